@@ -1,0 +1,80 @@
+"""geomtact: where a known part lies, told by the shape of one tactile contact, as a distribution over its whole pose.
+
+The public names below are loaded when first used, so that ``import geomtact`` takes no time.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from geomtact.errors import (
+    CacheError,
+    GeomtactError,
+    ImageError,
+    InputError,
+    MeshError,
+    PoseError,
+    SensorError,
+    UsageError,
+)
+
+if TYPE_CHECKING:
+    from geomtact.geometry.mesh import Mesh, load_mesh
+    from geomtact.inference.localizer import Localizer
+    from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.sensing.contact import Contact
+    from geomtact.sensing.local_shape import contact_mask
+    from geomtact.sensing.sensor import Sensor
+
+    __version__: str
+
+_MODULE_OF = {
+    "Contact": "geomtact.sensing.contact",
+    "Localizer": "geomtact.inference.localizer",
+    "Mesh": "geomtact.geometry.mesh",
+    "Mode": "geomtact.inference.posterior",
+    "Posterior": "geomtact.inference.posterior",
+    "Sensor": "geomtact.sensing.sensor",
+    "contact_mask": "geomtact.sensing.local_shape",
+    "load_mesh": "geomtact.geometry.mesh",
+}
+
+__all__ = [
+    "CacheError",
+    "Contact",
+    "GeomtactError",
+    "ImageError",
+    "InputError",
+    "Localizer",
+    "Mesh",
+    "MeshError",
+    "Mode",
+    "PoseError",
+    "Posterior",
+    "Sensor",
+    "SensorError",
+    "UsageError",
+    "__version__",
+    "contact_mask",
+    "load_mesh",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            return version("geomtact")
+        except PackageNotFoundError:  # a checkout that is used without being installed
+            return "unknown"
+    if name in _MODULE_OF:
+        value = getattr(importlib.import_module(_MODULE_OF[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'geomtact' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,164 @@
+"""The discretised contact pose space of one object on one sensor, with what the sensor would see at each pose.
+
+A *place* is an approach direction, a turn, and a lattice cell of the object's centre over the window; a *pose* is a
+place at one penetration. Every array is laid out penetration by penetration, so pose ``i`` is penetration
+``i // places`` of place ``i % places``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.contact_space.resolution import Resolution
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.rotations import Approach, Directions, level_step
+from geomtact.se3 import Array, hat, transform
+from geomtact.sensing.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class Index:
+    """A discretised contact pose space (thesis 6.1.1 to 6.1.3).
+
+    Attributes
+    ----------
+    rotation : (n,) rotation of each place
+    shift : (n, 2) object's centre along x and y, sensor frame [m]: a point of the cell at which it touches
+    height : (P, n) the centre's z at each penetration [m]
+    weight : (P, n) share of the uniform measure in each pose's cell; sums to 1, 0 where the housing forbids it
+    bits : (P, words, n) uint64, the contact masks packed along the words
+    area : (P, n) number of contact pixels
+    moments : (6, P n) moments of each mask (see ``sensing.moments``)
+    table : (rotations, ny, nx) place of each lattice cell, the nearest one where the cell does not touch
+    """
+
+    mesh: Mesh
+    sensor: Sensor
+    approach: Approach | None
+    resolution: Resolution
+    key: str
+    rotation: NDArray[np.int32]
+    shift: NDArray[np.float32]
+    height: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    bits: NDArray[np.uint64]
+    area: NDArray[np.uint16]
+    moments: NDArray[np.float32]
+    table: NDArray[np.int32]
+
+    ARRAYS = ("rotation", "shift", "height", "weight", "bits", "area", "moments", "table")
+
+    def __len__(self) -> int:
+        return self.height.size
+
+    @property
+    def places(self) -> int:
+        return self.height.shape[1]
+
+    @property
+    def bytes_per_pose(self) -> float:
+        return sum(getattr(self, a).nbytes for a in self.ARRAYS) / len(self)
+
+    @cached_property
+    def directions(self) -> Directions:
+        """The modelled approach directions."""
+        assert self.mesh.symmetry is not None
+        return Directions.make(self.mesh.symmetry, self.approach, self.resolution.level, self.resolution.turn_step)
+
+    @cached_property
+    def _rotations(self) -> Array:
+        return self.directions.rotations()[0]
+
+    @cached_property
+    def _first_turn(self) -> NDArray[np.int64]:
+        return np.concatenate([[0], np.cumsum(self.directions.turns)])[:-1]
+
+    def poses(self, ids: ArrayLike | None = None) -> Array:
+        """T_sensor_object (m, 4, 4) of poses ``ids`` (m,), all by default."""
+        i = np.arange(len(self)) if ids is None else np.asarray(ids)
+        level, place = np.divmod(i, self.places)
+        R = self._rotations[self.rotation[place]]
+        centre = np.concatenate([self.shift[place], self.height[level, place, None]], 1)
+        return transform(R, centre - R @ self.mesh.centre)
+
+    def points(self, ids: ArrayLike, point: ArrayLike) -> NDArray[np.float32]:
+        """Where a point (3,) of the object lies in the sensor frame at poses ``ids`` (m,): (m, 3) [m]."""
+        level, place = np.divmod(np.asarray(ids), self.places)
+        turned = (self._rotations @ (np.asarray(point, float) - self.mesh.centre)).astype(np.float32)
+        out = turned[self.rotation[place]]
+        out[:, :2] += self.shift[place]
+        out[:, 2] += self.height[level, place]
+        return out
+
+    def cell_covariance(self, T: ArrayLike) -> Array:
+        """Spread (6, 6) of the poses in the cell around ``T`` (4, 4): covariance of xi in T exp(xi^), radians and metres."""
+        R = np.asarray(T, float)[:3, :3]
+        turn = level_step(self.resolution.level) if self.directions.level is not None else self.resolution.turn_step
+        depth = self.sensor.max_penetration / len(self.resolution.penetrations)
+        step = self.resolution.step
+        about_centre = np.zeros((6, 6))
+        about_centre[:3, :3] = np.eye(3) * turn**2 / 12
+        about_centre[3:, 3:] = R.T @ np.diag([step**2, step**2, depth**2]) @ R / 12
+        # a rotation about the object's centre is one about its origin and a shift
+        J = np.eye(6)
+        J[3:, :3] = hat(self.mesh.centre)
+        return J @ about_centre @ J.T
+
+    def lookup(self, T: ArrayLike, penetration: ArrayLike) -> NDArray[np.int64]:
+        """The pose id (n,) whose cell holds each ``T`` (n, 4, 4), which presses ``penetration`` (n,) [m] deep.
+
+        Constant time a pose. A pose between the cells that touch gets the nearest one that does.
+        """
+        T, k, j = self.directions.lookup(np.asarray(T, float).reshape(-1, 4, 4))
+        rotation = self._first_turn[k] + j
+        centre = T[:, :2, :3] @ self.mesh.centre + T[:, :2, 3]
+        ny, nx = self.table.shape[1:]
+        step = self.resolution.step
+        ix = np.clip(np.rint(-centre[:, 0] / step).astype(np.int64) + nx // 2, 0, nx - 1)
+        iy = np.clip(np.rint(-centre[:, 1] / step).astype(np.int64) + ny // 2, 0, ny - 1)
+        place = self.table[rotation, iy, ix].astype(np.int64)
+        bins = len(self.resolution.penetrations)
+        depth = np.asarray(penetration, float) / self.sensor.max_penetration
+        level = np.clip((depth * bins).astype(np.int64), 0, bins - 1)
+        # the housing may leave only the deeper bins of a place, never only the shallower
+        some = self.weight[:, place] > 0
+        level = np.where(some[level, np.arange(len(place))], level, _nearest_true(some, level))
+        return level * self.places + place
+
+    def draw(self, ids: ArrayLike, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Poses (m, 4, 4) uniform within the cells of ``ids`` (m,), and the penetration (m,) [m] each one is to have.
+
+        Heights are those of the cell's own pose: ``ContactSpace.settle`` brings each to its penetration. Some of the
+        poses may lie off the contact pose space, where a cell straddles its border.
+        """
+        level, place = np.divmod(np.asarray(ids), self.places)
+        R = self.directions.draw(self.rotation[place], rng)
+        step = self.resolution.step
+        centre = np.zeros((len(place), 3))
+        centre[:, :2] = (np.rint(self.shift[place] / step) + rng.uniform(-0.5, 0.5, (len(place), 2))) * step
+        centre[:, 2] = self.height[level, place]
+        bins = len(self.resolution.penetrations)
+        depth = (level + rng.random(len(place))) / bins * self.sensor.max_penetration
+        return transform(R, centre - R @ self.mesh.centre), depth
+
+    def masks(self, ids: ArrayLike) -> NDArray[np.bool_]:
+        """The stored contact masks (m, h, w) of poses ``ids`` (m,)."""
+        level, place = np.divmod(np.asarray(ids), self.places)
+        words = np.ascontiguousarray(self.bits[level, :, place])
+        bits = np.unpackbits(words.view(np.uint8), axis=1)
+        return bits.astype(bool).reshape(-1, *self.resolution.mask_shape)
+
+
+def pack(masks: NDArray[np.bool_]) -> NDArray[np.uint64]:
+    """Masks (..., h*w) as packed words (..., h*w/64)."""
+    return np.packbits(masks, axis=-1).view(np.uint64)
+
+
+def _nearest_true(table: NDArray[np.bool_], row: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each column the row nearest to ``row`` in which ``table`` (P, n) is true."""
+    distance = np.abs(np.arange(len(table))[:, None] - row)
+    return np.argmin(np.where(table, distance, len(table) + distance), axis=0)

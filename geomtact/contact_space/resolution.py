@@ -1,0 +1,107 @@
+"""How finely to discretise: the finest grid that a budget of poses affords."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from geomtact.errors import UsageError
+from geomtact.geometry.rotations import Approach, Directions, level_step
+from geomtact.geometry.symmetry import Symmetry
+from geomtact.se3 import Array
+from geomtact.sensing.sensor import Sensor
+
+LEVELS = (1, 2, 3, 4)
+PIXELS_PER_MASK_PIXEL = 3  # of the height maps, along each side
+_BYTES_FOR_FINE_MASKS = 120e6
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """The grid's resolved settings, written next to every result.
+
+    Attributes
+    ----------
+    level : HEALPix level of the approach directions
+    turn_step : spacing of the turns of exact faces [rad]
+    step : lattice step along x and y [m]
+    pixel : pixel of the height maps [m]
+    penetrations : depths of the deepest point at the centres of the penetration bins [m]
+    mask_shape : (h, w) of the stored masks
+    """
+
+    level: int
+    turn_step: float
+    step: float
+    pixel: float
+    penetrations: tuple[float, ...]
+    mask_shape: tuple[int, int]
+
+    def to_json(self) -> dict:
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, data: dict) -> Resolution:
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+
+
+def choose(
+    radius_rms: float,
+    footprint: float,
+    symmetry: Symmetry,
+    sensor: Sensor,
+    approach: Approach | None = None,
+    max_poses: int = 1_200_000,
+) -> Resolution:
+    """The resolution whose cells are smallest, in mean point distance, at no more than about ``max_poses`` poses.
+
+    Parameters
+    ----------
+    radius_rms : rms distance of the object's surface from its centre [m]: what a rotation moves
+    footprint : mean area of window positions that touch, over rotations [m^2]
+    """
+    if max_poses < 1000:
+        raise UsageError(f"max_poses: expected at least 1000, got {max_poses}")
+    coarse, fine = _mask_shape(sensor, 32), _mask_shape(sensor, 64)
+    finest = float(_mask_pitch(sensor, fine).max())
+    bins, best = 4, None
+    # a level on which the symmetry or the approach leaves only points is the same at every level
+    directions = Directions.make(symmetry, approach, LEVELS[0])
+    levels = LEVELS if directions.level is not None else LEVELS[:1]
+    for level in levels:
+        if directions.level is None:
+            rotating = float((directions.periods > 0).sum())
+            if rotating:
+                turn_length = rotating * float(directions.periods.max()) * radius_rms
+                step = max(finest, (turn_length * footprint * bins / max_poses) ** (1 / 3))
+                n, turn_step = turn_length / step, step / max(radius_rms, 1e-9)
+            else:
+                n, turn_step = len(directions.vectors), 2 * np.pi
+                step = max(finest, np.sqrt(n * footprint * bins / max_poses))
+        else:
+            if level > LEVELS[0]:
+                directions = Directions.make(symmetry, approach, level)
+            n, turn_step = float(directions.turns.sum()), level_step(level)
+            step = max(finest, np.sqrt(n * footprint * bins / max_poses))
+        size = np.hypot(turn_step * radius_rms if n > 1 else 0.0, step)
+        if best is None or size < best[0]:
+            best = (size, level, turn_step, step, n * footprint / step**2)
+    assert best is not None
+    _, level, turn_step, step, places = best
+    if places * bins * 4 < max_poses:
+        bins = 8
+    shape = fine if places * bins * fine[0] * fine[1] / 8 < _BYTES_FOR_FINE_MASKS else coarse
+    pixel = float(_mask_pitch(sensor, shape).min()) / PIXELS_PER_MASK_PIXEL
+    depths = tuple(float(d) for d in (np.arange(bins) + 0.5) / bins * sensor.max_penetration)
+    return Resolution(level, float(turn_step), float(step), pixel, depths, shape)
+
+
+def _mask_shape(sensor: Sensor, long_side: int) -> tuple[int, int]:
+    short_side = long_side * 3 // 4
+    width, height = sensor.half_window
+    return (short_side, long_side) if width >= height else (long_side, short_side)
+
+
+def _mask_pitch(sensor: Sensor, shape: tuple[int, int]) -> Array:
+    return 2 * sensor.half_window / np.array(shape[::-1])

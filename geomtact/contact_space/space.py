@@ -1,0 +1,146 @@
+"""The contact pose space itself, undiscretised (thesis 6.1.1): which poses touch, and poses drawn uniformly from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.errors import MeshError
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.rotations import Approach, allowed, approach_of, check_approach, facing
+from geomtact.se3 import Array, random_rotations, transform
+from geomtact.sensing.cast import Caster
+from geomtact.sensing.sensor import Sensor
+
+# a pose may press deeper than the gel allows, or not quite touch, by a rounding error
+_ROUNDING = 1e-7
+
+
+@dataclass(frozen=True)
+class ContactSpace:
+    """All poses at which the object's deepest point in the window lies 0 to ``max_penetration`` below the membrane,
+    the housing is not entered, and the approach is allowed.
+
+    Attributes
+    ----------
+    mesh, sensor
+    approach : [(direction (3,) in the object frame, half angle [rad])], None for all
+    """
+
+    mesh: Mesh
+    sensor: Sensor
+    approach: Approach | None = None
+
+    @cached_property
+    def caster(self) -> Caster:
+        return Caster(self.mesh.vertices, self.mesh.faces)
+
+    @cached_property
+    def cones(self) -> list[tuple[Array, float]] | None:
+        return check_approach(self.approach)
+
+    def penetration(self, T: ArrayLike) -> Array:
+        """Depth (n,) [m] of the deepest point in the window at ``T`` (n, 4, 4); NaN outside the contact pose space."""
+        T = np.asarray(T, float).reshape(-1, 4, 4)
+        depth = self.caster.penetration(self.sensor, T)
+        inside = (depth >= -_ROUNDING) & (depth <= self.sensor.max_penetration + _ROUNDING)
+        inside &= self._allowed(T)
+        if self.sensor.housing_depth is not None and inside.any():
+            lowest = self.caster.lowest_outside(self.sensor, T[inside])
+            inside[inside] = lowest >= -self.sensor.housing_depth - _ROUNDING
+        return np.where(inside, np.clip(depth, 0, self.sensor.max_penetration), np.nan)
+
+    def settle(self, T: ArrayLike, depth: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """``T`` (n, 4, 4) moved along z until the deepest point in the window is ``depth`` (n,) [m] below the membrane.
+
+        Returns the moved poses and whether each one touches so.
+        """
+        T = np.array(T, float).reshape(-1, 4, 4)
+        depth = np.broadcast_to(np.asarray(depth, float), len(T))
+        going = np.arange(len(T))
+        ok = np.zeros(len(T), bool)
+        for _ in range(6):  # the camera sees a narrower window the deeper a point lies: seldom more than three steps
+            now = self.caster.penetration(self.sensor, T[going])
+            step = now - depth[going]
+            ok[going] = np.abs(step) < _ROUNDING
+            moving = np.isfinite(step) & ~ok[going]
+            T[going[moving], 2, 3] += step[moving]
+            going = going[moving]
+            if not len(going):
+                break
+        return T, ok
+
+    def sample(
+        self, n: int, rng: np.random.Generator, depths: tuple[float, float] | None = None, batch: int = 128
+    ) -> tuple[Array, Array]:
+        """``n`` poses uniform over the contact pose space (Haar times length), by rejection.
+
+        Parameters
+        ----------
+        depths : penetration drawn uniformly from this range [m]; the whole of it by default
+
+        Returns
+        -------
+        T_sensor_object : (n, 4, 4)
+        penetration : (n,) [m]
+
+        Raises
+        ------
+        MeshError
+            Hardly any pose touches as the approach and the housing allow.
+        """
+        low, high = depths or (0.0, self.sensor.max_penetration)
+        reach = float(np.linalg.norm(self.mesh.vertices - self.mesh.centre, axis=1).max())
+        half = reach + self.sensor.half_window
+        found: list[Array] = []
+        pressed: list[Array] = []
+        for _ in range(200 + 20 * n // batch):
+            R = self._rotations(batch, rng)
+            depth = rng.uniform(low, high, batch)
+            centre = np.zeros((batch, 3))
+            centre[:, :2] = rng.uniform(-half, half, (batch, 2))
+            # the object's lowest point is a first guess for where it meets the membrane
+            centre[:, 2] = -(R[:, 2] @ (self.mesh.vertices - self.mesh.centre).T).min(1) - depth
+            T, ok = self.settle(transform(R, centre - R @ self.mesh.centre), depth)
+            ok[ok] = np.isfinite(self.penetration(T[ok]))
+            found.append(T[ok])
+            pressed.append(depth[ok])
+            if sum(map(len, found)) >= n:
+                return np.concatenate(found)[:n], np.concatenate(pressed)[:n]
+        raise MeshError(
+            f"{self.mesh.name}: hardly any pose touches the sensor {self.sensor.name!r} as the approach and the housing "
+            "allow; widen the approach"
+        )
+
+    def _allowed(self, T: Array) -> NDArray[np.bool_]:
+        if self.cones is None:
+            return np.ones(len(T), bool)
+        return allowed(approach_of(T[:, :3, :3]), self.cones)
+
+    def _rotations(self, n: int, rng: np.random.Generator) -> Array:
+        """Rotations (n, 3, 3) uniform over what the approach allows."""
+        if self.cones is None:
+            return random_rotations(n, rng)
+        a = np.zeros((n, 3))
+        todo = np.arange(n)
+        size = np.array([1 - np.cos(half) if half else 1.0 for _, half in self.cones])
+        while len(todo):
+            which = rng.choice(len(self.cones), len(todo), p=size / size.sum())
+            v = np.stack([self.cones[i][0] for i in which])
+            half = np.array([self.cones[i][1] for i in which])
+            c = 1 - rng.random(len(todo)) * (1 - np.cos(half))
+            turn = rng.uniform(0, 2 * np.pi, len(todo))
+            side = np.stack([np.cos(turn), np.sin(turn), np.zeros(len(todo))], 1) * np.sqrt(np.maximum(0, 1 - c**2))[:, None]
+            side[:, 2] = c
+            # facing(-v) has v as its third row: the cone's axis becomes z
+            a[todo] = np.einsum("nij,ni->nj", facing(-v), side)
+            # a direction inside m cones is drawn m times too often
+            m = sum(allowed(a[todo], [cone]).astype(int) for cone in self.cones)
+            todo = todo[rng.random(len(todo)) > 1 / m]
+        turn = rng.uniform(0, 2 * np.pi, n)
+        c, s, o = np.cos(turn), np.sin(turn), np.zeros(n)
+        Rz = np.stack([c, -s, o, s, c, o, o, o, o + 1], -1).reshape(n, 3, 3)
+        return Rz @ facing(a)

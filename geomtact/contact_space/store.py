@@ -1,0 +1,184 @@
+"""The cache of built indexes: a folder an index, named by the hash of all that went into it.
+
+An entry is written under a temporary name and renamed, so it is whole or absent; arrays are memory-mapped when read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from geomtact.contact_space.build import Progress, build, choose_resolution
+from geomtact.contact_space.index import Index
+from geomtact.contact_space.resolution import Resolution
+from geomtact.errors import CacheError
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.rotations import Approach, check_approach
+from geomtact.geometry.symmetry import Symmetry
+from geomtact.sensing.sensor import Sensor
+
+FORMAT = 1  # raise whenever a built index would differ
+DEFAULT_LIMIT = 20 * 10**9
+
+
+@dataclass(frozen=True)
+class CacheEntry:
+    """One cached index: what it is for, its size, and when it was last read (seconds since 1970)."""
+
+    key: str
+    object: str
+    sensor: str
+    poses: int
+    size_bytes: int
+    last_used: float
+    folder: Path
+
+
+def default_cache_dir() -> Path:
+    """``$GEOMTACT_CACHE``, else the user's cache folder."""
+    if os.environ.get("GEOMTACT_CACHE"):
+        return Path(os.environ["GEOMTACT_CACHE"])
+    import platformdirs
+
+    return Path(platformdirs.user_cache_dir("geomtact"))
+
+
+def open_index(
+    mesh: Mesh,
+    sensor: Sensor,
+    approach: Approach | None = None,
+    max_poses: int = 1_200_000,
+    cache_dir: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Index:
+    """The index of ``mesh`` on ``sensor``: from the cache, or built and cached.
+
+    Two processes that want the same one build it once: the second waits for the first.
+
+    Raises
+    ------
+    CacheError
+        The cache folder cannot be written, or the disk is full.
+    """
+    import filelock
+
+    folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
+    key = _key(mesh, sensor, approach, max_poses)
+    index = _read(folder / key, mesh, sensor, approach)
+    if index is not None:
+        return index
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = filelock.FileLock(folder / f"{key}.lock")
+        with lock:
+            index = _read(folder / key, mesh, sensor, approach)
+            if index is None:
+                mesh = mesh.with_symmetry()
+                resolution = choose_resolution(mesh, sensor, approach, max_poses)
+                arrays = build(mesh, sensor, approach, resolution, progress)
+                index = Index(mesh, sensor, approach, resolution, key, **arrays)
+                _write(folder, index)
+                bound_cache(DEFAULT_LIMIT, folder, keep=key)
+    except OSError as error:
+        raise CacheError(
+            f"cache folder {folder}: cannot be written ({error.strerror or error}); "
+            "free space there, or give another folder with --cache-dir or GEOMTACT_CACHE"
+        ) from None
+    return _read(folder / key, mesh, sensor, approach) or index
+
+
+def cache_entries(cache_dir: str | Path | None = None) -> list[CacheEntry]:
+    """All cached indexes, last used first; entries that another version wrote are listed too."""
+    folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
+    entries = []
+    for meta_file in folder.glob("*/meta.json"):
+        with contextlib.suppress(OSError, ValueError, KeyError):
+            meta = json.loads(meta_file.read_text("utf-8"))
+            size = sum(f.stat().st_size for f in meta_file.parent.iterdir())
+            used = meta_file.stat().st_mtime
+            name = meta_file.parent.name
+            entries.append(CacheEntry(name, meta["object"], meta["sensor"], meta["poses"], size, used, meta_file.parent))
+    return sorted(entries, key=lambda e: -e.last_used)
+
+
+def bound_cache(limit_bytes: int, cache_dir: str | Path | None = None, keep: str = "") -> list[CacheEntry]:
+    """Remove the entries used longest ago until the cache holds at most ``limit_bytes``; returns what was removed."""
+    removed, total = [], 0
+    for entry in cache_entries(cache_dir):
+        total += entry.size_bytes
+        if total > limit_bytes and entry.key != keep:
+            shutil.rmtree(entry.folder, ignore_errors=True)
+            removed.append(entry)
+    return removed
+
+
+def clear_cache(cache_dir: str | Path | None = None) -> list[CacheEntry]:
+    """Remove every cached index and what interrupted runs left behind; returns what was removed."""
+    folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
+    removed = bound_cache(0, folder)
+    for left in [*folder.glob("building-*"), *folder.glob("*.lock")]:
+        shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+    return removed
+
+
+def _key(mesh: Mesh, sensor: Sensor, approach: Approach | None, max_poses: int) -> str:
+    cones = check_approach(approach)
+    approach_text = None if cones is None else [(v.tolist(), angle) for v, angle in cones]
+    symmetry = None if mesh.symmetry is None else mesh.symmetry.elements.round(9).tolist()
+    text = json.dumps([FORMAT, mesh.sha256, symmetry, sensor.sha256, approach_text, max_poses])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _write(folder: Path, index: Index) -> None:
+    symmetry = index.mesh.symmetry
+    assert symmetry is not None
+    meta = {
+        "format": FORMAT,
+        "object": index.mesh.name,
+        "object_sha256": index.mesh.sha256,
+        "sensor": index.sensor.name,
+        "poses": len(index),
+        "resolution": index.resolution.to_json(),
+        "symmetry": {
+            "kind": symmetry.kind,
+            "elements": symmetry.elements.tolist(),
+            "axis": None if symmetry.axis is None else symmetry.axis.tolist(),
+            "centre": symmetry.centre.tolist(),
+        },
+        "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
+    }
+    building = Path(tempfile.mkdtemp(prefix="building-", dir=folder))
+    try:
+        for name in Index.ARRAYS:
+            np.save(building / f"{name}.npy", getattr(index, name), allow_pickle=False)
+        (building / "meta.json").write_text(json.dumps(meta), "utf-8")
+        shutil.rmtree(folder / index.key, ignore_errors=True)
+        building.rename(folder / index.key)
+    except BaseException:
+        shutil.rmtree(building, ignore_errors=True)
+        raise
+
+
+def _read(folder: Path, mesh: Mesh, sensor: Sensor, approach: Approach | None) -> Index | None:
+    """The cached index, or None where it is absent or damaged (it is then built anew)."""
+    try:
+        meta = json.loads((folder / "meta.json").read_text("utf-8"))
+        arrays = {a: np.load(folder / f"{a}.npy", mmap_mode="r", allow_pickle=False) for a in Index.ARRAYS}
+        s = meta["symmetry"]
+        axis = None if s["axis"] is None else np.array(s["axis"])
+        symmetry = Symmetry(s["kind"], np.array(s["elements"]), axis, np.array(s["centre"]))
+        resolution = Resolution.from_json(meta["resolution"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    with contextlib.suppress(OSError):  # a read-only cache still serves
+        os.utime(folder / "meta.json")
+    return Index(replace(mesh, symmetry=symmetry), sensor, approach, resolution, folder.name, **arrays)

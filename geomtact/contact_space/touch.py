@@ -1,0 +1,62 @@
+"""A touch as a real sensor would report it: rigid or elastic contact, spoilt by noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.contact_space.space import ContactSpace
+from geomtact.sensing.elastic import elastic_mask
+from geomtact.sensing.noise import Noise, perturb
+
+CALIBRATION_NOISE = Noise(outline_rms=0.5e-3, correlation=(0.5e-3, 4e-3), specks=5, missing_probability=0.2)
+_MARGIN = 0.25  # of the window, on each side: the gel is dragged along by what presses beside the window
+
+
+def felt_mask(
+    space: ContactSpace, T: ArrayLike, elastic: bool, shape: tuple[int, int] | None = None
+) -> NDArray[np.bool_]:
+    """Where the sensor feels the object at ``T`` (4, 4), without noise: (h, w) bool over the window.
+
+    Parameters
+    ----------
+    elastic : the gel is an elastic half-space, touched where the pressure is positive; else the thesis's threshold
+    shape : (h, w) of the result, the image's own by default
+    """
+    sensor = space.sensor
+    h, w = shape or sensor.image_size_px[::-1]
+    if not elastic:
+        return space.caster.contact(sensor, T, (h, w)).mask
+    # the membrane is solved as flat: its bulge is shallow over the width of a contact
+    my, mx = round(_MARGIN * h), round(_MARGIN * w)
+    size = (w + 2 * mx, h + 2 * my)
+    pitch = (2 * sensor.half_window[0] / w, 2 * sensor.half_window[1] / h)
+    wide = replace(sensor, image_size_px=size, pixel_pitch=pitch, membrane_radius=0.0)
+    x, y = wide.pixel_centres()
+    rays = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    depth = space.caster.ray_depths(sensor, np.asarray(T, float)[None], rays)[0].reshape(len(y), len(x))
+    # beside the window an object may reach far below the membrane, into the housing: the gel ends there
+    depth[(depth > sensor.max_penetration) & _outside(depth.shape, my, mx)] = -np.inf
+    return elastic_mask(depth, pitch)[my : my + h, mx : mx + w]
+
+
+def draw_noise(noise: Noise, rng: np.random.Generator) -> Noise:
+    """Noise no stronger than ``noise``, its strength and its number of specks drawn uniformly: for learning from."""
+    return replace(
+        noise, outline_rms=noise.outline_rms * rng.random(), specks=int(rng.integers(noise.specks + 1))
+    )
+
+
+def spoilt(mask: NDArray[np.bool_], space: ContactSpace, noise: Noise, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """``mask`` (h, w) over the window with sensor noise."""
+    h, w = mask.shape
+    pitch = 2 * space.sensor.half_window / (w, h)
+    return perturb(mask, (float(pitch[0]), float(pitch[1])), noise, rng)
+
+
+def _outside(shape: tuple[int, int], my: int, mx: int) -> NDArray[np.bool_]:
+    out = np.ones(shape, bool)
+    out[my : shape[0] - my, mx : shape[1] - mx] = False
+    return out

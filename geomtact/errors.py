@@ -1,0 +1,47 @@
+"""What geomtact raises: each message says what was expected, what was given and what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class GeomtactError(Exception):
+    """Base class of every error that geomtact raises on purpose."""
+
+
+class UsageError(GeomtactError):
+    """An option or a name is missing, unknown or contradicts another (exit status 2)."""
+
+
+class InputError(GeomtactError):
+    """A file or an array cannot be used as it is (exit status 3)."""
+
+
+class MeshError(InputError):
+    """A mesh cannot be used: unreadable, without unit, open, or of another scale than the sensor."""
+
+
+class ImageError(InputError):
+    """An image cannot be used: unreadable, of another size than the sensor, or of no known kind."""
+
+
+class SensorError(InputError):
+    """A sensor description has a missing, unknown or impossible entry."""
+
+
+class PoseError(InputError):
+    """An array that should hold rigid transforms does not."""
+
+
+class CacheError(InputError):
+    """The cache folder cannot be read or written."""
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str:
+    """``"; did you mean 'x'?"`` for the known name nearest to ``name``, else the list of known names."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    if close:
+        return f"; did you mean {close[0]!r}? (known: {', '.join(known)})"
+    return f" (known: {', '.join(known)})"

@@ -1,0 +1,107 @@
+"""How far apart two poses of an object are, in the motion of its points, modulo its symmetry.
+
+Mean point distance is ADD (Hinterstoisser et al. 2012), the thesis's pose error; the largest point distance is MSSD
+(Hodan et al. 2020). Both are minimised over the object's symmetry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from geomtact.geometry.mesh import Mesh
+from geomtact.se3 import Array, apply, hat, transform
+
+_BATCH = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class PoseDistance:
+    """Distances between poses of ``mesh``, over ``n`` points spread evenly over its surface."""
+
+    mesh: Mesh
+    n: int = 256
+
+    @cached_property
+    def points(self) -> Array:
+        return self.mesh.surface_points(self.n)
+
+    def mean(self, T: ArrayLike, others: ArrayLike) -> Array:
+        """Mean point distance (m,) [m] from the pose ``T`` (4, 4) to ``others`` (m, 4, 4)."""
+        return self._distances(T, others, "mean")
+
+    def largest(self, T: ArrayLike, others: ArrayLike) -> Array:
+        """Largest point distance (m,) [m] from the pose ``T`` (4, 4) to ``others`` (m, 4, 4)."""
+        return self._distances(T, others, "max")
+
+    def within(self, T: ArrayLike, others: ArrayLike, radius: float) -> Array:
+        """Whether each of ``others`` (m, 4, 4) lies within ``radius`` [m] of ``T`` in mean point distance."""
+        T, others = np.asarray(T, float), np.asarray(others, float)
+        # the mean of the points moves no further than the points do in the mean
+        moved = np.linalg.norm(apply(others, self.anchor[None])[:, 0] - apply(T, self.anchor[None])[0], axis=1)
+        near = np.flatnonzero(moved <= radius + self.slack)
+        out = np.zeros(len(others), bool)
+        out[near] = self.mean(T, others[near]) <= radius
+        return out
+
+    @cached_property
+    def anchor(self) -> Array:
+        """A point (3,) of the object that its symmetry leaves in place and that lies near the mean of its points."""
+        symmetry = self.mesh.symmetry
+        return self.points.mean(0) if symmetry is None or symmetry.kind == "none" else symmetry.centre
+
+    @property
+    def slack(self) -> float:
+        """How much further [m] than the mean point distance the anchor may move between two poses."""
+        return 2 * float(np.linalg.norm(self.points.mean(0) - self.anchor))
+
+    @cached_property
+    def _centred(self) -> Array:
+        return self.points - self.mesh.centre
+
+    def _distances(self, T: ArrayLike, others: ArrayLike, over: str) -> Array:
+        T, others = np.asarray(T, float), np.asarray(others, float).reshape(-1, 4, 4)
+        out = np.zeros(len(others))
+        here = apply(T, self.points)
+        for i in range(0, len(others), _BATCH):
+            there = apply(self.aligned(T, others[i : i + _BATCH]), self.points)
+            d = np.linalg.norm(there - here, axis=-1)
+            out[i : i + _BATCH] = d.mean(1) if over == "mean" else d.max(1)
+        return out
+
+    def aligned(self, T: ArrayLike, others: ArrayLike) -> Array:
+        """The images (m, 4, 4) of ``others`` under the object's symmetry that lie nearest to ``T``, in mean square."""
+        T, others = np.asarray(T, float), np.asarray(others, float)
+        symmetry = self.mesh.symmetry
+        if symmetry is None or symmetry.kind == "none":
+            return others
+        if symmetry.kind == "sphere":
+            where = apply(others, symmetry.centre[None])[:, 0]
+            return transform(T[:3, :3], where - T[:3, :3] @ symmetry.centre)
+        # E |T p - T' S p|^2 is least where tr(R^T R' S C) is largest, C = E p p^T about the centre
+        C = self._centred.T @ self._centred / len(self._centred)
+        Q = T[:3, :3].T @ others[:, :3, :3]
+        elements = symmetry.elements[:, :3, :3]
+        if symmetry.kind == "discrete":
+            gain = np.einsum("mij,gji->mg", Q, elements @ C)
+            return others @ symmetry.elements[gain.argmax(1)]
+        a = symmetry.axis
+        assert a is not None
+        along = np.outer(a, a)
+        fixed, cosine, sine = (
+            np.einsum("mij,gji->mg", Q, part @ elements @ C) for part in (along, np.eye(3) - along, hat(a))
+        )
+        best = (fixed + np.hypot(cosine, sine)).argmax(1)
+        row = np.arange(len(others))
+        angle = np.arctan2(sine[row, best], cosine[row, best])[:, None, None]
+        S = along + np.cos(angle) * (np.eye(3) - along) + np.sin(angle) * hat(a)
+        S = S @ elements[best]
+        return others @ transform(S, symmetry.centre - S @ symmetry.centre)
+
+
+def mode_radius(mesh: Mesh) -> float:
+    """Mean point distance within which poses belong to one mode [m]: 5 mm or 5 % of the diameter, the smaller."""
+    return min(5e-3, 0.05 * mesh.diameter)

@@ -1,0 +1,334 @@
+"""A part's surface in metres, in the frame of its own file, checked before anything is computed from it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.errors import MeshError, nearest_name
+from geomtact.geometry.catalogue import catalogue
+from geomtact.geometry.symmetry import Symmetry, find_symmetry
+from geomtact.se3 import Array
+
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
+UNITLESS_FORMATS = (".stl", ".obj", ".ply", ".off")
+METRE_FORMATS = (".glb", ".gltf")
+
+# Beyond these no tactile sensor is meant; they also keep squares and cubes of lengths far from overflow.
+_SMALLEST, _LARGEST = 1e-4, 1e3
+
+
+class _SensorLike(Protocol):
+    """What the scale check needs to know of a sensor, which is a later stage."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def half_window(self) -> Array: ...
+    @property
+    def pixel_pitch(self) -> tuple[float, float]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A closed triangle mesh. Lengths are metres, in the object frame (the file's own coordinates).
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64 [m]
+    faces : (F, 3) int32, wound so that normals point outwards
+    name : catalogue name or the file's stem
+    unit : unit of the file it came from
+    path : the file, if any
+    symmetry : the object's rotation symmetry; None means not looked for yet (see :meth:`with_symmetry`)
+    """
+
+    vertices: Array
+    faces: NDArray[np.int32]
+    name: str
+    unit: str
+    path: Path | None = None
+    symmetry: Symmetry | None = None
+
+    def __post_init__(self) -> None:
+        vertices = np.array(self.vertices, dtype="<f8", order="C")
+        faces = np.array(self.faces, dtype="<i4", order="C")
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise MeshError(f"mesh {self.name!r}: expected (V, 3) and (F, 3), got {vertices.shape} and {faces.shape}")
+        vertices.flags.writeable = faces.flags.writeable = False
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the vertices in metres (little endian float64) and of the faces; not of name, path or unit."""
+        digest = hashlib.sha256(repr((self.vertices.shape, self.faces.shape)).encode())
+        digest.update(self.vertices.tobytes())
+        digest.update(self.faces.tobytes())
+        return digest.hexdigest()
+
+    @cached_property
+    def diameter(self) -> float:
+        """Largest distance between two points of the mesh [m]."""
+        from scipy.spatial import ConvexHull
+
+        return _largest_distance(self.vertices[ConvexHull(self.vertices).vertices])
+
+    @cached_property
+    def centre(self) -> Array:
+        """(3,) [m]: where rotations of the object are best centred: the symmetry's centre, else the bounding box's."""
+        if self.symmetry is not None and self.symmetry.kind != "none":
+            return self.symmetry.centre
+        return 0.5 * (self.vertices.min(0) + self.vertices.max(0))
+
+    @cached_property
+    def radius_rms(self) -> float:
+        """Area-weighted root mean square distance of the surface from :attr:`centre` [m]."""
+        corners = self.vertices[self.faces] - self.centre
+        # The mean of |p|^2 over a triangle is (|a|^2 + |b|^2 + |c|^2 + |a+b+c|^2) / 12.
+        mean_square = ((corners**2).sum((1, 2)) + (corners.sum(1) ** 2).sum(1)) / 12
+        return float(np.sqrt(np.average(mean_square, weights=self.areas)))
+
+    @cached_property
+    def areas(self) -> Array:
+        """(F,) area of each face [m^2]."""
+        return 0.5 * np.linalg.norm(self._crosses, axis=1)
+
+    @cached_property
+    def normals(self) -> Array:
+        """(F, 3) outward unit normal of each face (zero for a face without area)."""
+        length = np.linalg.norm(self._crosses, axis=1, keepdims=True)
+        return self._crosses / np.where(length > 0, length, 1.0)
+
+    @cached_property
+    def _crosses(self) -> Array:
+        a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
+        return np.cross(b - a, c - a)
+
+    def sample_surface(self, n: int, seed: int = 0) -> tuple[Array, Array]:
+        """``n`` points uniform over the surface (n, 3) [m], and the outward unit normals there (n, 3)."""
+        rng = np.random.default_rng(seed)
+        face = rng.choice(len(self.faces), size=n, p=self.areas / self.areas.sum())
+        u, v = rng.random((2, n, 1))
+        fold = u + v > 1
+        u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
+        a, b, c = np.moveaxis(self.vertices[self.faces[face]], 1, 0)
+        return a + u * (b - a) + v * (c - a), self.normals[face]
+
+    def surface_points(self, n: int, seed: int = 0) -> Array:
+        """``n`` points uniform over the surface (n, 3) [m]: those of :meth:`sample_surface`."""
+        return self.sample_surface(n, seed)[0]
+
+    def surface_normals(self, n: int, seed: int = 0) -> Array:
+        """Outward unit normals (n, 3) at :meth:`surface_points` of the same ``n`` and ``seed``."""
+        return self.sample_surface(n, seed)[1]
+
+    def with_symmetry(self, tolerance: float = 5e-5) -> Mesh:
+        """This mesh with its symmetry found (``tolerance`` in metres), or itself if it is known already."""
+        if self.symmetry is not None:
+            return self
+        return replace(self, symmetry=find_symmetry(self.vertices, self.faces, tolerance))
+
+
+def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _SensorLike | None = None) -> Mesh:
+    """Load a part by catalogue name or from an STL, OBJ, PLY, OFF, GLB or glTF file. The object frame is the file's.
+
+    Parameters
+    ----------
+    source : name in ``meshes/catalogue.toml``, path of a file, or a Mesh (checked against the sensor only)
+    unit : "mm", "cm", "m" or "inch"; needed for formats without units, not for catalogue parts and glTF (metres)
+    sensor : if given, the part's size is checked against its window
+
+    Returns
+    -------
+    Mesh
+        Vertices are rounded to single precision in metres (below 4 nm up to 125 mm, as mesh files hold them), vertices closer
+        than 1e-7 of the size are welded, and vertices and faces are put in a canonical order: the same
+        surface has the same ``sha256`` whatever the order, the format or the unit it was stored in.
+
+    Raises
+    ------
+    MeshError
+        Unknown name, no or contradicting unit, unreadable, empty, not closed, inside out, or of an impossible size.
+    """
+    if isinstance(source, Mesh):
+        mesh = source
+    else:
+        name, path, unit, symmetry = _resolve(source, unit)
+        raw_vertices, raw_faces = _read(path)
+        vertices, faces = _tidy(raw_vertices * UNITS[unit], raw_faces, path, unit)
+        _check_closed(vertices, faces, path)
+        mesh = Mesh(vertices, faces, name, unit, path, symmetry)
+    if sensor is not None:
+        _check_scale(mesh, sensor)
+    return mesh
+
+
+def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symmetry | None]:
+    """Name, file, unit and known symmetry of a catalogue name or a path."""
+    text = str(source)
+    parts = catalogue()
+    path = Path(text)
+    name = text if text in parts else next((n for n, e in parts.items() if e.file == path.resolve()), None)
+    if unit is not None and unit not in UNITS:
+        raise MeshError(f"{text}: unknown unit {unit!r}; give one of {', '.join(UNITS)}")
+    if name is not None:
+        entry = parts[name]
+        if unit is not None and unit != entry.unit:
+            raise MeshError(f"{text}: the catalogue says {entry.unit}, but unit={unit!r} was given; leave the unit out")
+        return name, entry.file, entry.unit, entry.symmetry
+    suffix = path.suffix.lower()
+    formats = UNITLESS_FORMATS + METRE_FORMATS
+    if suffix not in formats:
+        if path.exists():
+            raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(formats)}")
+        raise MeshError(f"no part named {text!r}{nearest_name(text, parts)}; or give a mesh file ({' '.join(formats)})")
+    if not path.is_file():
+        raise MeshError(f"{text}: no such file; give the path of a mesh, or a part: {', '.join(sorted(parts))}")
+    if suffix in METRE_FORMATS:
+        if unit not in (None, "m"):
+            raise MeshError(f"{text}: glTF is in metres by definition, but unit={unit!r} was given; leave the unit out")
+        unit = "m"
+    if unit is None:
+        raise MeshError(f"{text}: {suffix} files do not say their unit; give unit= one of {', '.join(UNITS)}")
+    return path.stem, path, unit, None
+
+
+def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (V, 3) in the file's unit and triangles (F, 3); a scene's bodies are placed and concatenated."""
+    import trimesh
+
+    if path.stat().st_size == 0:
+        raise MeshError(f"{path}: the file is empty (0 bytes); export the mesh again")
+    try:
+        # process=False: trimesh would merge, drop and reorder by rules of its own.
+        scene = trimesh.load_scene(str(path), process=False)
+        mesh = scene.to_mesh()
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+    except Exception as error:  # noqa: BLE001 -- a parser fails on bad bytes in more ways than can be listed
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise MeshError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); export the mesh again") from None
+    if len(faces) == 0:
+        what = "only points or lines" if scene.geometry else "nothing"
+        raise MeshError(f"{path}: expected a surface of triangles, found {what}; export the mesh with its faces")
+    if not np.isfinite(vertices[faces[(faces >= 0) & (faces < len(vertices))]]).all():
+        raise MeshError(f"{path}: vertices hold NaN or infinity; export the mesh again")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(f"{path}: a face names a vertex that is not there (of {len(vertices)}); export the mesh again")
+    return vertices, faces
+
+
+def _tidy(vertices: Array, faces: NDArray, path: Path, unit: str) -> tuple[Array, NDArray[np.int32]]:
+    """Weld and order: the same surface gives the same arrays, whatever file it came from."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    used = vertices[np.unique(faces)]
+    with np.errstate(over="ignore"):
+        size = float(np.linalg.norm(used.max(0) - used.min(0)))
+        reach = float(np.abs(used).max())
+    if not _SMALLEST <= size <= _LARGEST or reach > 1e3 * size:
+        raise MeshError(
+            f"{path}: {size:.3g} m across and up to {reach:.3g} m from the origin as read in {unit}, "
+            f"expected {_SMALLEST:g} to {_LARGEST:g} m near the origin; the unit is likely wrong"
+        )
+    vertices = vertices.astype(np.float32).astype(np.float64) + 0.0  # + 0.0 turns -0 into 0
+    vertices, index = np.unique(vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[faces]
+    # CAD exports repeat a vertex with the last bit different, which would leave hairline cracks.
+    pairs = cKDTree(vertices).query_pairs(1e-7 * size, output_type="ndarray")
+    if len(pairs):
+        near = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(vertices),) * 2)
+        _, label = connected_components(near, directed=False)
+        _, first = np.unique(label, return_index=True)
+        faces = first[label][faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    if len(faces) == 0:
+        raise MeshError(f"{path}: every face has shrunk to a line; export the mesh again")
+    kept, faces = np.unique(faces, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    start = faces.argmin(1)[:, None]
+    faces = np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    return vertices[kept], faces.astype(np.int32)
+
+
+def _check_closed(vertices: Array, faces: NDArray[np.int32], path: Path) -> None:
+    """Every edge is walked as often one way as the other, and the surface's outside is outside.
+
+    This allows bodies that touch along an edge, which casts of rays do not mind.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    _, index, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    excess = np.bincount(index.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    bare = int((uses % 2 == 1).sum())
+    if bare:
+        raise MeshError(
+            f"{path}: not watertight, {bare} of {len(uses)} edges are open; clean it with tools/prep_mesh.py"
+        )
+    turned = int((excess != 0).sum())
+    if turned:
+        raise MeshError(
+            f"{path}: neighbouring faces disagree about the outside at {turned} of {len(uses)} edges; "
+            "clean it with tools/prep_mesh.py"
+        )
+    join = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
+    count, body_of_vertex = connected_components(join, directed=False)
+    body = body_of_vertex[faces[:, 0]]
+    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(0), 1, 0)
+    volume = np.bincount(body, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, minlength=count)
+    low, high = (
+        _bounds(vertices, body_of_vertex, count, np.minimum),
+        _bounds(vertices, body_of_vertex, count, np.maximum),
+    )
+    # An inverted body is a cavity if it lies in an upright one; otherwise it is inside out.
+    solid = volume > 0
+    for k in np.flatnonzero(volume < 0):
+        if not ((low[solid] <= low[k]) & (high[solid] >= high[k])).all(1).any():
+            raise MeshError(
+                f"{path}: the surface is inside out (its faces look inwards); flip it with tools/prep_mesh.py"
+            )
+    size = np.linalg.norm(high - low, axis=1).max()
+    if volume.sum() < 1e-6 * size**3:
+        raise MeshError(f"{path}: the surface encloses no volume; give a solid part")
+
+
+def _bounds(vertices: Array, body: NDArray, count: int, pick: Callable) -> Array:
+    out = np.full((count, 3), np.inf if pick is np.minimum else -np.inf)
+    pick.at(out, body, vertices)  # type: ignore[attr-defined]
+    return out
+
+
+def _check_scale(mesh: Mesh, sensor: _SensorLike) -> None:
+    """Refuse a part of less than ten pixels or more than a hundred windows: with real parts the unit is wrong then."""
+    smallest = 10 * min(sensor.pixel_pitch)
+    largest = 100 * 2 * float(np.hypot(*sensor.half_window))
+    if not smallest <= mesh.diameter <= largest:
+        raise MeshError(
+            f"{mesh.path or mesh.name}: {1e3 * mesh.diameter:.3g} mm across as read in {mesh.unit}, but sensor "
+            f"{sensor.name} suits {1e3 * smallest:.2g} to {1e3 * largest:.0f} mm; the unit is likely wrong"
+        )
+
+
+def _largest_distance(points: Array) -> float:
+    """Largest distance between two of ``points`` (n, 3)."""
+    radius = np.linalg.norm(points - 0.5 * (points.min(0) + points.max(0)), axis=1)
+    far, best = points[radius.argmax()], 0.0
+    for _ in range(4):  # a few sweeps to the farthest point come close to the answer
+        distance = np.linalg.norm(points - far, axis=1)
+        far, best = points[distance.argmax()], max(best, float(distance.max()))
+    # Only a point whose distance to the centre and the largest such one sum to more can do better.
+    for p in points[radius + radius.max() > best * (1 + 1e-9)]:
+        best = max(best, float(np.linalg.norm(points - p, axis=1).max()))
+    return best

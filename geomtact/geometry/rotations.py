@@ -1,0 +1,316 @@
+"""Rotations as approach direction and turn (Hopf coordinates), modulo the object's symmetry.
+
+A pose's *approach* is the direction from the object towards the sensor in the object frame, ``a = R^T (0, 0, -1)``;
+its *turn* is what is left, a rotation about the sensor's z. Haar measure is solid angle times turn. Directions are
+HEALPix pixels (Gorski et al. 2005), so level l has 12 * 4^l directions and 6 * 2^l turns, nested and of equal volume
+(Yershova et al. 2010): 576, 4,608, 36,864 and 294,912 rotations for l = 1 to 4.
+
+What the object's symmetry makes equal is kept once, and what the scene rules out (``approach``) not at all: every
+allowed direction is mapped to one canonical image of its orbit, and a pixel's weight is the solid angle that lands in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import healpix
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from geomtact.errors import UsageError
+from geomtact.geometry.symmetry import Symmetry
+from geomtact.se3 import Array, hat, transform
+
+Approach = Sequence[tuple[ArrayLike, float]]
+FACE_TOLERANCE = 1e-6  # rad: how near a pose must come to an approach of half angle 0
+_FINE = 3  # levels between a pixel and the points that measure how much of it is kept
+_GENERIC = np.array([0.5402, 0.2911, 0.7896])  # of no machined part's symmetry: picks one image of each orbit
+
+
+def level_turns(level: int) -> int:
+    """Turns at a level: as far apart as its directions."""
+    return 6 * 2**level
+
+
+def level_step(level: int) -> float:
+    """Angle between neighbouring rotations of a level [rad]: the cube root of a cell's volume in SO(3)."""
+    return float((8 * np.pi**2 / (12 * 4**level * level_turns(level))) ** (1 / 3))
+
+
+def approach_of(R: ArrayLike) -> Array:
+    """Direction (..., 3) from the object towards the sensor, in the object frame, of R_sensor_object (..., 3, 3)."""
+    return -np.asarray(R, float)[..., 2, :]
+
+
+def facing(a: ArrayLike) -> Array:
+    """A rotation R_sensor_object (..., 3, 3) whose approach is the unit vector ``a`` (..., 3): turn 0 of that direction."""
+    z = -np.asarray(a, float)
+    other = np.where(np.abs(z[..., 2:]) > 0.9, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
+    x = np.cross(other, z)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], -2)
+
+
+def check_approach(approach: Approach | None) -> list[tuple[Array, float]] | None:
+    """Approach as [(unit vector (3,), half angle [rad])].
+
+    Raises
+    ------
+    UsageError
+        A direction of no length, an angle outside 0..pi, or exact faces mixed with cones.
+    """
+    if approach is None:
+        return None
+    cones = []
+    for direction, angle in approach:
+        v = np.asarray(direction, float)
+        if v.shape != (3,) or not np.isfinite(v).all() or np.linalg.norm(v) < 1e-12:
+            raise UsageError(f"approach: expected a direction of three numbers in the object frame, got {direction!r}")
+        if not 0 <= float(angle) <= np.pi:
+            raise UsageError(f"approach: the half angle is in radians, 0 to pi, got {angle!r}")
+        cones.append((v / np.linalg.norm(v), float(angle)))
+    if not cones:
+        raise UsageError("approach: an empty list rules out every touch; leave it out to allow all")
+    if len({angle == 0 for _, angle in cones}) > 1:
+        raise UsageError("approach: half angles of 0 (exact faces) cannot be mixed with cones; give all one kind")
+    return cones
+
+
+@dataclass(frozen=True)
+class Directions:
+    """The approach directions that are modelled, and the way from any pose to its cell.
+
+    Attributes
+    ----------
+    vectors : (D, 3) unit vectors, object frame
+    weights : (D,) share of the allowed directions that each stands for, sums to 1
+    turns : (D,) number of turns of each
+    periods : (D,) range of the turn [rad]: 2 pi, less where symmetry repeats it, 0 where the turn means nothing
+    symmetry : the object's
+    cones : the allowed approaches, None for all
+    level : HEALPix level, or None for exact faces and spheres
+    """
+
+    vectors: Array
+    weights: Array
+    turns: NDArray[np.int64]
+    periods: Array
+    symmetry: Symmetry
+    cones: list[tuple[Array, float]] | None
+    level: int | None
+    _cell: NDArray[np.int64]
+
+    @classmethod
+    def make(
+        cls, symmetry: Symmetry, approach: Approach | None = None, level: int = 2, turn_step: float | None = None
+    ) -> Directions:
+        """Directions of one HEALPix ``level``; ``turn_step`` [rad] spaces the turns of exact faces."""
+        cones = check_approach(approach)
+        if symmetry.kind == "sphere" or (cones and cones[0][1] == 0):
+            return cls._faces(symmetry, cones, turn_step or level_step(level))
+        nside = 2 ** (level + _FINE)
+        fine = np.stack(healpix.pix2vec(nside, np.arange(12 * nside**2), nest=True), -1)
+        fine = fine[allowed(fine, cones)]
+        if not len(fine):  # a cone thinner than the finest pixel
+            assert cones is not None
+            fine = np.stack([v for v, _ in cones])
+        image = _canonical(fine, symmetry, cones)[1]
+        key = _bin(image, symmetry, level)
+        n_keys = int(key.max()) + 1
+        count = np.bincount(key, minlength=n_keys)
+        mean = np.stack([np.bincount(key, image[:, i], n_keys) for i in range(3)], -1)
+        kept = np.flatnonzero(count)
+        vectors = mean[kept] / np.linalg.norm(mean[kept], axis=1, keepdims=True)
+        if symmetry.kind == "axis":
+            vectors = _on_meridian(vectors, fine, symmetry, cones, level)
+        cell = np.full(_bin_count(symmetry, level), -1)
+        cell[kept] = np.arange(len(kept))
+        turns = np.full(len(kept), level_turns(level))
+        periods = np.full(len(kept), 2 * np.pi)
+        return cls(vectors, count[kept] / count.sum(), turns, periods, symmetry, cones, level, cell)
+
+    @classmethod
+    def _faces(cls, symmetry: Symmetry, cones: list[tuple[Array, float]] | None, turn_step: float) -> Directions:
+        if symmetry.kind == "sphere":
+            vectors = np.array([cones[0][0] if cones else [0.0, 0.0, 1.0]])
+            periods = np.zeros(1)
+        else:
+            assert cones is not None
+            faces = np.stack([v for v, _ in cones])
+            image = _canonical(faces, symmetry, cones)[1]
+            far = np.linalg.norm(image[:, None] - image[None], axis=-1) > FACE_TOLERANCE
+            first = [i for i in range(len(image)) if far[i, :i].all()]
+            vectors = image[first]
+            periods = np.array([_turn_period(v, symmetry) for v in vectors])
+        turns = np.maximum(1, np.ceil(periods / turn_step - 1e-9)).astype(np.int64)
+        weights = np.full(len(vectors), 1 / len(vectors))
+        return cls(vectors, weights, turns, periods, symmetry, cones, None, np.arange(len(vectors)))
+
+    def rotations(self) -> tuple[Array, NDArray[np.int64], Array]:
+        """R_sensor_object (M, 3, 3) of all cells, direction by direction, their direction (M,) and turn [rad] (M,)."""
+        direction = np.repeat(np.arange(len(self.vectors)), self.turns)
+        turn = np.concatenate([np.arange(n) * p / n for n, p in zip(self.turns, self.periods, strict=True)])
+        Rz = Rotation.from_euler("z", turn[:, None]).as_matrix()
+        return Rz @ facing(self.vectors)[direction], direction, turn
+
+    def draw(self, cells: ArrayLike, rng: np.random.Generator) -> Array:
+        """Rotations (n, 3, 3) uniform within cells (n,), counted as :meth:`rotations` does."""
+        _, direction, turn = self.rotations()
+        k = direction[np.asarray(cells)]
+        psi = turn[np.asarray(cells)] + rng.uniform(-0.5, 0.5, len(k)) * self.periods[k] / self.turns[k]
+        a = self.vectors[k].copy()
+        todo = np.arange(len(k)) if self.level is not None else np.arange(0)
+        for _ in range(50):  # a disk that holds the pixel, until the draw falls into the pixel
+            if not len(todo):
+                break
+            radius = 1.1 * np.sqrt(4 * np.pi / (12 * 4 ** float(self.level or 0)))
+            rho, phi = radius * np.sqrt(rng.random(len(todo))), rng.uniform(0, 2 * np.pi, len(todo))
+            x, y, _ = np.moveaxis(facing(self.vectors[k[todo]]), 1, 0)
+            off = np.tan(rho)[:, None] * (np.cos(phi)[:, None] * x + np.sin(phi)[:, None] * y)
+            new = self.vectors[k[todo]] + off
+            new /= np.linalg.norm(new, axis=1, keepdims=True)
+            fits = (self._cell[_bin(new, self.symmetry, int(self.level or 0))] == k[todo]) & allowed(new, self.cones)
+            a[todo[fits]] = new[fits]
+            todo = todo[~fits]
+        Rz = Rotation.from_euler("z", psi[:, None]).as_matrix()
+        return Rz @ facing(self.vectors[k]) @ np.swapaxes(_smallest_rotation(self.vectors[k], a), -1, -2)
+
+    def canonical(self, T: ArrayLike) -> Array:
+        """The image (n, 4, 4) under the object's symmetry, ``T @ S``, that the grid stores."""
+        T = np.asarray(T, float)
+        sym = self.symmetry
+        if sym.kind == "sphere":
+            R = np.broadcast_to(facing(self.vectors[0]), T[:, :3, :3].shape)
+            return _about(T, sym.centre, R)
+        a = approach_of(T[:, :3, :3])
+        element, _ = _canonical(a, sym, self.cones)
+        T = T @ sym.elements[element]
+        if sym.kind == "axis":
+            a = approach_of(T[:, :3, :3])
+            target = self.vectors[self.direction_of(a)]
+            angle = _azimuth(a, sym.axis) - _azimuth(target, sym.axis)
+            S = Rotation.from_rotvec(angle[:, None] * sym.axis).as_matrix()
+            T = _about(T, sym.centre, T[:, :3, :3] @ S)
+        return T
+
+    def direction_of(self, a: ArrayLike) -> NDArray[np.int64]:
+        """Cell (n,) of canonical approach directions ``a`` (n, 3); where a pixel is not kept, the nearest that is."""
+        a = np.asarray(a, float)
+        if self.level is None:
+            return np.argmax(a @ self.vectors.T, axis=1)
+        cell = self._cell[_bin(a, self.symmetry, self.level)]
+        missing = np.flatnonzero(cell < 0)
+        if len(missing):
+            cell[missing] = np.argmax(a[missing] @ self.vectors.T, axis=1)
+        return cell
+
+    def lookup(self, T: ArrayLike) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+        """Canonical pose (n, 4, 4), direction (n,) and turn index (n,) of the cells that hold ``T`` (n, 4, 4)."""
+        T = self.canonical(T)
+        R = T[:, :3, :3]
+        a = approach_of(R)
+        k = self.direction_of(a)
+        # carry the cell's direction onto the pose's by the smallest rotation: what remains is the turn
+        level = R @ _smallest_rotation(self.vectors[k], a)
+        x = (level @ np.swapaxes(facing(self.vectors[k]), -1, -2))[:, :, 0]
+        n, period = self.turns[k], self.periods[k]
+        safe = np.where(period > 0, period, 1.0)
+        turn = np.arctan2(x[:, 1], x[:, 0]) % (2 * np.pi)
+        j = np.where(period > 0, np.rint((turn % safe) * n / safe).astype(np.int64) % n, 0)
+        return T, k, j
+
+
+def allowed(a: ArrayLike, cones: list[tuple[Array, float]] | None) -> NDArray[np.bool_]:
+    """Whether approach directions ``a`` (..., 3) lie within one of the cones."""
+    a = np.asarray(a, float)
+    if cones is None:
+        return np.ones(a.shape[:-1], bool)
+    ok = np.zeros(a.shape[:-1], bool)
+    for v, half_angle in cones:
+        # the chord keeps its precision at small angles, where the cosine has none
+        chord = np.linalg.norm(a - v, axis=-1)
+        ok |= 2 * np.arcsin(np.minimum(1, chord / 2)) <= half_angle + FACE_TOLERANCE
+    return ok
+
+
+def _canonical(a: Array, symmetry: Symmetry, cones: list[tuple[Array, float]] | None) -> tuple[NDArray[np.int64], Array]:
+    """Which group element (n,) carries each direction to its orbit's canonical allowed image, and that image (n, 3)."""
+    images = np.einsum("gji,nj->ngi", symmetry.elements[:, :3, :3], a)
+    if symmetry.kind == "axis":
+        score = images @ symmetry.axis
+        ok = np.ones(score.shape, bool)
+        if cones is not None:  # a turn about the axis may bring an image into a cone
+            ok = np.zeros(score.shape, bool)
+            for v, half_angle in cones:
+                tilt = np.arccos(np.clip(score, -1, 1)) - np.arccos(np.clip(v @ symmetry.axis, -1, 1))
+                ok |= np.abs(tilt) <= half_angle + FACE_TOLERANCE
+    else:
+        score = images @ _GENERIC
+        ok = allowed(images, cones)
+    best = np.argmax(np.where(ok, score, score - 10.0), axis=1)
+    return best, images[np.arange(len(a)), best]
+
+
+def _bin_count(symmetry: Symmetry, level: int) -> int:
+    return _bands(level) if symmetry.kind == "axis" else 12 * 4**level
+
+
+def _bands(level: int) -> int:
+    """Bands of polar angle about a symmetry axis, as wide as a HEALPix pixel of that level."""
+    return int(np.ceil(np.pi / np.sqrt(4 * np.pi / (12 * 4**level))))
+
+
+def _bin(a: Array, symmetry: Symmetry, level: int) -> NDArray[np.int64]:
+    if symmetry.kind == "axis":
+        n = _bands(level)
+        angle = np.arccos(np.clip(a @ symmetry.axis, -1, 1))
+        return np.minimum((angle / np.pi * n).astype(np.int64), n - 1)
+    return np.asarray(healpix.vec2pix(2**level, *a.T, nest=True), np.int64)
+
+
+def _on_meridian(
+    vectors: Array, fine: Array, symmetry: Symmetry, cones: list[tuple[Array, float]] | None, level: int
+) -> Array:
+    """Directions of the bands' mean polar angle, on an azimuth that the approach allows."""
+    image = _canonical(fine, symmetry, cones)[1]
+    key = _bin(image, symmetry, level)
+    centre = cones[0][0] if cones else facing(symmetry.axis)[0]
+    out = []
+    for k in np.unique(key):
+        member = image[key == k]
+        polar = np.mean(np.arccos(np.clip(member @ symmetry.axis, -1, 1)))
+        side = member[np.argmax(member @ centre)]
+        side = side - (side @ symmetry.axis) * symmetry.axis
+        norm = np.linalg.norm(side)
+        side = side / norm if norm > 1e-9 else facing(symmetry.axis)[0]
+        out.append(np.cos(polar) * symmetry.axis + np.sin(polar) * side)
+    return np.array(out)
+
+
+def _turn_period(a: Array, symmetry: Symmetry) -> float:
+    """Turn after which the object pressed along ``a`` looks the same."""
+    if symmetry.kind == "axis" and abs(abs(a @ symmetry.axis) - 1) < FACE_TOLERANCE**2 * 10:
+        return 0.0
+    same = np.linalg.norm(symmetry.elements[:, :3, :3] @ a - a, axis=-1) < 1e-4
+    return 2 * np.pi / int(same.sum())
+
+
+def _azimuth(a: Array, axis: Array) -> Array:
+    x, y, _ = facing(-axis)
+    return np.arctan2(a @ y, a @ x)
+
+
+def _about(T: Array, centre: Array, R: Array) -> Array:
+    """``T`` with its rotation replaced by ``R``, the object's point ``centre`` staying where it is."""
+    where = T[:, :3, :3] @ centre + T[:, :3, 3]
+    return transform(R, where - R @ centre)
+
+
+def _smallest_rotation(a: Array, b: Array) -> Array:
+    """Rotations (n, 3, 3) that carry unit vectors ``a`` onto ``b`` along great circles (Rodrigues)."""
+    v = np.cross(a, b)
+    c = (a * b).sum(-1)[:, None, None]
+    W = hat(v)
+    return np.eye(3) + W + W @ W / np.maximum(1 + c, 1e-9)

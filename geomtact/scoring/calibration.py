@@ -1,0 +1,129 @@
+"""From scores to probabilities: what a score is worth as evidence, measured on simulated touches.
+
+A score divided by a temperature is taken as a log likelihood, and a small share of every posterior is the uniform
+distribution, for what no score foresees. Both are chosen so that the poses of touches drawn uniformly over the contact
+pose space, felt through elastic and rigid gels and noise of any strength up to heavy, come out as probable as possible:
+the logarithmic score is proper, so what maximises it is calibrated (Gneiting and Raftery 2007).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.index import Index
+from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.touch import CALIBRATION_NOISE, draw_noise, felt_mask, spoilt
+from geomtact.scoring.protocol import Scorer
+from geomtact.se3 import Array
+
+TEMPERATURES = np.geomspace(0.02, 4.0, 16)
+FLOORS = np.geomspace(1e-3, 0.5, 16)
+_SHAPE = {True: (72, 96), False: (96, 72)}  # of the simulated touches, for wide and for tall windows
+_LEAST_CONTACT = 1e-6  # m^2
+
+
+@dataclass(frozen=True)
+class Touches:
+    """Simulated touches with known poses: masks (h, w) over the window, and the pose id (n,) whose cell holds each."""
+
+    masks: list[NDArray[np.bool_]]
+    ids: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """``log likelihood = score / temperature``; ``floor`` is the uniform's share of the posterior.
+
+    ``gain`` is the mean information gained by the touches it was fitted on [nats]; ``usual`` the score of the best
+    pose that all but one in fifty of them reached: an image below it is unlike any touch of the object.
+    """
+
+    temperature: float
+    floor: float
+    gain: float
+    usual: float
+
+
+def simulate_touches(index: Index, n: int, seed: int, progress: Callable[[float, str], None] | None = None) -> Touches:
+    """``n`` touches uniform over the contact pose space, half elastic, with noise of any strength up to heavy.
+
+    Poses are drawn within the cells, not at their centres: the score has to bridge what lies between.
+    """
+    rng = np.random.default_rng(seed)
+    space = ContactSpace(index.mesh, index.sensor, index.approach)
+    wide = bool(index.sensor.half_window[0] >= index.sensor.half_window[1])
+    shape = _SHAPE[wide]
+    pixel = float(4 * index.sensor.half_window.prod() / np.prod(shape))
+    weight = index.weight.ravel().astype(float)
+    total = np.cumsum(weight)
+    masks: list[NDArray[np.bool_]] = []
+    ids: list[int] = []
+    for _ in range(100):
+        drawn = np.searchsorted(total, rng.random(64) * total[-1])
+        T, depth = index.draw(np.minimum(drawn, len(weight) - 1), rng)
+        T, ok = space.settle(T, depth)
+        ok[ok] = np.isfinite(space.penetration(T[ok]))
+        if not ok.any():
+            continue
+        T, depth = T[ok], depth[ok]
+        cell = index.lookup(T, depth)
+        for pose, i in zip(T, cell, strict=True):
+            mask = felt_mask(space, pose, elastic=len(masks) % 2 == 1, shape=shape)
+            if mask.sum() * pixel < min(_LEAST_CONTACT, 12 * pixel):
+                continue
+            masks.append(spoilt(mask, space, draw_noise(CALIBRATION_NOISE, rng), rng))
+            ids.append(int(i))
+            if progress:
+                progress(len(masks) / n, "simulating sensor noise")
+            if len(masks) == n:
+                return Touches(masks, np.array(ids))
+    return Touches(masks, np.array(ids, np.int64))
+
+
+def calibrate(scorer: Scorer, index: Index, touches: Touches) -> Calibration:
+    """The temperature and floor under which the true poses of ``touches`` are most probable."""
+    log_weight = log_weights(index)
+    ratio = np.zeros((len(TEMPERATURES), len(touches.ids)))
+    best_score = np.zeros(len(touches.ids))
+    for i, (mask, true) in enumerate(zip(touches.masks, touches.ids, strict=True)):
+        score = scorer.score(index, mask).ravel()
+        best_score[i] = score.max()
+        score = score - score.max()
+        for j, temperature in enumerate(TEMPERATURES):
+            scaled = score * np.float32(1 / temperature)
+            ratio[j, i] = scaled[true] - _log_sum_exp(scaled + log_weight)
+    # the density at the truth is a mixture of the scored and the uniform one
+    mixed = np.log((1 - FLOORS[:, None, None]) * np.exp(np.minimum(ratio, 500)) + FLOORS[:, None, None]).mean(2)
+    best_floor, best = np.unravel_index(mixed.argmax(), mixed.shape)
+    usual = float(np.quantile(best_score, 0.02))
+    return Calibration(float(TEMPERATURES[best]), float(FLOORS[best_floor]), float(mixed.max()), usual)
+
+
+def log_weights(index: Index) -> NDArray[np.float32]:
+    """Log of the uniform measure of every pose's cell (N,); -inf where the housing forbids the pose."""
+    with np.errstate(divide="ignore"):
+        return np.log(np.asarray(index.weight).ravel())
+
+
+def posterior_log_prob(
+    log_likelihood: NDArray[np.float32], log_prior: NDArray[np.float32], floor: float
+) -> tuple[Array, float]:
+    """Log probability (N,) of every cell, and the log evidence: the likelihood's mean under the prior.
+
+    ``log_prior`` (N,) is the log mass of every cell; ``floor`` the prior's share of the posterior.
+    """
+    joint = log_likelihood.ravel() + log_prior
+    evidence = _log_sum_exp(joint)
+    scored = joint.astype(float) - evidence
+    with np.errstate(divide="ignore"):
+        return np.logaddexp(np.log1p(-floor) + scored, np.log(floor) + log_prior), float(evidence)
+
+
+def _log_sum_exp(x: NDArray[np.float32]) -> float:
+    top = x.max()
+    return float(top + np.log(np.exp(x - top).sum(dtype=np.float64)))
+

@@ -1,0 +1,94 @@
+"""A score with its calibration for one index, fitted once and kept beside the index."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.index import Index
+from geomtact.errors import MeshError, UsageError, nearest_name
+from geomtact.scoring.calibration import Calibration, Touches, calibrate, simulate_touches
+from geomtact.scoring.moments import Moments
+from geomtact.scoring.overlap import OVERLAPS
+from geomtact.scoring.protocol import Scorer
+
+FORMAT = 1
+SCORERS = (*OVERLAPS, "moments")
+_FIT, _JUDGE = 300, 100  # touches the moments are learned from, and touches the temperature is chosen on
+
+
+@dataclass(frozen=True)
+class FittedScorer:
+    """A scorer and what its scores are worth on one index."""
+
+    scorer: Scorer
+    calibration: Calibration
+
+    def log_likelihood(self, index: Index, mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
+        """Log likelihood (P, n) up to a constant, and the score of the best pose."""
+        score = self.scorer.score(index, mask)
+        return score / np.float32(self.calibration.temperature), float(score.max())
+
+
+def fitted_scorer(
+    name: str, index: Index, folder: Path | None = None, progress: Callable[[float, str], None] | None = None
+) -> FittedScorer:
+    """The scorer ``name`` calibrated for ``index``; read from ``folder`` where it was fitted before.
+
+    Raises
+    ------
+    UsageError
+        No scorer of that name.
+    MeshError
+        The object can hardly be touched, so nothing can be calibrated.
+    """
+    if name not in SCORERS:
+        raise UsageError(f"no score named {name!r}{nearest_name(name, SCORERS)}")
+    path = None if folder is None else folder / f"{name}.json"
+    if path is not None:
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            return _from_json(json.loads(path.read_text("utf-8")))
+    touches = simulate_touches(index, _FIT + _JUDGE, seed=20_200_531, progress=progress)
+    if len(touches.ids) < 40:
+        raise MeshError(
+            f"{index.mesh.name}: hardly any pose presses the sensor {index.sensor.name!r} with at least 1 mm2; "
+            "check the object's unit and the approach"
+        )
+    n = len(touches.ids) * _FIT // (_FIT + _JUDGE)
+    scorer: Scorer = (
+        Moments.fit(index, touches.masks[:n], touches.ids[:n]) if name == "moments" else OVERLAPS[name]
+    )
+    fitted = FittedScorer(scorer, calibrate(scorer, index, Touches(touches.masks[n:], touches.ids[n:])))
+    if path is not None:
+        with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
+            handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".json")
+            with os.fdopen(handle, "w") as file:
+                json.dump(_to_json(fitted), file)
+            os.replace(temporary, path)
+    return fitted
+
+
+def _to_json(fitted: FittedScorer) -> dict:
+    out = {"format": FORMAT, "name": fitted.scorer.name, "calibration": asdict(fitted.calibration)}
+    if isinstance(fitted.scorer, Moments):
+        m = fitted.scorer
+        out["moments"] = {"bias": m.bias.tolist(), "covariance": m.covariance.tolist(), "freedom": m.freedom}
+    return out
+
+
+def _from_json(data: dict) -> FittedScorer:
+    if data["format"] != FORMAT:
+        raise ValueError("another format")
+    calibration = Calibration(**data["calibration"])
+    if data["name"] != "moments":
+        return FittedScorer(OVERLAPS[data["name"]], calibration)
+    m = data["moments"]
+    return FittedScorer(Moments(np.array(m["bias"]), np.array(m["covariance"]), m["freedom"]), calibration)

@@ -1,0 +1,110 @@
+"""Rigid transforms: ``T_a_b`` is 4x4 and maps b-coordinates into a, ``p_a = T_a_b @ p_b``.
+
+Twists are ``xi = (rx, ry, rz, tx, ty, tz)``, rotation first, radians and metres, applied on the right:
+``T exp(xi^)`` moves the object in its own frame (Barfoot, State Estimation for Robotics, ch. 7).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from geomtact.errors import PoseError
+
+Array = NDArray[np.float64]
+
+
+def check_transforms(T: ArrayLike, name: str = "T") -> Array:
+    """Return ``T`` as float64 (..., 4, 4) after checking that every matrix is a rigid transform.
+
+    Raises
+    ------
+    PoseError
+        Wrong shape, not finite, or not a rotation within 1e-6; says which.
+    """
+    out = np.asarray(T, dtype=np.float64)
+    if out.ndim < 2 or out.shape[-2:] != (4, 4):
+        raise PoseError(f"{name}: expected rigid transforms of shape (..., 4, 4), got {out.shape}")
+    if not np.isfinite(out).all():
+        raise PoseError(f"{name}: expected finite numbers, got NaN or infinity")
+    R = out[..., :3, :3]
+    error = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0)
+    if error > 1e-6 or (np.linalg.det(R) < 0).any():
+        raise PoseError(
+            f"{name}: the upper left 3x3 is no rotation (R R^T differs from 1 by {error:.2g}); "
+            "orthonormalise it, and give translations in metres"
+        )
+    if np.abs(out[..., 3, :] - [0, 0, 0, 1]).max(initial=0.0) > 1e-9:
+        raise PoseError(f"{name}: the last row must be 0 0 0 1")
+    return out
+
+
+def transform(R: ArrayLike, t: ArrayLike) -> Array:
+    """Homogeneous (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3) [m]."""
+    R, t = np.asarray(R, float), np.asarray(t, float)
+    shape = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+    T = np.zeros((*shape, 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def inverse(T: ArrayLike) -> Array:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    T = np.asarray(T, float)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    return transform(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
+
+
+def apply(T: ArrayLike, points: ArrayLike) -> Array:
+    """Map ``points`` (n, 3) by ``T`` (..., 4, 4) -> (..., n, 3)."""
+    T, points = np.asarray(T, float), np.asarray(points, float)
+    return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+
+
+def hat(w: ArrayLike) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    x, y, z = np.moveaxis(np.asarray(w, float), -1, 0)
+    o = np.zeros_like(x)
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(*x.shape, 3, 3)
+
+
+def exp(xi: ArrayLike) -> Array:
+    """Exponential of twists (..., 6) -> (..., 4, 4) (Barfoot, eqs. 7.25 and 7.37)."""
+    xi = np.asarray(xi, float)
+    w, v = xi[..., :3], xi[..., 3:]
+    theta = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = theta < 1e-5
+    safe = np.where(small, 1.0, theta)
+    a = np.where(small, 0.5 - theta**2 / 24, (1 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1 / 6 - theta**2 / 120, (safe - np.sin(safe)) / safe**3)
+    W = hat(w)
+    V = np.eye(3) + a * W + b * (W @ W)
+    R = Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape[:-1], 3, 3)
+    return transform(R, (V @ v[..., None])[..., 0])
+
+
+def log(T: ArrayLike) -> Array:
+    """Twist (..., 6) whose exponential is ``T`` (..., 4, 4), rotation angle at most pi."""
+    T = np.asarray(T, float)
+    w = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*T.shape[:-2], 3)
+    theta = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = theta < 1e-4
+    safe = np.where(small, 1.0, theta)
+    c = np.where(small, 1 / 12 + theta**2 / 720, 1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.sin(safe) + 1e-300))
+    W = hat(w)
+    V_inv = np.eye(3) - 0.5 * W + c * (W @ W)
+    return np.concatenate([w, (V_inv @ T[..., :3, 3, None])[..., 0]], -1)
+
+
+def random_rotations(n: int, rng: np.random.Generator) -> Array:
+    """``n`` rotations (n, 3, 3) uniform in the Haar measure (Shoemake 1992: normalised Gaussian quaternions)."""
+    q = rng.normal(size=(n, 4))
+    return Rotation.from_quat(q / np.linalg.norm(q, axis=1, keepdims=True)).as_matrix()
+
+
+def quat_xyzw(T: ArrayLike) -> Array:
+    """Unit quaternion (4,) in the order x, y, z, w, with w >= 0, of ``T`` (4, 4)."""
+    return Rotation.from_matrix(np.asarray(T, float)[:3, :3]).as_quat(canonical=True)

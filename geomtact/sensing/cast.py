@@ -1,0 +1,164 @@
+"""What the sensor would feel at a pose, by ray casting (thesis 6.1.3).
+
+A camera with the sensor's own optics looks through the gel; a pixel is in contact where the object comes nearer than
+the membrane. Rays are cast in the object frame, so one Embree scene serves every pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.se3 import Array, apply, inverse
+from geomtact.sensing.contact import Contact
+from geomtact.sensing.sensor import Sensor
+
+_RAYS_PER_CALL = 1 << 18
+
+
+class Caster:
+    """Casts camera rays at one object.
+
+    Parameters
+    ----------
+    vertices : (V, 3) object frame [m]
+    faces : (F, 3) indices into vertices
+    threads : how many poses are cast at once (Embree releases the GIL)
+    """
+
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike, threads: int = 2):
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self.vertices = np.asarray(vertices, float)
+        self.threads = threads
+        self._scene = EmbreeScene()
+        # Embree works in float32: rays start near the object's centre to keep 1e-8 m
+        self._centre = 0.5 * (self.vertices.min(0) + self.vertices.max(0))
+        self._radius = float(np.linalg.norm(self.vertices - self._centre, axis=1).max())
+        corners = (self.vertices - self._centre).astype(np.float32)[np.asarray(faces)]
+        TriangleMesh(self._scene, np.ascontiguousarray(corners))
+
+    def contact(self, sensor: Sensor, T_sensor_object: ArrayLike, shape: tuple[int, int] | None = None) -> Contact:
+        """The contact at one pose ``T_sensor_object`` (4, 4): what the sensor would see, without noise.
+
+        ``shape`` = (h, w) casts on a coarser grid over the same window; by default one ray per image pixel.
+        """
+        depth = self.depths(sensor, np.asarray(T_sensor_object, float)[None], shape)[0]
+        mask = depth > 0
+        return Contact(mask, np.where(mask, depth, 0).astype(np.float32))
+
+    def depths(self, sensor: Sensor, T: ArrayLike, shape: tuple[int, int] | None = None) -> NDArray[np.float32]:
+        """How far below the membrane the object lies along each camera ray: (n, h, w) [m] for poses ``T`` (n, 4, 4).
+
+        Negative where the object stays above the membrane, -inf where the ray misses it.
+        """
+        x, y = sensor.pixel_centres(shape)
+        rays = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        return self.ray_depths(sensor, T, rays).reshape(-1, len(y), len(x))
+
+    def ray_depths(self, sensor: Sensor, T: ArrayLike, rays: ArrayLike) -> NDArray[np.float32]:
+        """As :meth:`depths`, for the camera rays that cross z = 0 at ``rays`` (m, 2) [m]: (n, m)."""
+        T, rays = np.asarray(T, float).reshape(-1, 4, 4), np.asarray(rays, float)
+        out = np.full((len(T), len(rays)), -np.inf, np.float32)
+        per_call = max(1, _RAYS_PER_CALL // max(1, len(rays)))
+        parts = [slice(i, i + per_call) for i in range(0, len(T), per_call)]
+
+        def work(part: slice) -> None:
+            out[part] = self._cast(sensor, T[part], rays)
+
+        if len(parts) < 2:
+            for part in parts:
+                work(part)
+        else:
+            with ThreadPoolExecutor(self.threads) as pool:
+                list(pool.map(work, parts))
+        return out
+
+    def penetration(self, sensor: Sensor, T: ArrayLike) -> Array:
+        """Depth of the object's deepest point inside the window (n,) [m]: > 0 below the membrane.
+
+        Exact for the mesh's vertices and to a quarter of a percent of the window between them; +inf where the camera
+        sits inside the object, -inf where nothing of the object is in the window.
+        """
+        T = np.asarray(T, float).reshape(-1, 4, 4)
+        out = np.full(len(T), -np.inf)
+        inner = np.stack(np.meshgrid(*sensor.pixel_centres((48, 64))), -1).reshape(-1, 2)
+        rays = np.concatenate([inner, _border(sensor)])
+        for part in _slices(len(T), 256):
+            deepest = self.ray_depths(sensor, T[part], rays).max(1).astype(float)
+            out[part] = np.maximum(deepest, self._deepest_vertex(sensor, T[part]))
+            out[part][self._camera_inside(sensor, T[part])] = np.inf
+        return out
+
+    def lowest_outside(self, sensor: Sensor, T: ArrayLike) -> Array:
+        """Lowest z (n,) [m] of the object's vertices outside the window, in the sensor frame; +inf if there are none."""
+        T = np.asarray(T, float).reshape(-1, 4, 4)
+        out = np.full(len(T), np.inf)
+        for part in _slices(len(T), 64):
+            p = apply(T[part], self.vertices)
+            outside = (np.abs(sensor.project(p)) > sensor.half_window).any(-1)
+            out[part] = np.where(outside, p[..., 2], np.inf).min(1)
+        return out
+
+    def _cast(self, sensor: Sensor, T: Array, rays: Array) -> NDArray[np.float32]:
+        R = T[:, :3, :3]
+        if sensor.camera_distance:
+            start = np.broadcast_to([0.0, 0.0, -sensor.camera_distance], (len(T), 1, 3))
+            ray = np.concatenate([rays, np.full((len(rays), 1), sensor.camera_distance)], 1)[None]
+        else:
+            # far enough below for every pose that reaches the membrane at all
+            below = np.linalg.norm(apply(T, self._centre[None])[:, 0], axis=-1) + 2 * self._radius
+            start = np.concatenate(
+                [
+                    np.broadcast_to(rays, (len(T), len(rays), 2)),
+                    np.broadcast_to(-below[:, None, None], (len(T), len(rays), 1)),
+                ],
+                -1,
+            )
+            ray = np.broadcast_to([0.0, 0.0, 1.0], (1, len(rays), 3))
+        origin = (start - T[:, None, :3, 3]) @ R - self._centre
+        direction = ray @ R
+        origin = np.ascontiguousarray(np.broadcast_to(origin, direction.shape), np.float32).reshape(-1, 3)
+        hit = self._scene.run(origin, direction.astype(np.float32).reshape(-1, 3), query="DISTANCE")
+        t = hit.reshape(len(T), len(rays))
+        p = start + t[..., None].astype(float) * ray
+        with np.errstate(over="ignore", invalid="ignore"):
+            depth = -p[..., 2] - sensor.sag(p[..., 0], p[..., 1])
+        return np.where(t < 1e30, depth, -np.inf).astype(np.float32)
+
+    def _deepest_vertex(self, sensor: Sensor, T: Array) -> Array:
+        p = apply(T, self.vertices)
+        in_window = (np.abs(sensor.project(p)) <= sensor.half_window).all(-1)
+        if sensor.camera_distance:
+            in_window &= p[..., 2] > -sensor.camera_distance
+        depth = -p[..., 2] - sensor.sag(p[..., 0], p[..., 1])
+        return np.where(in_window, depth, -np.inf).max(1)
+
+    def _camera_inside(self, sensor: Sensor, T: Array) -> NDArray[np.bool_]:
+        if not sensor.camera_distance:
+            return np.zeros(len(T), bool)
+        camera = apply(inverse(T), np.array([[0.0, 0.0, -sensor.camera_distance]]))[:, 0] - self._centre
+        # an odd direction, so that no ray runs along a face of a machined part
+        direction = np.broadcast_to(np.float32([0.41, 0.33, 0.85]), camera.shape)
+        hit = self._scene.run(camera.astype(np.float32), np.ascontiguousarray(direction), output=True)
+        leaving = (hit["Ng"] * direction).sum(1) > 0
+        return leaving & (hit["primID"] >= 0)
+
+
+def _border(sensor: Sensor) -> Array:
+    """Points (m, 2) along the window's border at half a pixel pitch, just inside."""
+    half = sensor.half_window * (1 - 1e-6)
+    n = 2 * max(sensor.image_size_px)
+    s = np.linspace(-1, 1, n)
+    one = np.ones(n)
+    square = [np.stack(p, 1) for p in ((s, one), (s, -one), (one, s), (-one, s))]
+    return np.concatenate(square) * half
+
+
+def _slices(n: int, size: int) -> Iterator[slice]:
+    for i in range(0, n, size):
+        yield slice(i, i + size)

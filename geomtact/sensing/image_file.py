@@ -1,0 +1,175 @@
+"""Image files: read as they are in RGB order, with one clear error each; written with the touch's metadata."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.errors import ImageError, PoseError
+from geomtact.se3 import check_transforms
+
+MAX_BYTES = 256 * 2**20
+MAX_PIXELS = 64 * 2**20
+_PREFIX = "geomtact:"
+_SUPPORTED = "give a PNG, JPEG, BMP, TIFF or .npy file"
+
+
+def read_image(path: str | Path) -> NDArray[Any]:
+    """The pixels of an image file as stored: (H, W) or (H, W, C), colours in the order R, G, B(, A).
+
+    Raises
+    ------
+    ImageError
+        No such file, empty, too large, no image, or damaged.
+    """
+    path = Path(path)
+    data = _read_bytes(path)
+    if data[:6] == b"\x93NUMPY":
+        return _read_npy(data, path)
+    if data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return _read_tiff(data, path)
+    return _read_coded(data, path)
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """What ``geomtact simulate`` wrote into a PNG, under the keys it has there; {} where there is nothing.
+
+    ``geomtact:object`` and ``geomtact:sensor`` are strings, ``geomtact:T_sensor_object`` an array (4, 4) [m].
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    data = _read_bytes(Path(path))
+    if data[:8] != b"\x89PNG\r\n\x1a\n":
+        return {}
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            image.load()
+            text = dict(getattr(image, "text", {}))
+    except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path}: the image is truncated or damaged ({error}); save or copy it again") from None
+    found: dict[str, Any] = {key: value for key, value in text.items() if key.startswith(_PREFIX)}
+    pose = f"{_PREFIX}T_sensor_object"
+    if pose in found:
+        try:
+            found[pose] = check_transforms(json.loads(found[pose]), pose)
+        except (ValueError, TypeError, PoseError) as error:
+            raise ImageError(f"{path}: its entry {pose} is no rigid transform ({error}); write it again") from None
+    return found
+
+
+def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] | None = None) -> None:
+    """Write a PNG: a mask as 0/255, a height map [m] as 16-bit micrometres, an RGB image (uint8) as it is.
+
+    ``metadata``: ``object``, ``sensor``, ``T_sensor_object`` (4, 4), with or without the prefix ``geomtact:`` that they
+    carry in the file.
+    """
+    from PIL import Image, PngImagePlugin
+
+    array = np.asarray(array)
+    if array.dtype == bool and array.ndim == 2:
+        pixels = np.where(array, 255, 0).astype(np.uint8)
+    elif array.dtype.kind == "f" and array.ndim == 2:
+        if not np.isfinite(array).all() or array.min(initial=0) < 0 or array.max(initial=0) > 0.0655:
+            raise ImageError("heights to write must lie between 0 and 0.0655 m; give metres")
+        pixels = np.round(array * 1e6).astype(np.uint16)
+    elif array.dtype == np.uint8 and array.ndim in (2, 3):
+        pixels = array
+    else:
+        raise ImageError(f"cannot write {array.dtype} {array.shape}: give a bool mask, float heights [m] or uint8 RGB")
+    info = PngImagePlugin.PngInfo()
+    for key, value in (metadata or {}).items():
+        text = value if isinstance(value, str) else json.dumps(np.asarray(value).tolist())
+        info.add_text(_PREFIX + key.removeprefix(_PREFIX), text)
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        # an image is written whole or not at all
+        Image.fromarray(pixels).save(partial, format="PNG", pnginfo=info)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise ImageError(f"{path}: cannot be written ({error.strerror or error}); give another folder") from None
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        size = path.stat().st_size
+        if path.is_dir():
+            raise ImageError(f"{path}: expected an image file, got a folder; {_SUPPORTED}")
+        if size == 0:
+            raise ImageError(f"{path}: the file is empty (0 bytes); {_SUPPORTED}")
+        if size > MAX_BYTES:
+            raise ImageError(f"{path}: {size / 2**20:.0f} MiB, more than {MAX_BYTES / 2**20:.0f} MiB; is it one image?")
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise ImageError(f"{path}: no such file; give the path of an image") from None
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def _read_npy(data: bytes, path: Path) -> NDArray[Any]:
+    try:
+        return np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ImageError(
+            f"{path}: not a whole .npy array of numbers ({error}); save it again with numpy.save"
+        ) from None
+
+
+def _read_tiff(data: bytes, path: Path) -> NDArray[Any]:
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(io.BytesIO(data)) as file:
+            if len(file.pages) == 0:
+                raise ImageError(f"{path}: the TIFF file is damaged (no page in it); save it again")
+            if len(file.pages) > 1:
+                raise ImageError(f"{path}: expected one image, got {len(file.pages)} pages; save one page")
+            page = file.pages[0]
+            _check_pixels(path, page.shape[1] if len(page.shape) > 1 else 1, page.shape[0])
+            image = page.asarray()
+            # tifffile hands out channels as stored; planar images keep them first
+            return np.moveaxis(image, 0, -1) if image.ndim == 3 and image.shape[0] in (3, 4) else image
+    except ImageError:
+        raise
+    except Exception as error:  # noqa: BLE001  (tifffile raises whatever its codecs raise)
+        raise ImageError(f"{path}: the TIFF file is damaged ({error}); save it again") from None
+
+
+def _read_coded(data: bytes, path: Path) -> NDArray[Any]:
+    """PNG, JPEG, BMP and what else OpenCV reads."""
+    import cv2
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(data)) as header:
+            _check_pixels(path, *header.size)
+            # OpenCV fills what is missing of a truncated file with grey and says nothing
+            header.load()
+    except UnidentifiedImageError:
+        raise ImageError(f"{path}: not an image; {_SUPPORTED}") from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path}: the image is truncated or damaged ({error}); save or copy it again") from None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise ImageError(f"{path}: OpenCV cannot decode this image; {_SUPPORTED}")
+    if image.ndim == 3 and image.shape[2] >= 3:
+        image = image[..., [2, 1, 0, *range(3, image.shape[2])]]
+    return np.ascontiguousarray(image)
+
+
+def _check_pixels(path: Path, width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        raise ImageError(
+            f"{path}: {width} x {height} px is more than {MAX_PIXELS // 2**20} million; is it a sensor image?"
+        )

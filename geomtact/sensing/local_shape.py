@@ -1,0 +1,277 @@
+"""From an RGB reading to the contact mask (the thesis's local shape), without a calibration of the lights.
+
+The difference from the background is taken as a linear image of the gel's slope. Its two strongest colour directions
+span the slope; the 2x2 map that is left unknown is the one that makes the slope field a gradient (free of curl). Its
+integral is the gel's indentation up to a factor; the rim of the contact is where, on the way up, the gel is steepest.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.errors import ImageError
+from geomtact.se3 import Array
+from geomtact.sensing.sensor import Sensor
+
+Mask = NDArray[np.bool_]
+
+_GREY = 1 / 255
+_STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
+_NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
+_CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like slopes
+
+
+def contact_mask(image: Any, background: Any = None, sensor: Sensor | str | None = None) -> Mask:
+    """Where the object touches, in an RGB reading.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8 or float 0..1, RGB
+    background : (H, W, 3) the same sensor without contact; None: a smooth one is estimated from the image itself,
+        which serves for contacts much smaller than the window
+    sensor : gives the pixel pitch where columns and rows differ, and the size to check; None: square pixels
+
+    Returns
+    -------
+    (H, W) bool; all False where nothing stands out of the image's own noise
+    """
+    from scipy import ndimage
+
+    image = _as_unit_rgb(image, "image")
+    pitch = np.ones(2)
+    if sensor is not None:
+        sensor = Sensor.load(sensor)
+        pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
+        if image.shape[:2] != sensor.image_size_px[::-1]:
+            raise ImageError(
+                f"image: expected {sensor.image_size_px[0]} x {sensor.image_size_px[1]} px for sensor {sensor.name}, "
+                f"got {image.shape[1]} x {image.shape[0]} px; name the sensor that took it"
+            )
+    reference = None if background is None else _same_size(_as_unit_rgb(background, "background"), image)
+    # one smoothing scale from the resolution, 2 px at 320 x 240; a second look smooths more where noise asks for it
+    sigma = min(image.shape[:2]) / 120
+    change, felt, strong, noise = _change(image, reference, sigma)
+    if felt.any():
+        noise_share = noise / float(np.quantile(np.linalg.norm(change, axis=-1)[felt], 0.9))
+        if noise_share > _NOISE_SHARE:
+            sigma *= min(noise_share / _NOISE_SHARE, 2.0)
+            change, felt, strong, _ = _change(image, reference, sigma)
+    if not felt.any():
+        return felt
+    slope = _slope_field(change, felt, sigma, pitch)
+    if slope is None:
+        height = np.linalg.norm(change, axis=-1) * felt
+        mask = ndimage.binary_fill_holes(height > 0.5 * np.quantile(height[felt], 0.95))
+    else:
+        height = _indentation(_integrate(slope, pitch), felt)
+        mask = _inside_rim(height, slope, felt, sigma)
+    return _components(mask, height, strong, sigma)
+
+
+def smooth_background(image: Array) -> Array:
+    """A background (H, W, 3) for ``image`` (H, W, 3): the smooth surface (degree 5) that most of its pixels lie on."""
+    h, w = image.shape[:2]
+    along_y, along_x = (np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, n), 5) for n in (h, w))
+    terms = [(i, j) for i in range(6) for j in range(6 - i)]
+    basis = np.stack([np.outer(along_y[:, i], along_x[:, j]).ravel() for i, j in terms], -1)
+    values = image.reshape(-1, 3)
+    keep = np.ones(len(values), bool)
+    for _ in range(8):
+        fit = basis @ np.linalg.lstsq(basis[keep][::7], values[keep][::7], rcond=None)[0]
+        error = np.abs(values - fit).sum(1)
+        keep = error <= np.quantile(error, 0.7)
+    return fit.reshape(image.shape)
+
+
+def _as_unit_rgb(image: Any, name: str) -> Array:
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
+        raise ImageError(f"{name}: expected an RGB image (H, W, 3), got an array of shape {image.shape}")
+    if image.dtype == np.uint8:
+        return image / 255.0
+    if image.dtype.kind != "f":
+        raise ImageError(f"{name}: expected uint8 or float 0..1, got {image.dtype}; convert it")
+    image = image.astype(float)
+    if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
+        raise ImageError(f"{name}: expected finite values from 0 to 1, got NaN or others; divide by the white value")
+    return image
+
+
+def _same_size(background: Array, image: Array) -> Array:
+    if background.shape != image.shape:
+        raise ImageError(
+            f"background: expected the size of the image, {image.shape[1]} x {image.shape[0]} px, "
+            f"got {background.shape[1]} x {background.shape[0]} px; take it with the same sensor"
+        )
+    return background
+
+
+def _change(image: Array, background: Array | None, sigma: float) -> tuple[Array, Mask, Mask, float]:
+    """The smoothed change (H, W, 3) from the background, where it is felt and where strongly so, and its noise."""
+    from scipy import ndimage
+
+    smooth = ndimage.gaussian_filter(image, (sigma, sigma, 0))
+    reference = (
+        smooth_background(smooth) if background is None else ndimage.gaussian_filter(background, (sigma, sigma, 0))
+    )
+    change = _without_light_drift(smooth, reference)
+    # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
+    floor = 0.0 if background is not None else float(np.median(np.linalg.norm(change, axis=-1)))
+    return change, *_felt(change, sigma, floor)
+
+
+def _without_light_drift(image: Array, reference: Array) -> Array:
+    """``image`` minus the background, whose brightness is fitted per channel (gain, offset) to the calmer half."""
+    out = np.empty_like(image)
+    for c in range(3):
+        x, y = reference[..., c].ravel(), image[..., c].ravel()
+        keep = np.ones(x.size, bool)
+        for _ in range(6):
+            dx = x[keep] - x[keep].mean()
+            variance = float((dx**2).mean())
+            gain = float((dx * y[keep]).mean() / variance) if variance > _GREY**2 else 1.0
+            gain = float(np.clip(gain, 0.8, 1.25))
+            offset = float(y[keep].mean() - gain * x[keep].mean())
+            error = np.abs(y - gain * x - offset)
+            keep = error <= np.median(error)
+        out[..., c] = image[..., c] - gain * reference[..., c] - offset
+    return out
+
+
+def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]:
+    """The regions (H, W) that stand out of the noise somewhere, those places, and the noise: hysteresis."""
+    from scipy import ndimage
+
+    step = max(1, round(3 * sigma))
+    noise2 = 0.0
+    for c in range(3):
+        # second differences over three smoothing lengths cancel slopes, and most pixels lie outside any rim
+        second = [
+            np.abs(a[2 * step :] - 2 * a[step:-step] + a[: -2 * step]) for a in (change[..., c], change[..., c].T)
+        ]
+        deviation = np.median(np.concatenate([s.ravel() for s in second])) / 0.6745 / np.sqrt(6)
+        noise2 += max(float(deviation), 0.25 * _GREY) ** 2
+    noise = max(np.sqrt(noise2), floor)
+    size = np.linalg.norm(change, axis=-1)
+    strong = size > max(_STRONG * noise, 5 * _GREY)
+    strong = ndimage.binary_opening(strong, iterations=max(1, round(sigma)))
+    weak = size > max(_WEAK * noise, 0.05 * float(size.max()))
+    weak = ndimage.binary_fill_holes(ndimage.binary_closing(weak, iterations=max(1, round(2 * sigma))) | weak)
+    labels, _ = ndimage.label(weak)
+    kept = np.unique(labels[strong])
+    return np.isin(labels, kept[kept > 0]), strong, float(noise)
+
+
+def _slope_field(change: Array, felt: Mask, sigma: float, pitch: Array) -> Array | None:
+    """The gel's slope (H, W, 2) up to a factor; None where the colours of the lights do not tell it."""
+    from scipy import ndimage
+
+    values = change[felt]
+    power, colours = np.linalg.eigh(values.T @ values / len(values))
+    if power[1] < 1e-3 * power[2]:
+        return None
+    plane = change @ (colours[:, 1:] / np.sqrt(power[1:]))
+    plane = np.stack([ndimage.gaussian_filter(plane[..., i], sigma) for i in (0, 1)], -1)
+    along_y, along_x = np.gradient(plane, axis=0) / pitch[1], np.gradient(plane, axis=1) / pitch[0]
+    curl = np.concatenate([along_y, -along_x], -1)[felt]
+    residual, maps = np.linalg.eigh(curl.T @ curl)
+    if residual[0] > _CURL_LIMIT * residual[-1]:
+        return None
+    return plane @ maps[:, 0].reshape(2, 2).T
+
+
+def _integrate(slope: Array, pitch: Array) -> Array:
+    """The height (H, W) whose gradient is nearest to ``slope``, mirrored at the border (Frankot, Chellappa 1988)."""
+    from scipy import fft
+
+    h, w = slope.shape[:2]
+    gx, gy = slope[..., 0], slope[..., 1]
+    gx = np.block([[gx, -gx[:, ::-1]], [gx[::-1], -gx[::-1, ::-1]]])
+    gy = np.block([[gy, gy[:, ::-1]], [-gy[::-1], -gy[::-1, ::-1]]])
+    kx = 2 * np.pi * fft.fftfreq(2 * w)[None, :] / pitch[0]
+    ky = 2 * np.pi * fft.fftfreq(2 * h)[:, None] / pitch[1]
+    k2 = kx**2 + ky**2
+    k2[0, 0] = 1.0
+    return fft.ifft2(-1j * (kx * fft.fft2(gx) + ky * fft.fft2(gy)) / k2).real[:h, :w]
+
+
+def _indentation(height: Array, felt: Mask) -> Array:
+    """``height`` (H, W) with its sign and zero set: the gel rests where nothing is felt, pressed in elsewhere."""
+    from scipy import ndimage
+
+    unfelt = float((~felt).mean())
+    if unfelt > 0.15:
+        depth = ndimage.distance_transform_edt(felt)[felt]
+        inward = ((height[felt] - height[felt].mean()) * depth).sum()
+    else:
+        # a contact that fills the window: the dome's difference from the object is curved downwards over most of it
+        inward = -np.median(ndimage.laplace(height)[felt])
+    if inward < 0:
+        height = -height
+    rest = np.median(height[~felt]) if unfelt > 0.05 else np.quantile(height, 0.02)
+    return np.maximum(height - rest, 0) * felt
+
+
+def _inside_rim(height: Array, slope: Array, felt: Mask, sigma: float) -> Mask:
+    """Where the walk uphill to the deepest indentation no longer meets a slope much steeper than the one underfoot.
+
+    Inside a contact the gel takes the object's shape; outside it relaxes, and the slope dies away from the rim on.
+    """
+    from scipy import ndimage
+
+    steep = np.linalg.norm(slope, axis=-1)
+    ahead = ndimage.gaussian_filter(_uphill_maximum(height, steep), 2 * sigma)
+    share = steep / np.maximum(ahead, 1e-12)
+    share[height > 0.6 * float(height.max())] = 1.0
+    inside = (height > 0.1 * float(height.max())) & (share >= _steepest_fall(share, felt))
+    return ndimage.binary_opening(ndimage.binary_fill_holes(inside), iterations=max(1, round(2 * sigma)))
+
+
+def _steepest_fall(share: Array, felt: Mask) -> float:
+    """The level of ``share`` (H, W) on whose contour it falls fastest in the mean."""
+    edges = np.linspace(0.4, 0.9, 21)
+    fall = np.hypot(*np.gradient(share))[felt]
+    bins = np.digitize(share[felt], edges)
+    count = np.bincount(bins, minlength=22)[1:-1]
+    mean = np.bincount(bins, fall, minlength=22)[1:-1] / np.maximum(count, 1)
+    mean = np.convolve(np.pad(mean, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    return float(edges[int(mean.argmax())] + 0.0125)
+
+
+def _uphill_maximum(height: Array, value: Array) -> Array:
+    """The largest ``value`` (H, W) on the steepest way up from each pixel to its summit of ``height`` (H, W)."""
+    h, w = height.shape
+    index = np.arange(h * w).reshape(h, w)
+    padded = np.pad(height, 1, constant_values=-np.inf)
+    best, target = height.copy(), index.copy()
+    for dy, dx in ((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)):
+        neighbour = padded[1 + dy : 1 + dy + h, 1 + dx : 1 + dx + w]
+        higher = neighbour > best
+        target[higher] = (index + dy * w + dx)[higher]
+        best = np.maximum(best, neighbour)
+    way, out = target.ravel(), value.ravel().copy()
+    # pointer jumping: every round doubles the length of way that is seen
+    while True:
+        out = np.maximum(out, out[way])
+        further = way[way]
+        if np.array_equal(further, way):
+            return out.reshape(h, w)
+        way = further
+
+
+def _components(mask: Mask, height: Array, strong: Mask, sigma: float) -> Mask:
+    """The components of ``mask`` that are pressed in, backed by a strong change and larger than the smoothing."""
+    from scipy import ndimage
+
+    labels, n = ndimage.label(mask)
+    if n == 0:
+        return mask
+    area = np.bincount(labels.ravel(), minlength=n + 1)
+    backed = np.bincount(labels[strong], minlength=n + 1)
+    deepest = np.r_[0.0, ndimage.maximum(height, labels, range(1, n + 1))]
+    keep = (area > np.pi * (2 * sigma) ** 2) & (backed > 0) & (deepest > 0.3 * height.max())
+    keep[0] = False
+    return keep[labels]

@@ -1,0 +1,204 @@
+"""What one image of the sensor says: a mask, a height map or an RGB reading becomes a contact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.errors import ImageError, UsageError, nearest_name
+from geomtact.sensing.contact import Contact
+from geomtact.sensing.image_file import read_image, read_metadata, write_image
+from geomtact.sensing.local_shape import contact_mask
+from geomtact.sensing.sensor import Sensor
+
+__all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observation", "write_image"]
+
+KINDS = ("auto", "mask", "height", "reading")
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One image and the contact it shows.
+
+    Attributes
+    ----------
+    contact : Contact on the sensor's image grid; an all-False mask means that nothing touches
+    kind : "mask", "height" or "reading", as given or as decided
+    warnings : what was assumed on the way, one line each
+    image : the array as read: (H, W) or (H, W, 3), alpha dropped
+    """
+
+    contact: Contact
+    kind: str
+    warnings: list[str] = field(default_factory=list)
+    image: NDArray[Any] = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+
+
+def read_observation(
+    image: str | Path | ArrayLike,
+    sensor: Sensor | str | Path,
+    kind: str = "auto",
+    background: str | Path | ArrayLike | None = None,
+) -> Observation:
+    """Read an image as a contact.
+
+    Parameters
+    ----------
+    image : path or array. ``auto`` takes bool or two-valued as a mask; float (H, W) as a height [m]; 16-bit grey as a
+        height in micrometres; three channels, RGB, uint8 or float 0..1, as a reading; other grey as a reading
+    sensor : whose image it is; another size is an error
+    kind : "auto", "mask", "height" or "reading"
+    background : for a reading, the same sensor without contact
+
+    Raises
+    ------
+    ImageError
+        Unreadable, of another size, not finite, negative heights, heights in another unit.
+    """
+    sensor = Sensor.load(sensor)
+    if kind not in KINDS:
+        raise UsageError(f"unknown kind {kind!r}{nearest_name(str(kind), KINDS)}")
+    warnings: list[str] = []
+    name, array = _load(image, "image", warnings)
+    _check_size(array, sensor, name)
+    if kind == "auto":
+        kind = _decide(array, name, warnings)
+    if background is not None and kind != "reading":
+        warnings.append(f"the background is not used: a {kind} needs none")
+    if kind == "mask":
+        contact = Contact(_mask(array, name, warnings))
+    elif kind == "height":
+        height = _height(array, name, sensor, warnings)
+        contact = Contact(height > 0, height)
+    else:
+        contact = Contact(_reading(array, name, sensor, background, warnings))
+    if contact.mask.all():
+        warnings.append(f"{name}: every pixel is in contact; the outline lies outside the window and tells nothing")
+    return Observation(contact, kind, warnings, array)
+
+
+def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any]]:
+    """The name and the array (H, W) or (H, W, 3) behind a path or an array; opaque alpha is dropped."""
+    if isinstance(source, str | Path):
+        name, array = str(source), read_image(source)
+    else:
+        name, array = role, np.asarray(source)
+    if array.dtype.kind not in "buif":
+        raise ImageError(f"{name}: expected numbers, got an array of {array.dtype}; give bool, integers or floats")
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[..., 0]
+    if array.size == 0 or array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] > 4):
+        raise ImageError(f"{name}: expected (H, W) or (H, W, 3), got an array of shape {array.shape}; give one image")
+    if array.ndim == 3 and array.shape[2] in (2, 4):
+        alpha = array[..., -1]
+        opaque = 1.0 if array.dtype.kind == "f" else np.iinfo(array.dtype).max if array.dtype.kind in "ui" else True
+        if (alpha != opaque).any():
+            raise ImageError(
+                f"{name}: the image has transparent pixels; flatten it or save it without an alpha channel"
+            )
+        array = array[..., :-1] if array.shape[2] == 4 else array[..., 0]
+        warnings.append(f"{name}: the opaque alpha channel was dropped")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ImageError(
+            f"{name}: {int((~np.isfinite(array)).sum())} values are NaN or infinite; fill them or set them to 0"
+        )
+    if array.ndim == 3 and (array == array[..., :1]).all():
+        array = array[..., 0]
+    return name, array
+
+
+def _check_size(array: NDArray[Any], sensor: Sensor, name: str) -> None:
+    height, width = array.shape[:2]
+    if (width, height) == sensor.image_size_px:
+        return
+    wanted, given = "{} x {} px".format(*sensor.image_size_px), f"{width} x {height} px"
+    if (height, width) == sensor.image_size_px:
+        hint = "the image is transposed: rotate it by 90 degrees, as the camera sees it"
+    elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
+        hint = "the shape agrees: resize the image, or describe this resolution in a sensor file of its own"
+    else:
+        hint = "name the sensor that took it"
+    raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
+
+
+def _decide(array: NDArray[Any], name: str, warnings: list[str]) -> str:
+    if array.ndim == 3:
+        return "reading"
+    if array.dtype == bool or _two_valued(array):
+        return "mask"
+    if array.dtype.kind == "f" or array.dtype == np.uint16:
+        return "height"
+    warnings.append(f"{name}: a grey image with many values is taken as a reading; for a mask or height give --kind")
+    return "reading"
+
+
+def _two_valued(array: NDArray[Any]) -> bool:
+    """Zeros and one other value; a single value counts if it is how masks say yes or no."""
+    top = array.max()
+    if top == array.min():
+        return bool(top in (0, 1, 255))
+    return bool(array.min() == 0 and ((array == 0) | (array == top)).all())
+
+
+def _mask(array: NDArray[Any], name: str, warnings: list[str]) -> NDArray[np.bool_]:
+    if array.ndim == 3:
+        raise ImageError(f"{name}: a mask has one channel, got a colour image; save it as grey or give --kind reading")
+    if array.dtype != bool and not _two_valued(array):
+        warnings.append(f"{name}: the mask has more than two values; every pixel that is not 0 counts as contact")
+    return array != 0
+
+
+def _height(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str]) -> NDArray[np.float32]:
+    if array.ndim == 3:
+        raise ImageError(f"{name}: a height map has one channel, got a colour image; give --kind reading")
+    if array.dtype == np.uint16:
+        height = array * 1e-6
+    elif array.dtype.kind == "f":
+        height = array.astype(np.float64)
+    else:
+        raise ImageError(
+            f"{name}: heights must be float (metres) or 16-bit (micrometres), got {array.dtype}; convert them"
+        )
+    lowest, highest = float(height.min()), float(height.max())
+    if lowest < -1e-6:
+        raise ImageError(
+            f"{name}: heights are depths of the gel's indentation, >= 0; the lowest is {lowest:.4g} m; flip or clip"
+        )
+    if lowest < 0:
+        warnings.append(f"{name}: heights down to {lowest * 1e6:.2g} micrometres were set to 0")
+    if highest > 10 * sensor.max_penetration:
+        raise ImageError(
+            f"{name}: expected heights in metres up to about {sensor.max_penetration:g}, the largest is {highest:.4g}; "
+            "convert to metres (16-bit: micrometres), or give --kind mask"
+        )
+    if highest > 1.5 * sensor.max_penetration:
+        warnings.append(f"{name}: heights up to {1e3 * highest:.2f} mm exceed the sensor's max_penetration_mm")
+    return np.maximum(height, 0).astype(np.float32)
+
+
+def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, warnings: list[str]) -> NDArray[np.bool_]:
+    reference = None
+    if background is None:
+        warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself")
+    else:
+        label, reference = _load(background, "background", warnings)
+        _check_size(reference, sensor, label)
+        reference = _rgb(reference, label)
+    return contact_mask(_rgb(array, name), reference, sensor)
+
+
+def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:
+    """(H, W, 3) uint8 or float 0..1; grey is repeated."""
+    if array.dtype.kind in "ui" and array.dtype.itemsize > 1:
+        array = array / float(np.iinfo(np.uint16).max if array.dtype == np.uint16 else max(255, int(array.max())))
+    elif array.dtype == bool:
+        array = array.astype(float)
+    if array.dtype.kind == "f" and (array.min() < 0 or array.max() > 1):
+        raise ImageError(
+            f"{name}: a float reading must lie in 0..1, got {array.min():.4g} to {array.max():.4g}; divide by 255"
+        )
+    return np.repeat(array[..., None], 3, -1) if array.ndim == 2 else array

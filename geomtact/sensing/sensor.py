@@ -1,0 +1,228 @@
+"""The sensor: a camera behind a gel membrane, described by a TOML file.
+
+The frame is the one of docs/conventions.md: origin at the image centre on the undeformed membrane, +x along
+image columns, +y along rows, +z out towards the object. The camera sits at (0, 0, -camera_distance).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from geomtact.errors import SensorError, nearest_name
+from geomtact.se3 import Array
+
+_KEYS = {
+    "name": str,
+    "image_size_px": list,
+    "pixel_pitch_mm": list,
+    "camera_distance_mm": float,
+    "max_penetration_mm": float,
+    "membrane_radius_mm": float,
+    "housing_depth_mm": float,
+    "note": str,
+}
+_REQUIRED = ("name", "image_size_px", "pixel_pitch_mm", "camera_distance_mm", "max_penetration_mm")
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Geometry of a tactile sensor. Lengths are metres.
+
+    Attributes
+    ----------
+    name : str
+    image_size_px : (width, height) of the image, pixels
+    pixel_pitch : (along x, along y) on the membrane at z = 0
+    camera_distance : camera centre to membrane; 0 means orthographic
+    max_penetration : how far an object can press into the gel
+    membrane_radius : 0 means flat; otherwise the gel bulges towards the object with this radius
+    housing_depth : how far the object may reach below z = 0 outside the window; None rules nothing out
+    note : where the figures come from
+    """
+
+    name: str
+    image_size_px: tuple[int, int]
+    pixel_pitch: tuple[float, float]
+    camera_distance: float
+    max_penetration: float
+    membrane_radius: float = 0.0
+    housing_depth: float | None = None
+    note: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        def need(ok: bool, what: str) -> None:
+            if not ok:
+                raise SensorError(f"sensor {self.name!r}: {what}")
+
+        need(all(n >= 8 for n in self.image_size_px), f"image_size_px must be at least 8, got {self.image_size_px}")
+        need(all(p > 0 for p in self.pixel_pitch), f"pixel_pitch_mm must be positive, got {self.pixel_pitch}")
+        need(self.max_penetration > 0, "max_penetration_mm must be positive")
+        need(self.camera_distance >= 0, "camera_distance_mm must be >= 0 (0 means orthographic)")
+        need(
+            self.camera_distance == 0 or self.camera_distance > 2 * self.max_penetration,
+            "camera_distance_mm must exceed twice max_penetration_mm",
+        )
+        half_diagonal = float(np.hypot(*self.half_window))
+        need(
+            self.membrane_radius == 0 or self.membrane_radius > 1.02 * half_diagonal,
+            f"membrane_radius_mm must be 0 (flat) or exceed the window's half diagonal, {1e3 * half_diagonal:.2f} mm",
+        )
+        need(self.housing_depth is None or self.housing_depth >= 0, "housing_depth_mm must be >= 0")
+
+    @classmethod
+    def load(cls, source: str | Path | Sensor) -> Sensor:
+        """A bundled sensor by name, or one from a TOML file.
+
+        Raises
+        ------
+        SensorError
+            Unknown name (the nearest is named), unreadable file, unknown or missing key, wrong type.
+        """
+        if isinstance(source, Sensor):
+            return source
+        text = str(source)
+        if text in bundled_sensors():
+            return cls.from_toml(_folder().joinpath(f"{text}.toml").read_text("utf-8"), text)
+        path = Path(text)
+        if path.suffix == ".toml" or path.is_file():
+            try:
+                return cls.from_toml(path.read_text("utf-8"), str(path))
+            except (OSError, UnicodeDecodeError) as error:
+                raise SensorError(f"sensor file {path}: cannot be read ({error}); give a TOML file") from None
+        raise SensorError(f"no sensor named {text!r}{nearest_name(text, bundled_sensors())}; or give a .toml file")
+
+    @classmethod
+    def from_toml(cls, text: str, origin: str = "sensor") -> Sensor:
+        """Parse the TOML text of one sensor; ``origin`` names it in errors."""
+        try:
+            data = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise SensorError(f"{origin}: not valid TOML ({error})") from None
+        for key in data:
+            if key not in _KEYS:
+                raise SensorError(f"{origin}: unknown key {key!r}{nearest_name(key, _KEYS)}")
+        for key in _REQUIRED:
+            if key not in data:
+                raise SensorError(f"{origin}: the key {key!r} is missing")
+        for key, value in data.items():
+            wanted = _KEYS[key]
+            number = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+            if (wanted is float and not number) or (wanted is str and not isinstance(value, str)):
+                raise SensorError(f"{origin}: {key} must be a {wanted.__name__}, got {value!r}")
+            if wanted is list and not (
+                isinstance(value, list)
+                and len(value) == 2
+                and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+            ):
+                raise SensorError(f"{origin}: {key} must be two numbers (along x, along y), got {value!r}")
+        if any(v != int(v) for v in data["image_size_px"]):
+            raise SensorError(f"{origin}: image_size_px must be whole numbers, got {data['image_size_px']}")
+        housing = data.get("housing_depth_mm")
+        width, height = data["image_size_px"]
+        pitch_x, pitch_y = data["pixel_pitch_mm"]
+        return cls(
+            name=data["name"],
+            image_size_px=(int(width), int(height)),
+            pixel_pitch=(pitch_x / 1e3, pitch_y / 1e3),
+            camera_distance=data["camera_distance_mm"] / 1e3,
+            max_penetration=data["max_penetration_mm"] / 1e3,
+            membrane_radius=data.get("membrane_radius_mm", 0.0) / 1e3,
+            housing_depth=None if housing is None else housing / 1e3,
+            note=data.get("note", ""),
+        )
+
+    def to_toml(self) -> str:
+        """The TOML text that :meth:`from_toml` reads back to an equal sensor."""
+
+        def mm(metres: float) -> str:
+            return repr(float(f"{metres * 1e3:.12g}"))
+
+        lines = [
+            f"name = {_toml_string(self.name)}",
+            f"image_size_px = [{self.image_size_px[0]}, {self.image_size_px[1]}]",
+            f"pixel_pitch_mm = [{mm(self.pixel_pitch[0])}, {mm(self.pixel_pitch[1])}]",
+            f"camera_distance_mm = {mm(self.camera_distance)}",
+            f"max_penetration_mm = {mm(self.max_penetration)}",
+            f"membrane_radius_mm = {mm(self.membrane_radius)}",
+        ]
+        if self.housing_depth is not None:
+            lines.append(f"housing_depth_mm = {mm(self.housing_depth)}")
+        if self.note:
+            lines.append(f"note = {_toml_string(self.note)}")
+        return "\n".join(lines) + "\n"
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the geometry (not of the note)."""
+        geometry = [getattr(self, f.name) for f in fields(self) if f.compare]
+        return hashlib.sha256(repr(geometry).encode()).hexdigest()
+
+    @property
+    def half_window(self) -> Array:
+        """Half width and half height (2,) of the window on the membrane [m]."""
+        return 0.5 * np.asarray(self.image_size_px) * np.asarray(self.pixel_pitch)
+
+    def sag(self, x: ArrayLike, y: ArrayLike) -> Array:
+        """How far the membrane lies below its apex at (x, y) [m]: z_membrane = -sag."""
+        x, y = np.asarray(x, float), np.asarray(y, float)
+        if self.membrane_radius == 0:
+            return np.zeros(np.broadcast_shapes(x.shape, y.shape))
+        r2 = np.minimum(x**2 + y**2, self.membrane_radius**2)
+        return r2 / (self.membrane_radius + np.sqrt(self.membrane_radius**2 - r2))
+
+    def pixel_centres(self, shape: tuple[int, int] | None = None) -> tuple[Array, Array]:
+        """x (w,) and y (h,) of pixel centres at z = 0 [m], for the image or for a grid ``shape`` = (h, w) over it."""
+        half = self.half_window
+        w, h = self.image_size_px if shape is None else shape[::-1]
+        x = ((np.arange(w) + 0.5) / w * 2 - 1) * half[0]
+        y = ((np.arange(h) + 0.5) / h * 2 - 1) * half[1]
+        return x, y
+
+    def project(self, points: ArrayLike) -> Array:
+        """Where the camera rays through ``points`` (..., 3) [m] cross z = 0: (..., 2) [m]."""
+        p = np.asarray(points, float)
+        if self.camera_distance == 0:
+            return p[..., :2].copy()
+        return p[..., :2] * (self.camera_distance / np.maximum(self.camera_distance + p[..., 2:], 1e-9))
+
+    def lift(self, xy: ArrayLike) -> Array:
+        """The membrane points (..., 3) [m] seen through ``xy`` (..., 2) at z = 0: where each camera ray meets the gel."""
+        xy = np.asarray(xy, float)
+        x, y = xy[..., 0], xy[..., 1]
+        sag = self.sag(x, y)
+        if self.camera_distance and self.membrane_radius:
+            for _ in range(20):
+                shrink = 1 - sag / self.camera_distance
+                sag = self.sag(x * shrink, y * shrink)
+        shrink = 1 - sag / self.camera_distance if self.camera_distance else np.ones_like(sag)
+        return np.stack([x * shrink, y * shrink, -sag], -1)
+
+    def to_pixels(self, xy: ArrayLike) -> Array:
+        """Continuous pixel coordinates (column, row) (..., 2) of ``xy`` (..., 2) [m] at z = 0; pixel centres are whole."""
+        return (np.asarray(xy, float) + self.half_window) / np.asarray(self.pixel_pitch) - 0.5
+
+    def from_pixels(self, uv: ArrayLike) -> Array:
+        """Inverse of :meth:`to_pixels`."""
+        return (np.asarray(uv, float) + 0.5) * np.asarray(self.pixel_pitch) - self.half_window
+
+
+def bundled_sensors() -> list[str]:
+    """Names of the sensors that come with geomtact."""
+    return sorted(p.name.removesuffix(".toml") for p in _folder().iterdir() if p.name.endswith(".toml"))
+
+
+def _folder():
+    return resources.files("geomtact") / "sensing" / "sensors"
+
+
+def _toml_string(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    return f'"{escaped}"'

@@ -1,0 +1,241 @@
+"""Loading a mesh: the object frame stays, the same surface is the same mesh, and what cannot be used is refused in one line."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from geomtact.errors import MeshError
+from geomtact.geometry.catalogue import catalogue
+from geomtact.geometry.mesh import UNITS, Mesh, load_mesh
+from geomtact.se3 import apply, random_rotations, transform
+from geomtact.sensing.sensor import Sensor
+
+SENSORS = ("gelslim", "gelsight-mini")
+
+
+def box(extents=(20.0, 30.0, 50.0), offset=(7.0, -3.0, 100.0)) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(extents)
+    mesh.apply_translation(offset)
+    return mesh
+
+
+def save(mesh, path):
+    mesh.export(str(path))
+    return path
+
+
+def refused(match: str, *args, **kwargs) -> None:
+    with pytest.raises(MeshError, match=match) as caught:
+        load_mesh(*args, **kwargs)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "off"])
+@pytest.mark.parametrize("unit", UNITS)
+def test_coordinates_are_the_file_s_own_in_metres(tmp_path, suffix, unit):
+    mesh = load_mesh(save(box(), tmp_path / f"a.{suffix}"), unit)
+    expected = np.unique(box().vertices, axis=0) * UNITS[unit]
+    np.testing.assert_allclose(mesh.vertices, expected, rtol=6e-8, atol=0)
+    assert (mesh.name, mesh.unit, len(mesh.faces)) == ("a", unit, 12)
+
+
+def test_a_face_keeps_its_outside(tmp_path):
+    mesh = load_mesh(save(box(), tmp_path / "a.stl"), "mm")
+    middle = mesh.vertices[mesh.faces].mean(1)
+    assert (((middle - mesh.centre) * mesh.normals).sum(1) > 0).all()
+    assert mesh.areas.sum() == pytest.approx(2e-6 * (20 * 30 + 30 * 50 + 50 * 20), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["bracket", "gear", "pin"])
+def test_mm_stl_and_metre_glb_of_one_part_are_one_mesh(tmp_path, name):
+    original = load_mesh(name)
+    raw = trimesh.load_mesh(str(original.path), process=False)
+    raw.apply_scale(1e-3)
+    glb = load_mesh(save(raw, tmp_path / "a.glb"))
+    np.testing.assert_array_equal(glb.vertices, original.vertices)
+    assert glb.sha256 == original.sha256
+
+
+def test_hash_ignores_order_and_name_but_not_shape(tmp_path, rng):
+    mesh = box()
+    shuffled = rng.permutation(len(mesh.vertices))
+    faces = np.argsort(shuffled)[mesh.faces][rng.permutation(len(mesh.faces))]
+    other = trimesh.Trimesh(mesh.vertices[shuffled], np.roll(faces, 1, axis=1), process=False)
+    one = load_mesh(save(mesh, tmp_path / "one.ply"), "mm")
+    assert one.sha256 == load_mesh(save(other, tmp_path / "two.off"), "mm").sha256
+    assert one.sha256 != load_mesh(tmp_path / "one.ply", "cm").sha256
+    assert one.sha256 != load_mesh(save(box((20, 30, 50.01)), tmp_path / "three.stl"), "mm").sha256
+
+
+def test_scene_is_placed_and_concatenated(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box((0.02, 0.02, 0.02)), transform=transform(np.eye(3), [0, 0, 0.1]))
+    mirror = np.diag([-1.0, 1, 1, 1])
+    mirror[0, 3] = 0.05
+    scene.add_geometry(trimesh.creation.box((0.01, 0.01, 0.03)), transform=mirror)
+    mesh = load_mesh(save(scene, tmp_path / "two.glb"))
+    assert len(mesh.faces) == 24
+    np.testing.assert_allclose(mesh.vertices.min(0), [-0.01, -0.01, -0.015], atol=1e-8)
+    np.testing.assert_allclose(mesh.vertices.max(0), [0.055, 0.01, 0.11], atol=1e-8)
+
+
+def test_a_cavity_is_no_inverted_body(tmp_path):
+    hole = trimesh.creation.box((5, 5, 5))
+    hole.invert()
+    assert (
+        len(load_mesh(save(trimesh.util.concatenate([box(offset=(0, 0, 0)), hole]), tmp_path / "a.ply"), "mm").faces)
+        == 24
+    )
+    hole.apply_translation((100, 0, 0))
+    refused("inside out", save(trimesh.util.concatenate([box(), hole]), tmp_path / "b.ply"), "mm")
+
+
+def test_diameter_is_the_largest_distance(rng):
+    points = rng.normal(size=(300, 3))
+    hull = trimesh.convex.convex_hull(points)
+    mesh = Mesh(hull.vertices, hull.faces, "hull", "m")
+    assert mesh.diameter == pytest.approx(np.linalg.norm(points[:, None] - points, axis=-1).max(), abs=1e-12)
+    assert load_mesh("ball").diameter == pytest.approx(0.012, abs=2e-8)
+
+
+def test_radius_rms_is_that_of_the_samples_and_samples_lie_on_the_surface():
+    mesh = load_mesh("stepped_shaft")
+    points, normals = mesh.sample_surface(50_000, seed=3)
+    assert mesh.radius_rms == pytest.approx(np.sqrt(((points - mesh.centre) ** 2).sum(1).mean()), rel=0.01)
+    np.testing.assert_array_equal(points, mesh.surface_points(50_000, seed=3))
+    np.testing.assert_array_equal(normals, mesh.surface_normals(50_000, seed=3))
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
+    raw = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    inside = raw.ray.contains_points(points[:300] - 1e-5 * normals[:300])
+    outside = raw.ray.contains_points(points[:300] + 1e-5 * normals[:300])
+    assert inside.mean() > 0.98
+    assert outside.mean() < 0.02
+    assert load_mesh("ball").radius_rms == pytest.approx(0.006, rel=1e-3)
+
+
+def test_diameter_and_radius_do_not_depend_on_the_frame(rng):
+    mesh = load_mesh("bracket").with_symmetry()
+    T = transform(random_rotations(1, rng)[0], [0.01, 0.02, 0.03])
+    moved = Mesh(apply(T, mesh.vertices), mesh.faces, "moved", "m")
+    assert moved.diameter == pytest.approx(mesh.diameter, rel=1e-12)
+    assert moved.areas.sum() == pytest.approx(mesh.areas.sum(), rel=1e-12)
+
+
+def test_arrays_cannot_be_written():
+    with pytest.raises(ValueError, match="read-only"):
+        load_mesh("ball").vertices[0] = 0
+
+
+def test_unit_is_never_guessed(tmp_path):
+    stl = save(box(), tmp_path / "a.stl")
+    refused("mm, cm, m, inch", stl)
+    refused("unknown unit 'km'", stl, "km")
+    refused("metres by definition", save(box(), tmp_path / "a.glb"), "mm")
+    refused("catalogue says mm", "pin", "m")
+    assert load_mesh(catalogue()["pin"].file).sha256 == load_mesh("pin").sha256
+
+
+def test_unknown_names_and_files(tmp_path):
+    refused("did you mean 'elbow_pipe'", "elbow-pipe")
+    refused("no part named 'zzz'", "zzz")
+    refused("no such file", tmp_path / "nothing.stl", "mm")
+    (tmp_path / "a.step").write_text("ISO-10303-21;")
+    refused("not a mesh format", tmp_path / "a.step", "mm")
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "off", "glb", "gltf"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\x00" * 100, b"solid nothing\nendsolid\n", b"ply\n", b"\xff\xfe rubbish \n 1 2 3"]
+)
+def test_broken_files(tmp_path, suffix, content):
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(content)
+    refused(str(path), path, None if suffix.startswith("gl") else "mm")
+
+
+@pytest.mark.parametrize("suffix", ["stl", "ply", "glb"])
+def test_truncated_files(tmp_path, suffix):
+    path = save(box(), tmp_path / f"a.{suffix}")
+    path.write_bytes(path.read_bytes()[:-40])
+    refused("a.", path, None if suffix == "glb" else "mm")
+
+
+def test_points_nan_and_open_surfaces(tmp_path):
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    refused("only points", tmp_path / "points.obj", "mm")
+    nan = box()
+    vertices = np.array(nan.vertices)
+    vertices[3, 1] = np.nan
+    refused("NaN", save(trimesh.Trimesh(vertices, nan.faces, process=False), tmp_path / "nan.stl"), "mm")
+    mesh = box()
+    refused(
+        r"3 of 18 edges are open.*tools/prep_mesh.py",
+        save(trimesh.Trimesh(mesh.vertices, mesh.faces[1:], process=False), tmp_path / "open.stl"),
+        "mm",
+    )
+    faces = np.array(mesh.faces)
+    faces[0] = faces[0, ::-1]
+    refused("disagree", save(trimesh.Trimesh(mesh.vertices, faces, process=False), tmp_path / "turned.ply"), "mm")
+    mesh.invert()
+    refused("inside out", save(mesh, tmp_path / "inverted.stl"), "mm")
+    sheet = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [0, 9, 0]], [[0, 1, 2], [0, 2, 1]], process=False)
+    refused("no volume", save(sheet, tmp_path / "sheet.ply"), "mm")
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_unit_1000_times_wrong_is_refused_and_the_right_one_is_not(tmp_path, sensor):
+    sensor = Sensor.load(sensor)
+    for name, entry in catalogue().items():
+        mesh = load_mesh(name, sensor=sensor)
+        if mesh.diameter > 0.011:
+            refused("unit is likely wrong", _copy(entry.file, tmp_path), "m", sensor=sensor)
+        metres = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        refused("unit is likely wrong", save(metres, tmp_path / "small.ply"), "mm", sensor=sensor)
+    with pytest.raises(MeshError, match="unit is likely wrong"):
+        load_mesh(Mesh(1e3 * mesh.vertices, mesh.faces, "big", "m"), sensor=sensor)
+
+
+def _copy(path, folder):
+    copy = folder / path.name
+    copy.write_bytes(path.read_bytes())
+    return copy
+
+
+def test_dirty_files_raise_mesh_errors_only(data_folder):
+    loaded = 0
+    for path in sorted(data_folder.glob("meshes_*dirty/*")) + sorted(data_folder.glob("meshes_trimesh/dirty/*")):
+        if path.suffix == ".txt":
+            continue
+        try:
+            load_mesh(path, "mm")
+            loaded += 1
+        except MeshError as error:
+            assert "\n" not in str(error)
+            assert path.name in str(error)
+    assert loaded >= 10
+
+
+@pytest.mark.parametrize(
+    ("pattern", "unit"),
+    [
+        ("meshes_small_solids/*.stl", "mm"),
+        ("meshes_ycb/*.obj", "cm"),
+        ("hsp_digit_sim_ycb/meshes/*.obj", "m"),
+        ("meshes_factory_nist/*peg*.obj", "m"),
+        ("meshes_trimesh/clean/featuretype.STL", "inch"),
+        ("meshes_trimesh/clean/octagonal_pocket.stl", "m"),
+        ("meshes_trimesh/clean/[a-r]*.STL", "inch"),
+    ],
+)
+def test_real_parts_load(data_folder, pattern, unit):
+    paths = sorted(data_folder.glob(pattern))
+    assert paths
+    for path in paths:
+        mesh = load_mesh(path, unit)
+        raw = trimesh.load_mesh(str(path))
+        np.testing.assert_allclose(mesh.vertices.min(0), UNITS[unit] * raw.bounds[0], atol=1e-7 * mesh.diameter)
+        np.testing.assert_allclose(mesh.vertices.max(0), UNITS[unit] * raw.bounds[1], atol=1e-7 * mesh.diameter)
+
+
+def test_a_nut_with_open_edges_is_refused(data_folder):
+    refused("108 of .* edges are open", data_folder / "meshes_factory_nist/factory_nut_m16_tight_subdiv_3x.obj", "m")
