@@ -63,6 +63,13 @@ class Index:
     def bytes_per_pose(self) -> float:
         return sum(getattr(self, a).nbytes for a in self.ARRAYS) / len(self)
 
+    @property
+    def angle_step(self) -> float:
+        """Angle between neighbouring rotations [rad]."""
+        if self.directions.level is not None:
+            return level_step(self.resolution.level)
+        return self.resolution.turn_step if self.directions.periods.any() else 0.0
+
     @cached_property
     def directions(self) -> Directions:
         """The modelled approach directions."""
@@ -70,7 +77,8 @@ class Index:
         return Directions.make(self.mesh.symmetry, self.approach, self.resolution.level, self.resolution.turn_step)
 
     @cached_property
-    def _rotations(self) -> Array:
+    def rotations(self) -> Array:
+        """R_sensor_object (M, 3, 3) of every rotation of the grid."""
         return self.directions.rotations()[0]
 
     @cached_property
@@ -81,14 +89,24 @@ class Index:
         """T_sensor_object (m, 4, 4) of poses ``ids`` (m,), all by default."""
         i = np.arange(len(self)) if ids is None else np.asarray(ids)
         level, place = np.divmod(i, self.places)
-        R = self._rotations[self.rotation[place]]
+        R = self.rotations[self.rotation[place]]
         centre = np.concatenate([self.shift[place], self.height[level, place, None]], 1)
         return transform(R, centre - R @ self.mesh.centre)
+
+    def of_rotations(self, rotations: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Pose ids (m,) of all places and penetrations of some rotations."""
+        first = self._first_place
+        place = np.concatenate([np.arange(first[r], first[r + 1]) for r in rotations] or [np.zeros(0, np.int64)])
+        return (np.arange(len(self.height))[:, None] * self.places + place).ravel().astype(np.int64)
+
+    @cached_property
+    def _first_place(self) -> NDArray[np.int64]:
+        return np.searchsorted(self.rotation, np.arange(len(self.rotations) + 1))
 
     def points(self, ids: ArrayLike, point: ArrayLike) -> NDArray[np.float32]:
         """Where a point (3,) of the object lies in the sensor frame at poses ``ids`` (m,): (m, 3) [m]."""
         level, place = np.divmod(np.asarray(ids), self.places)
-        turned = (self._rotations @ (np.asarray(point, float) - self.mesh.centre)).astype(np.float32)
+        turned = (self.rotations @ (np.asarray(point, float) - self.mesh.centre)).astype(np.float32)
         out = turned[self.rotation[place]]
         out[:, :2] += self.shift[place]
         out[:, 2] += self.height[level, place]
@@ -97,7 +115,7 @@ class Index:
     def cell_covariance(self, T: ArrayLike) -> Array:
         """Spread (6, 6) of the poses in the cell around ``T`` (4, 4): covariance of xi in T exp(xi^), radians and metres."""
         R = np.asarray(T, float)[:3, :3]
-        turn = level_step(self.resolution.level) if self.directions.level is not None else self.resolution.turn_step
+        turn = self.angle_step
         depth = self.sensor.max_penetration / len(self.resolution.penetrations)
         step = self.resolution.step
         about_centre = np.zeros((6, 6))

@@ -17,6 +17,7 @@ from geomtact.sensing.sensor import Sensor
 
 # a pose may press deeper than the gel allows, or not quite touch, by a rounding error
 _ROUNDING = 1e-7
+_SETTLED = 1e-6  # m
 
 
 @dataclass(frozen=True)
@@ -53,21 +54,31 @@ class ContactSpace:
             inside[inside] = lowest >= -self.sensor.housing_depth - _ROUNDING
         return np.where(inside, np.clip(depth, 0, self.sensor.max_penetration), np.nan)
 
-    def settle(self, T: ArrayLike, depth: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    def settle(self, T: ArrayLike, depth: ArrayLike, steps: int = 30) -> tuple[Array, NDArray[np.bool_]]:
         """``T`` (n, 4, 4) moved along z until the deepest point in the window is ``depth`` (n,) [m] below the membrane.
 
-        Returns the moved poses and whether each one touches so.
+        Returns the moved poses and whether each one touches so after at most ``steps`` casts.
         """
         T = np.array(T, float).reshape(-1, 4, 4)
         depth = np.broadcast_to(np.asarray(depth, float), len(T))
-        going = np.arange(len(T))
         ok = np.zeros(len(T), bool)
-        for _ in range(6):  # the camera sees a narrower window the deeper a point lies: seldom more than three steps
-            now = self.caster.penetration(self.sensor, T[going])
-            step = now - depth[going]
-            ok[going] = np.abs(step) < _ROUNDING
-            moving = np.isfinite(step) & ~ok[going]
-            T[going[moving], 2, 3] += step[moving]
+        too_high, too_low = np.full(len(T), np.inf), np.full(len(T), -np.inf)
+        going = np.arange(len(T))
+        for _ in range(steps):
+            z = T[going, 2, 3]
+            step = self.caster.penetration(self.sensor, T[going]) - depth[going]
+            ok[going] = np.abs(step) < _SETTLED
+            high = step < 0
+            too_high[going[high]], too_low[going[~high]] = z[high], z[~high]
+            # the camera sees a narrower window the deeper a point lies: a point at the edge leaves it as it is pressed in,
+            # so the step is only trusted between a height that is too high and one that is too low
+            with np.errstate(invalid="ignore"):
+                middle = 0.5 * (too_high[going] + too_low[going])
+            new = z + step
+            trusted = (new < too_high[going]) & (new > too_low[going])
+            new = np.where(trusted, new, middle)
+            moving = np.isfinite(new) & ~ok[going] & (np.abs(new - z) > _SETTLED / 100)
+            T[going[moving], 2, 3] = new[moving]
             going = going[moving]
             if not len(going):
                 break

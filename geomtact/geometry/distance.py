@@ -49,9 +49,16 @@ class PoseDistance:
 
     @cached_property
     def anchor(self) -> Array:
-        """A point (3,) of the object that its symmetry leaves in place and that lies near the mean of its points."""
-        symmetry = self.mesh.symmetry
-        return self.points.mean(0) if symmetry is None or symmetry.kind == "none" else symmetry.centre
+        """A point (3,) of the object that its symmetry leaves in place, as near as may be to the mean of its points."""
+        symmetry, mean = self.mesh.symmetry, self.points.mean(0)
+        if symmetry is None or symmetry.kind == "none":
+            return mean
+        if symmetry.kind == "sphere":
+            return symmetry.centre
+        mean = apply(symmetry.elements, mean[None])[:, 0].mean(0)
+        if symmetry.axis is not None:
+            mean = symmetry.centre + (mean - symmetry.centre) @ symmetry.axis * symmetry.axis
+        return mean
 
     @property
     def slack(self) -> float:
@@ -61,6 +68,20 @@ class PoseDistance:
     @cached_property
     def _centred(self) -> Array:
         return self.points - self.mesh.centre
+
+    def turned(self, R: ArrayLike, others: ArrayLike) -> Array:
+        """Root mean square point distance (m,) [m] that the rotation alone makes, from ``R`` (3, 3) to ``others``
+        (m, 3, 3), about :attr:`anchor`, modulo the object's symmetry."""
+        symmetry = self.mesh.symmetry
+        if symmetry is not None and symmetry.kind == "sphere":
+            return np.zeros(len(np.asarray(others)))
+        about = self.points - self.anchor
+        fixed = transform(np.eye(3), np.zeros(3))
+        here, there = fixed.copy(), np.repeat(fixed[None], len(np.asarray(others)), 0)
+        here[:3, :3], there[:, :3, :3] = R, others
+        relative = here[:3, :3].T @ self.aligned(here, there)[:, :3, :3]
+        C = about.T @ about / len(about)
+        return np.sqrt(np.maximum(2 * (np.trace(C) - np.einsum("mij,ji->m", relative, C)), 0))
 
     def _distances(self, T: ArrayLike, others: ArrayLike, over: str) -> Array:
         T, others = np.asarray(T, float), np.asarray(others, float).reshape(-1, 4, 4)

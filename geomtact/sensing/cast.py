@@ -89,20 +89,33 @@ class Caster:
         inner = np.stack(np.meshgrid(*sensor.pixel_centres((48, 64))), -1).reshape(-1, 2)
         rays = np.concatenate([inner, _border(sensor)])
         for part in _slices(len(T), 256):
-            deepest = self.ray_depths(sensor, T[part], rays).max(1).astype(float)
-            out[part] = np.maximum(deepest, self._deepest_vertex(sensor, T[part]))
+            out[part] = self.ray_depths(sensor, T[part], rays).max(1)
+            pose, p = self._below(T[part], -out[part])
+            seen = (np.abs(sensor.project(p)) <= sensor.half_window).all(-1)
+            if sensor.camera_distance:
+                seen &= p[:, 2] > -sensor.camera_distance
+            depth = -p[:, 2] - sensor.sag(p[:, 0], p[:, 1])
+            np.maximum.at(out[part], pose[seen], depth[seen])
             out[part][self._camera_inside(sensor, T[part])] = np.inf
         return out
 
     def lowest_outside(self, sensor: Sensor, T: ArrayLike) -> Array:
-        """Lowest z (n,) [m] of the object's vertices outside the window, in the sensor frame; +inf if there are none."""
+        """Lowest z (n,) [m] of the object's vertices outside the window, in the sensor frame; +inf if none is below 0."""
         T = np.asarray(T, float).reshape(-1, 4, 4)
         out = np.full(len(T), np.inf)
-        for part in _slices(len(T), 64):
-            p = apply(T[part], self.vertices)
+        for part in _slices(len(T), 256):
+            pose, p = self._below(T[part], np.zeros(len(T[part])))
             outside = (np.abs(sensor.project(p)) > sensor.half_window).any(-1)
-            out[part] = np.where(outside, p[..., 2], np.inf).min(1)
+            np.minimum.at(out[part], pose[outside], p[outside, 2])
         return out
+
+    def _below(self, T: Array, z: Array) -> tuple[NDArray[np.int64], Array]:
+        """Vertices that lie below ``z`` (n,) [m] at poses ``T``: which pose (m,), and where (m, 3) in the sensor frame."""
+        heights = T[:, 2, :3] @ self.vertices.T + T[:, 2, 3, None]
+        pose, vertex = np.nonzero(heights < z[:, None])
+        R = T[pose, :2, :3]
+        xy = np.einsum("mij,mj->mi", R, self.vertices[vertex]) + T[pose, :2, 3]
+        return pose, np.column_stack([xy, heights[pose, vertex]])
 
     def _cast(self, sensor: Sensor, T: Array, rays: Array) -> NDArray[np.float32]:
         R = T[:, :3, :3]
@@ -130,14 +143,6 @@ class Caster:
             depth = -p[..., 2] - sensor.sag(p[..., 0], p[..., 1])
         return np.where(t < 1e30, depth, -np.inf).astype(np.float32)
 
-    def _deepest_vertex(self, sensor: Sensor, T: Array) -> Array:
-        p = apply(T, self.vertices)
-        in_window = (np.abs(sensor.project(p)) <= sensor.half_window).all(-1)
-        if sensor.camera_distance:
-            in_window &= p[..., 2] > -sensor.camera_distance
-        depth = -p[..., 2] - sensor.sag(p[..., 0], p[..., 1])
-        return np.where(in_window, depth, -np.inf).max(1)
-
     def _camera_inside(self, sensor: Sensor, T: Array) -> NDArray[np.bool_]:
         if not sensor.camera_distance:
             return np.zeros(len(T), bool)
@@ -150,9 +155,9 @@ class Caster:
 
 
 def _border(sensor: Sensor) -> Array:
-    """Points (m, 2) along the window's border at half a pixel pitch, just inside."""
+    """Points (m, 2) along the window's border, a pixel apart, just inside."""
     half = sensor.half_window * (1 - 1e-6)
-    n = 2 * max(sensor.image_size_px)
+    n = max(sensor.image_size_px)
     s = np.linspace(-1, 1, n)
     one = np.ones(n)
     square = [np.stack(p, 1) for p in ((s, one), (s, -one), (one, s), (-one, s))]

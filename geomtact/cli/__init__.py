@@ -1,0 +1,34 @@
+"""The command line. Each command imports what it needs when it runs, so that ``geomtact --help`` is instant."""
+
+from __future__ import annotations
+
+import typer
+
+from geomtact.cli.library import cache, objects, sensors
+from geomtact.cli.localize import localize
+from geomtact.cli.prepare import prepare
+from geomtact.cli.shell import one_line_errors
+from geomtact.cli.simulate import simulate
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Localize a known part from the shape of one tactile contact: the whole distribution of its pose.",
+)
+for command in (localize, prepare, simulate, sensors, objects, cache):
+    app.command()(one_line_errors(command))
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: bool = typer.Option(False, "--version", help="Print the version and stop.", is_eager=True)) -> None:
+    if version:
+        import geomtact
+
+        typer.echo(f"geomtact {geomtact.__version__}")
+        raise typer.Exit
+
+
+def main() -> None:
+    """Entry point of the ``geomtact`` command."""
+    app()

@@ -1,0 +1,90 @@
+"""``geomtact sensors``, ``objects`` and ``cache``: what there is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geomtact.cli.shell import print_table, tell
+from geomtact.errors import UsageError
+
+CacheDir = Annotated[
+    Path | None,
+    typer.Option(
+        "--cache-dir", help="Folder of the cached indexes; else $GEOMTACT_CACHE, else the user's cache folder."
+    ),
+]
+
+
+def sensors() -> None:
+    """List the bundled sensors."""
+    from geomtact.sensing.sensor import Sensor, bundled_sensors
+
+    rows = []
+    for name in bundled_sensors():
+        s = Sensor.load(name)
+        width, height = 2e3 * s.half_window
+        optics = f"{1e3 * s.camera_distance:.3g} mm" if s.camera_distance else "orthographic"
+        shape = f"radius {1e3 * s.membrane_radius:.3g} mm" if s.membrane_radius else "flat"
+        pixels = f"{s.image_size_px[0]} x {s.image_size_px[1]}"
+        rows.append([name, pixels, f"{width:.1f} x {height:.1f}", f"{1e3 * s.max_penetration:.1f}", optics, shape])
+    print_table(["sensor", "pixels", "window [mm]", "depth [mm]", "camera", "membrane"], rows)
+
+
+def objects() -> None:
+    """List the bundled parts."""
+    import numpy as np
+
+    from geomtact.geometry.catalogue import catalogue
+    from geomtact.geometry.mesh import load_mesh
+
+    rows = []
+    for name, entry in catalogue().items():
+        size = " x ".join(f"{1e3 * side:.0f}" for side in np.ptp(load_mesh(name).vertices, axis=0))
+        symmetry = entry.symmetry.kind
+        if symmetry == "discrete":
+            symmetry = f"{len(entry.symmetry.elements)}-fold"
+        rows.append([name, entry.unit, size, symmetry, entry.licence, entry.description])
+    print_table(["part", "unit", "size [mm]", "symmetry", "licence", "what it is"], rows)
+
+
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all cached indexes.")] = False,
+    limit_gb: Annotated[
+        float | None,
+        typer.Option("--limit-gb", min=0, help="Remove those used longest ago until at most this is left."),
+    ] = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """List the cached indexes; clear or bound the cache."""
+    import time
+
+    from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache, default_cache_dir
+
+    if clear and limit_gb is not None:
+        raise UsageError("--clear and --limit-gb exclude each other; give one of them")
+    folder = cache_dir or default_cache_dir()
+    if clear or limit_gb is not None:
+        removed = clear_cache(folder) if limit_gb is None else bound_cache(int(1e9 * limit_gb), folder)
+        tell(f"removed {_count(len(removed))}, {sum(e.size_bytes for e in removed) / 1e6:.0f} MB")
+    entries = cache_entries(folder)
+    rows = [
+        [e.key[:12], e.object, e.sensor, f"{e.poses:,}", f"{e.size_bytes / 1e6:.0f}", _when(time.time() - e.last_used)]
+        for e in entries
+    ]
+    print_table(["key", "part", "sensor", "poses", "MB", "last used"], rows, right=["poses", "MB"])
+    typer.echo(f"{_count(len(entries))}, {sum(e.size_bytes for e in entries) / 1e6:.0f} MB in {folder}")
+
+
+def _when(seconds: float) -> str:
+    for unit, length in (("day", 86400), ("hour", 3600), ("minute", 60)):
+        n = int(seconds // length)
+        if n:
+            return f"{n} {unit}{'s' if n > 1 else ''} ago"
+    return "just now"
+
+
+def _count(n: int) -> str:
+    return f"{n} index" if n == 1 else f"{n} indexes"

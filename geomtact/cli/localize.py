@@ -1,0 +1,135 @@
+"""``geomtact localize``: from one image to the distribution of the part's pose."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geomtact.cli.library import CacheDir
+from geomtact.cli.prepare import SensorName, Unit, open_localizer
+from geomtact.cli.shell import NO_CONTACT, print_table, tell
+
+MODES = 5
+
+
+class Kind(StrEnum):
+    auto = "auto"
+    mask = "mask"
+    height = "height"
+    reading = "reading"
+
+
+class Effort(StrEnum):
+    fast = "fast"
+    balanced = "balanced"
+    exact = "exact"
+
+
+def localize(
+    image: Annotated[Path, typer.Argument(help="Contact mask, height map or RGB reading.", show_default=False)],
+    object_name: Annotated[
+        str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")
+    ] = None,
+    unit: Unit = None,
+    sensor: SensorName = None,
+    kind: Annotated[Kind, typer.Option(help="What the image is.")] = Kind.auto,
+    background: Annotated[Path | None, typer.Option(help="Image of the untouched sensor, for readings.")] = None,
+    prior: Annotated[Path | None, typer.Option(help="posterior.npz of what is known before.")] = None,
+    effort: Annotated[
+        Effort | None, typer.Option(help="How much to compute; balanced by default.", show_default=False)
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for result.json, posterior.npz, report.html and report.png.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print result.json, and nothing else, to standard output.")
+    ] = False,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Localize a part from one image: print the most probable poses and write a report.
+
+    What is not given is taken from the nearest geomtact.toml (this folder or above), then from the image's metadata.
+    Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in the image.
+    """
+    import time
+
+    from geomtact.cli.project import resolve
+    from geomtact.sensing.reading import read_metadata, read_observation
+
+    given = {
+        "object": object_name,
+        "unit": unit,
+        "sensor": sensor,
+        "background": None if background is None else str(background),
+        "effort": effort,
+    }
+    values, sources = resolve(given, read_metadata(image))
+    chosen = _effort(values["effort"])
+
+    began = time.perf_counter()
+    if values["sensor"] is not None:
+        # a bad image is told before minutes go into an index
+        read_observation(image, values["sensor"], kind.value, values["background"])
+    localizer = open_localizer(values, sources, cache_dir)
+    prepared = time.perf_counter()
+    posterior = localizer.localize(
+        str(image), kind=kind.value, background=values["background"], prior=prior, effort=chosen, seed=seed
+    )
+    localized = time.perf_counter()
+    modes = posterior.modes(MODES)
+    for warning in posterior.warnings:
+        tell(f"warning: {warning}")
+
+    settings = {
+        "image": str(image),
+        "kind": kind.value,
+        "prior": prior and str(prior),
+        **values,
+        "taken_from": sources,
+        "cache_dir": cache_dir and str(cache_dir),
+    }
+    timing = {"prepare": 1e3 * (prepared - began), "modes": 1e3 * (time.perf_counter() - localized)}
+    if out is not None:
+        from geomtact.report.write import write_all
+
+        content = write_all(out, posterior, modes, localizer.simulate, settings, timing)
+    elif as_json:
+        from geomtact.report.result import result
+
+        content = result(posterior, modes, settings, timing)
+    if as_json:
+        from geomtact.report.result import to_text
+
+        typer.echo(to_text(content), nl=False)
+    else:
+        _print(posterior, modes, out)
+    if not posterior.contact:
+        tell("no contact found in the image")
+        raise typer.Exit(NO_CONTACT)
+
+
+def _effort(name: str | None) -> str:
+    """The effort by name; a ``geomtact.toml`` may hold a wrong one."""
+    from geomtact.errors import InputError, nearest_name
+
+    if name is not None and name not in list(Effort):
+        raise InputError(f"no effort named {name!r}{nearest_name(name, list(Effort))}")
+    return str(name or Effort.balanced)
+
+
+def _print(posterior, modes, out: Path | None) -> None:
+    from geomtact.report.summary import HEADINGS, facts, summaries_of, table
+
+    typer.echo(f"{posterior.mesh.name} on {posterior.sensor.name}, {posterior.frame} frame")
+    if modes:
+        right = ["mode", "probability", "±"]
+        print_table(HEADINGS, table(summaries_of(posterior, modes)), right)
+        for fact in facts(posterior):
+            typer.echo(fact)
+    typer.echo(
+        f"written: {out}/report.html and .png, result.json, posterior.npz" if out else "for a report, give --out DIR"
+    )

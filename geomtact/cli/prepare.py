@@ -1,0 +1,55 @@
+"""``geomtact prepare``: build and cache the index of a part on a sensor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from geomtact.cli.library import CacheDir
+from geomtact.cli.shell import progress_bar, tell
+
+if TYPE_CHECKING:
+    from geomtact.inference.localizer import Localizer
+
+Unit = Annotated[str | None, typer.Option("--unit", help="Unit of a mesh file without one: mm, cm, m or inch.")]
+SensorName = Annotated[str | None, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
+
+
+def prepare(
+    object_name: Annotated[
+        str | None, typer.Argument(metavar="OBJECT", help="Part (see 'geomtact objects') or mesh file.")
+    ] = None,
+    unit: Unit = None,
+    sensor: SensorName = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Build the index of a part on a sensor and cache it, so that 'localize' starts at once."""
+    import time
+
+    from geomtact.cli.project import resolve
+
+    values, sources = resolve({"object": object_name, "unit": unit, "sensor": sensor})
+    began = time.perf_counter()
+    localizer = open_localizer(values, sources, cache_dir)
+    typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
+
+
+def open_localizer(values: dict, sources: dict, cache_dir: Path | None) -> Localizer:
+    """The localizer for resolved options, with a progress bar where its index has to be built first."""
+    from geomtact.cli.project import require
+    from geomtact.geometry.catalogue import catalogue
+    from geomtact.sensing.sensor import bundled_sensors
+
+    object_name = require(values, "object", list(catalogue()), "a mesh file with --unit")
+    sensor = require(values, "sensor", bundled_sensors(), "a TOML file")
+    for key, source in sources.items():
+        tell(f"{key}: {values[key]} (from {source})")
+
+    from geomtact.inference.localizer import Localizer
+
+    with progress_bar("preparing") as progress:
+        return Localizer.prepare(
+            object_name, unit=values["unit"], sensor=sensor, cache_dir=cache_dir, progress=progress
+        )

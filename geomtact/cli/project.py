@@ -1,0 +1,94 @@
+"""Where options come from that the user left out: the nearest ``geomtact.toml``, then the image's own metadata."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+
+from geomtact.errors import InputError, UsageError, nearest_name
+
+FILE = "geomtact.toml"
+KEYS = ("object", "unit", "sensor", "background", "effort")
+
+
+def resolve(
+    given: Mapping[str, str | None], metadata: Mapping[str, str] | None = None, start: Path | None = None
+) -> tuple[dict[str, str | None], dict[str, str]]:
+    """Fill in what was not given.
+
+    Parameters
+    ----------
+    given : options by their name in ``KEYS``; None means not given
+    metadata : of the image: its ``geomtact:object``, ``geomtact:unit`` and ``geomtact:sensor`` serve last
+    start : folder from which ``geomtact.toml`` is looked for upwards; by default the current one
+
+    Returns
+    -------
+    values : the options, None where nobody says
+    sources : where each one that was filled in comes from
+
+    Notes
+    -----
+    A unit belongs to the object that it is named with: the file's does not serve an object that the command line names,
+    nor the image's any other than the image's own.
+    """
+    values, sources = dict(given), {}
+    path = find(start or Path.cwd())
+    if path is not None:
+        entries = read(path)
+        if values.get("object") is not None and "object" in entries:
+            entries.pop("unit", None)
+        for key, value in entries.items():
+            if key in values and values[key] is None:
+                values[key], sources[key] = value, str(path)
+    said = {key: (metadata or {}).get(f"geomtact:{key}") for key in ("object", "unit", "sensor")}
+    if values.get("object") is not None:
+        said["unit"] = None
+    for key, found in said.items():
+        if key in values and values[key] is None and found:
+            values[key], sources[key] = found, "the image's metadata"
+    return values, sources
+
+
+def require(values: Mapping[str, str | None], option: str, choices: list[str], other: str) -> str:
+    """``values[option]``, or an error that names the option and lists the choices.
+
+    Raises
+    ------
+    UsageError
+    """
+    value = values.get(option)
+    if value is None:
+        raise UsageError(
+            f"which {option}? give --{option} NAME, one of {', '.join(choices)}; or {other}; or set {option} in {FILE}"
+        )
+    return value
+
+
+def find(start: Path) -> Path | None:
+    """The nearest ``geomtact.toml`` in ``start`` or above."""
+    start = start.resolve()
+    return next((folder / FILE for folder in (start, *start.parents) if (folder / FILE).is_file()), None)
+
+
+def read(path: Path) -> dict[str, str]:
+    """The entries of a ``geomtact.toml``; files named in it are relative to its own folder.
+
+    Raises
+    ------
+    InputError
+        Not valid TOML, an unknown key (the nearest is named), or an entry that is no text.
+    """
+    try:
+        entries = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as TOML ({error}); mend it or remove it") from None
+    for key, value in entries.items():
+        if key not in KEYS:
+            raise InputError(f"{path}: unknown key {key!r}{nearest_name(key, KEYS)}")
+        if not isinstance(value, str):
+            raise InputError(f"{path}: {key} must be text in quotes, got {value!r}")
+        if key in ("object", "sensor", "background") and (path.parent / value).is_file():
+            entries[key] = str(path.parent / value)
+    return entries

@@ -1,0 +1,96 @@
+"""What all commands share: exit statuses, one-line errors, progress and tables."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+from geomtact.errors import GeomtactError, UsageError
+
+USAGE_ERROR, BAD_INPUT, NO_CONTACT = 2, 3, 4
+
+
+def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
+    """``command`` with geomtact's and the system's errors told in one line, and the exit status that fits."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+        except GeomtactError as error:
+            _tell_error(str(error))
+            raise typer.Exit(USAGE_ERROR if isinstance(error, UsageError) else BAD_INPUT) from None
+        except BrokenPipeError:
+            # whoever read the output has gone; Python would complain once more when it flushes at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            _tell_error(f"{where}{error.strerror or error}; check the path, its permissions and the space left there")
+            raise typer.Exit(BAD_INPUT) from None
+
+    return run
+
+
+def tell(text: str) -> None:
+    """One line to standard error."""
+    typer.echo(text, err=True)
+
+
+def _tell_error(text: str) -> None:
+    tell("error: " + " ".join(text.split()))
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[float, str], None]]:
+    """A bar on standard error; yields what the library calls with the share done (0..1) and the step's name.
+
+    It shows only once the library reports, so a cached index shows none.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    task = bar.add_task(title, total=1.0)
+    started = False
+
+    def report(done: float, step: str = "") -> None:
+        nonlocal started
+        if not started:
+            started = True
+            bar.start()
+            if not console.is_terminal:
+                tell(f"{title} ...")
+        bar.update(task, completed=done, description=f"{title}: {step}" if step else title)
+
+    try:
+        yield report
+    finally:
+        if started:
+            bar.stop()
+
+
+def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], right: Iterable[str] = ()) -> None:
+    """A plain table on standard output; ``right`` names the columns that are set flush right."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table, right = Table(box=SIMPLE_HEAD, pad_edge=False), set(right)
+    for heading in headings:
+        table.add_column(Text(heading), justify="right" if heading in right else "left")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    console = Console()
+    if not console.is_terminal:
+        console.width = 160  # a pipe has no width to keep to
+    console.print(table)

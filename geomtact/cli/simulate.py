@@ -1,0 +1,136 @@
+"""``geomtact simulate``: touches of a part at known poses, as images that carry their part and sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from geomtact.cli.prepare import SensorName, Unit
+from geomtact.errors import InputError
+
+if TYPE_CHECKING:
+    from geomtact.contact_space.space import ContactSpace
+    from geomtact.evaluation.touches import Touch
+    from geomtact.se3 import Array
+    from geomtact.sensing.noise import Noise
+
+
+class NoiseName(StrEnum):
+    none = "none"
+    moderate = "moderate"
+    heavy = "heavy"
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What touches need of a localizer: no index is built for them."""
+
+    space: ContactSpace
+
+
+def simulate(
+    object_name: Annotated[
+        str | None, typer.Argument(metavar="OBJECT", help="Part (see 'geomtact objects') or mesh file.")
+    ] = None,
+    unit: Unit = None,
+    sensor: SensorName = None,
+    out: Annotated[Path, typer.Option(help="Folder for the images and their poses.")] = Path("."),
+    n: Annotated[int, typer.Option("--n", min=1, help="How many touches at random poses.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    elastic: Annotated[
+        bool, typer.Option("--elastic/--geometric", help="Pressure of an elastic gel, or a threshold on the depth.")
+    ] = False,
+    noise: Annotated[NoiseName, typer.Option(help="How strongly the mask is spoilt.")] = NoiseName.none,
+    pose: Annotated[
+        Path | None, typer.Option(help='JSON with "T_sensor_object" (4x4, metres): one touch there.')
+    ] = None,
+) -> None:
+    """Simulate touches: write OBJECT_1.png (contact mask) and OBJECT_1.json (true pose) and so on.
+
+    The images carry part and sensor in their metadata, so 'geomtact localize OBJECT_1.png' needs no options.
+    """
+    from geomtact.cli.project import require, resolve
+    from geomtact.contact_space.space import ContactSpace
+    from geomtact.geometry.catalogue import catalogue
+    from geomtact.geometry.mesh import load_mesh
+    from geomtact.sensing import noise as noises
+    from geomtact.sensing.sensor import Sensor, bundled_sensors
+
+    values, _ = resolve({"object": object_name, "unit": unit, "sensor": sensor})
+    named = require(values, "object", list(catalogue()), "a mesh file with --unit")
+    sensor_named = require(values, "sensor", bundled_sensors(), "a TOML file")
+    pressed = Sensor.load(sensor_named)
+    mesh = load_mesh(named, values["unit"], sensor=pressed)
+    scene = _Scene(ContactSpace(mesh, pressed))
+    strength = {NoiseName.none: noises.CLEAN, NoiseName.moderate: noises.MODERATE, NoiseName.heavy: noises.HEAVY}[noise]
+
+    if pose is not None:
+        touches = [_touch_at(scene, read_pose(pose), seed, elastic, strength)]
+    else:
+        from geomtact.evaluation.touches import random_touches
+
+        touches = random_touches(scene, n, seed, elastic=elastic, noise=strength)
+    # files are named in full, so that the image is understood from any folder
+    metadata = {key: str(Path(v).resolve()) if Path(v).is_file() else v for key, v in values.items() if v is not None}
+    out.mkdir(parents=True, exist_ok=True)
+    for k, touch in enumerate(touches, 1):
+        stem = f"{mesh.name}_{k}"
+        truth = {
+            "object": mesh.name,
+            "sensor": pressed.name,
+            "T_sensor_object": touch.T_sensor_object.tolist(),
+            "penetration_mm": 1e3 * float(touch.penetration),
+            "contact": "elastic" if elastic else "geometric",
+            "noise": noise.value,
+            "seed": seed,
+        }
+        _write(out / stem, touch.mask, truth, metadata)
+        typer.echo(f"{out / stem}.png: {100 * touch.mask.mean():.1f} % of the window in contact")
+
+
+def read_pose(path: Path) -> Array:
+    """``T_sensor_object`` (4, 4) from a JSON file that holds it under that name or alone.
+
+    Raises
+    ------
+    InputError
+        No JSON, or no such entry; PoseError if the matrix is no rigid transform.
+    """
+    import json
+
+    from geomtact.se3 import check_transforms
+
+    try:
+        content: Any = json.loads(path.read_text("utf-8"))
+        T = content["T_sensor_object"] if isinstance(content, dict) else content
+        return check_transforms(T, f"{path}: T_sensor_object").reshape(4, 4)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a JSON file") from None
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f'{path}: expected JSON {{"T_sensor_object": 4x4 numbers}}, in metres') from None
+
+
+def _touch_at(scene: _Scene, T: Array, seed: int, elastic: bool, noise: Noise) -> Touch:
+    import numpy as np
+
+    from geomtact.contact_space.touch import felt_mask, spoilt
+    from geomtact.evaluation.touches import Touch
+
+    mask = spoilt(felt_mask(scene.space, T, elastic), scene.space, noise, np.random.default_rng(seed))
+    return Touch(T, float(scene.space.caster.penetration(scene.space.sensor, T)[0]), mask, elastic)
+
+
+def _write(stem: Path, mask: Any, truth: dict, metadata: dict) -> None:
+    """Write STEM.png, with ``metadata`` as text entries, and STEM.json."""
+    from geomtact.report.files import write_whole
+    from geomtact.report.result import plain, to_text
+    from geomtact.sensing.image_file import write_image
+
+    metadata = {**metadata, "T_sensor_object": truth["T_sensor_object"]}
+    write_image(stem.with_name(stem.name + ".png"), mask, metadata)
+    text = to_text(plain(truth))
+    write_whole(stem.with_name(stem.name + ".json"), lambda path: path.write_text(text, "utf-8"))

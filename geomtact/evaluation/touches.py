@@ -1,0 +1,54 @@
+"""Touches with known poses, on which figures are given: uniform over the contact pose space, rigid or elastic, noisy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.touch import felt_mask, spoilt
+from geomtact.se3 import Array
+from geomtact.sensing.noise import MODERATE, Noise
+
+PENETRATION = (0.3e-3, 1.5e-3)
+LEAST_CONTACT = 1e-6  # m^2
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One touch: the true pose (4, 4), how deep it presses [m], and what the sensor reports (H, W) bool."""
+
+    T_sensor_object: Array
+    penetration: float
+    mask: NDArray[np.bool_]
+    elastic: bool
+
+
+def random_touches(
+    localizer: Any, n: int, seed: int, elastic: bool | None = None, noise: Noise = MODERATE
+) -> list[Touch]:
+    """``n`` touches of ``localizer.mesh`` on ``localizer.sensor``.
+
+    Poses are uniform over the contact pose space with a penetration of 0.3 to 1.5 mm and at least 1 mm^2 of contact.
+    They come from casts at the exact pose, not from the index.
+
+    Parameters
+    ----------
+    elastic : True for an elastic gel, False for the thesis's threshold, None for one after the other
+    """
+    rng = np.random.default_rng(seed)
+    space: ContactSpace = localizer.space
+    high = min(PENETRATION[1], space.sensor.max_penetration)
+    pixel = float(np.prod(space.sensor.pixel_pitch))
+    out: list[Touch] = []
+    while len(out) < n:
+        T, depth = space.sample(min(64, 2 * (n - len(out)) + 8), rng, (min(PENETRATION[0], high / 2), high))
+        for pose, d in zip(T, depth, strict=True):
+            soft = len(out) % 2 == 1 if elastic is None else elastic
+            mask = felt_mask(space, pose, soft)
+            if mask.sum() * pixel >= LEAST_CONTACT and len(out) < n:
+                out.append(Touch(pose, float(d), spoilt(mask, space, noise, rng), soft))
+    return out

@@ -1,0 +1,118 @@
+"""Posteriors on disk: one npz file without pickles, complete in itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from geomtact.contact_space.store import open_index
+from geomtact.errors import InputError
+from geomtact.geometry.mesh import Mesh
+from geomtact.inference.posterior import Posterior, Refined
+from geomtact.sensing.sensor import Sensor
+
+_KEPT = 0.9999  # of the mass is written cell by cell; the rest is written as one number
+_FORMAT = "geomtact/posterior/1"
+
+
+def save(posterior: Posterior, path: str | Path) -> None:
+    """Write ``posterior`` to ``path``: poses, log_prob, frame, object_sha256, sensor_toml, seed, and what
+    :func:`load` needs. Of a posterior spread over a million cells, those that hold 99.99 % are kept one by one.
+    """
+    p = np.exp(posterior.log_prob)
+    order = np.argsort(-p, kind="stable")
+    kept = np.sort(order[: int(np.searchsorted(np.cumsum(p[order]), _KEPT)) + 1])
+    mass = float(p[kept].sum())
+    refined = posterior.refined
+    keys = np.array(sorted(refined), np.int64)
+    meta = {
+        "format": _FORMAT,
+        "object": posterior.mesh.name,
+        "unit": posterior.mesh.unit,
+        "approach": None
+        if posterior.index.approach is None
+        else [(np.asarray(v, float).tolist(), float(a)) for v, a in posterior.index.approach],
+        "contact": posterior.contact,
+        "log_evidence": posterior.log_evidence,
+        "settings": posterior.settings,
+        "warnings": posterior.warnings,
+        "refined": [[refined[int(k)].length, refined[int(k)].moved, refined[int(k)].observable.tolist()] for k in keys],
+    }
+    arrays = {
+        "poses": posterior.poses[kept],
+        "log_prob": posterior.log_prob[kept] - (np.log(mass) if mass else 0.0),
+        "frame": np.array(posterior.frame),
+        "object_sha256": np.array(posterior.mesh.sha256),
+        "sensor_toml": np.array(posterior.sensor.to_toml()),
+        "seed": np.array(posterior.seed),
+        "cells": posterior.cells[kept],
+        "rest": np.array(1 - (1 - posterior.rest) * mass if len(p) else 0.0),
+        "T_frame_sensor": posterior.T_frame_sensor,
+        "vertices": posterior.mesh.vertices,
+        "faces": posterior.mesh.faces,
+        "index_key": np.array(posterior.index.key),
+        "refined_cells": keys,
+        "refined_T": np.array([refined[int(k)].T for k in keys]).reshape(-1, 4, 4),
+        "refined_covariance": np.array([refined[int(k)].covariance for k in keys]).reshape(-1, 6, 6),
+        "meta": np.array(json.dumps(meta)),
+    }
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **arrays)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
+    """Read a posterior; its index is opened from the cache, or built anew where it is no longer there.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or is no posterior.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: file[name] for name in file.files}
+        meta = json.loads(str(data["meta"]))
+        if meta["format"] != _FORMAT:
+            raise ValueError(f"format {meta['format']!r}")
+        mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"])
+        sensor = Sensor.from_toml(str(data["sensor_toml"]), str(path))
+        cells, log_prob = data["cells"].astype(np.int64), data["log_prob"].astype(float)
+        extra = meta["refined"]
+        refined = {
+            int(k): Refined(T, C, np.array(rows).reshape(-1, 6), length, moved)
+            for k, T, C, (length, moved, rows) in zip(
+                data["refined_cells"], data["refined_T"], data["refined_covariance"], extra, strict=True
+            )
+        }
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
+        raise InputError(f"{path}: not a posterior that geomtact saved ({error}); give a posterior.npz") from None
+    settings = meta["settings"]
+    index = open_index(mesh, sensor, meta["approach"], settings.get("max_poses", 1_200_000), cache_dir)
+    if len(cells) and int(cells.max()) >= len(index):
+        raise InputError(f"{path}: its poses are not those of this version's grid; localize again")
+    return Posterior(
+        index,
+        cells,
+        log_prob,
+        rest=float(data["rest"]),
+        frame=str(data["frame"]),
+        T_frame_sensor=data["T_frame_sensor"],
+        contact=bool(meta["contact"]),
+        log_evidence=float(meta["log_evidence"]),
+        seed=int(data["seed"]),
+        refined=refined,
+        settings=settings,
+        warnings=meta["warnings"],
+    )

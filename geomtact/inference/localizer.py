@@ -1,0 +1,207 @@
+"""From a mesh and a tactile image to the distribution of the part's pose: the thesis's method, a call a step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomtact.contact_space.index import Index
+from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.store import default_cache_dir, open_index
+from geomtact.errors import UsageError, nearest_name
+from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.geometry.rotations import Approach
+from geomtact.inference.posterior import Posterior
+from geomtact.inference.prior import prior_log_mass
+from geomtact.inference.refine import Refinery
+from geomtact.scoring.calibration import posterior_log_prob
+from geomtact.scoring.fitted import FittedScorer, fitted_scorer
+from geomtact.se3 import check_transforms
+from geomtact.sensing.contact import Contact
+from geomtact.sensing.reading import read_observation
+from geomtact.sensing.sensor import Sensor
+
+EFFORTS = {"fast": 0, "balanced": 5, "exact": 25}  # modes that are refined
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Localizer:
+    """Localizes one object on one sensor.
+
+    Attributes
+    ----------
+    index : every touch of the object on the sensor, simulated beforehand
+    scorer : the calibrated score that compares a contact with them
+    """
+
+    index: Index
+    scorer: FittedScorer
+    max_poses: int = 1_200_000
+
+    @classmethod
+    def prepare(
+        cls,
+        mesh: str | Path | Mesh,
+        unit: str | None = None,
+        sensor: str | Path | Sensor = "gelslim",
+        approach: Approach | None = None,
+        *,
+        scorer: str = "moments",
+        max_poses: int = 1_200_000,
+        cache_dir: str | Path | None = None,
+        progress: Progress | None = None,
+    ) -> Localizer:
+        """Simulate all touches of an object (thesis 6.1.1 to 6.1.3), or read them from the cache.
+
+        Parameters
+        ----------
+        mesh : name of a bundled part, path of a mesh file, or a Mesh
+        unit : "mm", "cm", "m" or "inch"; needed for files that state none
+        sensor : name of a bundled sensor, path of a TOML file, or a Sensor
+        approach : [(direction (3,), half angle)]: only touches whose direction from the object towards the sensor, in
+            the object frame, lies within the angle [rad] of one of these; 0 means exactly that face
+        scorer : "moments", "iou" or "l1"
+        max_poses : about how many poses the grid may have
+        cache_dir : folder of the index cache; by default ``$GEOMTACT_CACHE`` or the user's cache folder
+        progress : called with the share done (0 to 1) and what is being done
+
+        Raises
+        ------
+        MeshError, SensorError, UsageError, CacheError
+        """
+        sensor = Sensor.load(sensor)
+        part = load_mesh(mesh, unit, sensor=sensor)
+        index = open_index(part, sensor, approach, max_poses, cache_dir, progress)
+        folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
+        return cls(index, fitted_scorer(scorer, index, folder / index.key, progress), max_poses)
+
+    def localize(
+        self,
+        image: Any,
+        kind: str = "auto",
+        background: Any = None,
+        T_world_sensor: Any = None,
+        prior: Any = None,
+        effort: str = "balanced",
+        seed: int = 0,
+    ) -> Posterior:
+        """The distribution of the object's pose, given what the sensor shows (thesis 6.1 and 6.3).
+
+        Parameters
+        ----------
+        image : path or array: a mask, a height map [m] or an RGB reading (see ``sensing.reading``)
+        kind : "auto", "mask", "height" or "reading"
+        background : a reading without contact, for readings
+        T_world_sensor : (4, 4), or [(4, 4)] for one image: the posterior is then in the world frame
+        prior : None, a Posterior, its path, a pair (poses, log weights) or a log density (see ``inference.prior``)
+        effort : "fast" (no refinement), "balanced" (five refined modes) or "exact" (twenty-five)
+        seed : of the random choices made where credible levels tie
+
+        Raises
+        ------
+        ImageError, PoseError, UsageError, InputError
+        """
+        if effort not in EFFORTS:
+            raise UsageError(f"no effort named {effort!r}{nearest_name(effort, EFFORTS)}")
+        timing: dict[str, float] = {}
+        frame, T_frame_sensor, image = _frame(image, T_world_sensor)
+        settings = self._settings(kind, effort, seed)
+        with _timed(timing, "read"):
+            observation = read_observation(image, self.sensor, kind, background)
+        mask, warnings = observation.contact.mask, list(observation.warnings)
+        common = {
+            "frame": frame,
+            "T_frame_sensor": T_frame_sensor,
+            "seed": seed,
+            "observations": [observation],
+            "settings": settings | {"kind": observation.kind},
+            "timing_ms": timing,
+        }
+        if not mask.any():
+            return Posterior(
+                self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, warnings=warnings, **common
+            )
+        with _timed(timing, "score"):
+            log_likelihood, best = self.scorer.log_likelihood(self.index, mask)
+        with _timed(timing, "posterior"):
+            log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame)
+            log_prob, evidence = posterior_log_prob(log_likelihood, log_prior, self.scorer.calibration.floor)
+            cells = np.flatnonzero(np.isfinite(log_prob))
+        if best < self.scorer.calibration.usual:
+            warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
+        posterior = Posterior(
+            self.index, cells, log_prob[cells], log_evidence=evidence, warnings=warnings, **common
+        )
+        with _timed(timing, "refine"):
+            posterior = replace(posterior, refined=self._refinery.refine(posterior, mask, EFFORTS[effort]))
+        return posterior
+
+    def simulate(self, T_sensor_object: Any) -> Contact:
+        """What the sensor would see at a pose (4, 4), without noise (thesis 6.1.3)."""
+        T = check_transforms(T_sensor_object, "T_sensor_object")
+        if T.shape != (4, 4):
+            raise UsageError(f"simulate: expected one pose (4, 4), got shape {T.shape}")
+        return self.space.caster.contact(self.sensor, T)
+
+    @property
+    def mesh(self) -> Mesh:
+        return self.index.mesh
+
+    @property
+    def sensor(self) -> Sensor:
+        return self.index.sensor
+
+    @cached_property
+    def space(self) -> ContactSpace:
+        """The object's contact pose space, undiscretised."""
+        return ContactSpace(self.mesh, self.sensor, self.index.approach)
+
+    @cached_property
+    def _refinery(self) -> Refinery:
+        return Refinery(self.space)
+
+    def _settings(self, kind: str, effort: str, seed: int) -> dict[str, Any]:
+        return {
+            "kind": kind,
+            "effort": effort,
+            "seed": seed,
+            "scorer": self.scorer.scorer.name,
+            "temperature": self.scorer.calibration.temperature,
+            "floor": self.scorer.calibration.floor,
+            "max_poses": self.max_poses,
+            "poses": len(self.index),
+            "grid": self.index.resolution.to_json(),
+            "approach": None
+            if self.index.approach is None
+            else [(np.asarray(v, float).tolist(), float(a)) for v, a in self.index.approach],
+        }
+
+
+def _frame(image: Any, T_world_sensor: Any) -> tuple[str, Any, Any]:
+    """The posterior's frame, the sensor's pose in it, and the image."""
+    several = isinstance(image, list | tuple)
+    if several and len(image) != 1:
+        raise UsageError(f"localize: expected one image, got {len(image)}; localize them one at a time")
+    if several:
+        image = image[0]
+    if T_world_sensor is None:
+        return "sensor", np.eye(4), image
+    T = check_transforms(T_world_sensor, "T_world_sensor")
+    if T.shape not in ((4, 4), (1, 4, 4)):
+        raise UsageError(f"T_world_sensor: expected one pose for one image, got shape {T.shape}")
+    return "world", T.reshape(4, 4), image
+
+
+@contextmanager
+def _timed(timing: dict[str, float], stage: str):
+    start = time.perf_counter()
+    yield
+    timing[stage] = 1e3 * (time.perf_counter() - start)

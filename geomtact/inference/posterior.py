@@ -1,0 +1,346 @@
+"""The posterior: a distribution over the discretised contact pose space, and all that is asked of it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.contact_space.index import Index
+from geomtact.contact_space.space import ContactSpace
+from geomtact.errors import UsageError
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.geometry.mesh import Mesh
+from geomtact.se3 import Array, check_transforms, inverse
+from geomtact.sensing.sensor import Sensor
+
+_SEEDS = 400  # of the most probable cells, from which modes are grown
+_MODES = 16  # grown at most
+_POINTS = 128  # of the surface, for distances between modes
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One place where the object may be.
+
+    Attributes
+    ----------
+    T : (4, 4), the object in the posterior's frame
+    probability : mass within 5 mm or 5 % of the object's diameter, the smaller, of T (mean point distance modulo
+        symmetry); each pose counts for its most probable mode only
+    covariance : (6, 6) of xi = (rx, ry, rz, tx, ty, tz) in T exp(xi^), radians and metres
+    observable : (r, 6) orthonormal rows: directions of xi, rotations scaled by ``length``, that the contact tells
+    length : metres by which rotations are scaled before directions are compared
+    refined : whether registration moved T off the grid
+    """
+
+    T: Array
+    probability: float
+    covariance: Array
+    observable: Array
+    length: float
+    refined: bool
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What registration found at one cell: its pose in the sensor frame, and what the contact tells there."""
+
+    T: Array
+    covariance: Array
+    observable: Array
+    length: float
+    moved: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The distribution of an object's pose after a touch.
+
+    Attributes
+    ----------
+    index : the discretised contact pose space it lives on
+    cells : (N,) pose ids of the index that it holds one by one
+    log_prob : (N,) log probability of each, normalised
+    rest : share of the whole that lies outside ``cells``, spread over them as the uniform is; 0 if all are held
+    frame : "sensor" or "world"
+    T_frame_sensor : (4, 4)
+    contact : whether the image shows any contact
+    log_evidence : log of the mean likelihood under the prior, comparable between objects on one sensor
+    refined : what registration found, by pose id
+    observations, settings, timing_ms, warnings : how it came about
+    """
+
+    index: Index
+    cells: NDArray[np.int64]
+    log_prob: Array
+    rest: float = 0.0
+    frame: str = "sensor"
+    T_frame_sensor: Array = field(default_factory=lambda: np.eye(4))
+    contact: bool = True
+    log_evidence: float = 0.0
+    seed: int = 0
+    refined: dict[int, Refined] = field(default_factory=dict)
+    observations: list[Any] = field(default_factory=list)
+    settings: dict[str, Any] = field(default_factory=dict)
+    timing_ms: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def mesh(self) -> Mesh:
+        return self.index.mesh
+
+    @property
+    def sensor(self) -> Sensor:
+        return self.index.sensor
+
+    @property
+    def observation(self) -> Any:
+        """The touch it came from, None for a loaded posterior."""
+        return self.observations[0] if self.observations else None
+
+    @cached_property
+    def space(self) -> ContactSpace:
+        return ContactSpace(self.mesh, self.sensor, self.index.approach)
+
+    @cached_property
+    def poses(self) -> Array:
+        """Poses (N, 4, 4) of the object in ``frame``, one a cell; refined ones where registration found better."""
+        return self.T_frame_sensor @ self._sensor_poses(np.arange(len(self.cells)))
+
+    @cached_property
+    def entropy_nats(self) -> float:
+        """Minus the mean log density under the posterior itself: 0 for the uniform, lower the more is known."""
+        p = np.exp(self.log_prob)
+        held = 1 - self.rest
+        mean = held * float(p @ np.where(p > 0, self._log_density + np.log(held), 0.0))
+        if self.rest:
+            mean += self.rest * self._rest_log_density
+        return -mean if self.contact else 0.0
+
+    @property
+    def effective_poses(self) -> float:
+        """How many equally likely cells would be as uncertain: exp of the discrete entropy."""
+        p = np.exp(self.log_prob)
+        return float(np.exp(-(p @ np.where(p > 0, self.log_prob, 0.0)))) if len(p) else 0.0
+
+    def modes(self, k: int = 5) -> list[Mode]:
+        """The ``k`` most probable modes, most probable first; none without contact."""
+        if not self.contact or k < 1:
+            return []
+        found = self._modes[:k]
+        return [self._mode(i, mass) for i, mass in found]
+
+    def leading_cells(self, k: int) -> NDArray[np.int64]:
+        """Pose ids (m,) of the index at the heart of the ``k`` most probable modes."""
+        return self.cells[[row for row, _ in self._modes[:k]]] if self.contact and k > 0 else self.cells[:0]
+
+    def log_density(self, T: ArrayLike) -> Any:
+        """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
+
+        -inf outside the contact pose space, finite inside; without contact, -inf where T would touch and 0 elsewhere.
+        """
+        T = check_transforms(T)
+        inside = inverse(self.T_frame_sensor) @ T.reshape(-1, 4, 4)
+        depth = self.space.penetration(inside)
+        touching = np.isfinite(depth)
+        if not self.contact:
+            out = np.where(touching, -np.inf, 0.0)
+        else:
+            out = np.full(len(inside), -np.inf)
+            if touching.any():
+                out[touching] = self.cell_log_density(self.index.lookup(inside[touching], depth[touching]))
+        return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
+
+    def cell_log_density(self, ids: ArrayLike) -> Array:
+        """Log density (n,) in the cells of pose ids (n,) of the index, relative to the uniform distribution."""
+        ids = np.asarray(ids)
+        where = np.searchsorted(self._sorted, ids)
+        where = np.minimum(where, len(self._sorted) - 1)
+        held = self._sorted[where] == ids
+        density = self._log_density[self._order[where]] + np.log(1 - self.rest)
+        return np.where(held, density, self._rest_log_density)
+
+    def credible_level(self, T: ArrayLike) -> Any:
+        """Smallest highest-density mass in [0, 1] whose region holds ``T`` (4, 4) or (n, 4, 4).
+
+        Poses of one cell tie: a share of their mass counts, drawn uniformly from T and the posterior's seed.
+        """
+        T = check_transforms(T)
+        density = np.atleast_1d(self.log_density(T)).ravel()
+        level, above = self._density_levels
+        out = np.ones(len(density))
+        for i, (rho, pose) in enumerate(zip(density, T.reshape(-1, 4, 4), strict=True)):
+            if np.isfinite(rho):
+                j = np.searchsorted(-level, -rho - 1e-9)  # first level not above rho
+                j = min(j, len(level) - 1)
+                before = above[j - 1] if j else 0.0
+                out[i] = before + _share(pose, self.seed) * (above[j] - before)
+        return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """``n`` poses (n, 4, 4) drawn from the posterior, uniform within each cell.
+
+        Raises
+        ------
+        UsageError
+            There is no contact, so no distribution over touching poses.
+        """
+        if not self.contact:
+            raise UsageError("sample: the image shows no contact, so there is no distribution of touching poses")
+        out: list[Array] = []
+        for _ in range(100):
+            if sum(map(len, out)) >= n:
+                break
+            cell = self._draw_cells(max(16, n), rng)
+            T, depth = self.index.draw(cell, rng)
+            T, ok = self.space.settle(T, depth)
+            ok[ok] = np.isfinite(self.space.penetration(T[ok]))
+            ok[ok] = self.index.lookup(T[ok], depth[ok]) == cell[ok]
+            out.append(T[ok])
+        return self.T_frame_sensor @ np.concatenate(out)[:n]
+
+    def save(self, path: Any) -> None:
+        """Write ``posterior.npz`` (no pickles); see :func:`geomtact.inference.files.load`."""
+        from geomtact.inference.files import save
+
+        save(self, path)
+
+    @staticmethod
+    def load(path: Any, cache_dir: Any = None) -> Posterior:
+        """Read what :meth:`save` wrote."""
+        from geomtact.inference.files import load
+
+        return load(path, cache_dir)
+
+    @cached_property
+    def _log_density(self) -> Array:
+        """Log density of the held cells (N,), as if they were all."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            density = self.log_prob - np.log(np.asarray(self.index.weight).reshape(-1)[self.cells].astype(float))
+        return np.where(np.isfinite(density), density, -np.inf)
+
+    @cached_property
+    def _rest_log_density(self) -> float:
+        weight = np.asarray(self.index.weight).reshape(-1)
+        left = float(weight.sum(dtype=float) - weight[self.cells].sum(dtype=float))
+        return float(np.log(self.rest / left)) if self.rest > 0 and left > 0 else -np.inf
+
+    @cached_property
+    def _order(self) -> NDArray[np.int64]:
+        if (np.diff(self.cells) > 0).all():
+            return np.arange(len(self.cells))
+        return np.argsort(self.cells, kind="stable")
+
+    @cached_property
+    def _sorted(self) -> NDArray[np.int64]:
+        return self.cells[self._order]
+
+    @cached_property
+    def _density_levels(self) -> tuple[Array, Array]:
+        """Distinct log densities, highest first, and the mass at or above each."""
+        if not len(self.cells):
+            return np.zeros(1), np.ones(1)
+        density = np.append(self._log_density + np.log(1 - self.rest), self._rest_log_density)
+        mass = np.append(np.exp(self.log_prob) * (1 - self.rest), self.rest)
+        order = np.argsort(-density, kind="stable")
+        order = order[mass[order] > 0]
+        density, mass = density[order], mass[order]
+        last = np.append(np.diff(density) < -1e-9, True)
+        return density[last], np.cumsum(mass)[last]
+
+    def _sensor_poses(self, rows: NDArray[np.int64]) -> Array:
+        """Poses (m, 4, 4) of ``rows`` in the sensor frame."""
+        cells = self.cells[rows]
+        T = self.index.poses(cells)
+        for i in np.flatnonzero(np.isin(cells, list(self.refined))):
+            T[i] = self.refined[int(cells[i])].T
+        return T
+
+    def _draw_cells(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        total = np.cumsum(np.exp(self.log_prob))
+        row = np.searchsorted(total, rng.random(n) * total[-1])
+        cell = self.cells[np.minimum(row, len(total) - 1)]
+        if self.rest:
+            weight = np.array(self.index.weight, float).reshape(-1)
+            weight[self.cells] = 0
+            from_rest = rng.random(n) < self.rest
+            cell[from_rest] = np.searchsorted(np.cumsum(weight), rng.random(int(from_rest.sum())) * weight.sum())
+        return cell
+
+    @cached_property
+    def _modes(self) -> list[tuple[int, float]]:
+        """Row of each mode's pose and the mass of the mode, most probable first."""
+        p = np.exp(self.log_prob) * (1 - self.rest)
+        top = np.argpartition(-p, min(_SEEDS, len(p) - 1))[:_SEEDS]
+        top = top[p[top] > 0]
+        moved = self._rows_of(np.array(list(self.refined), np.int64))
+        seeds = np.array(list(dict.fromkeys([*_sorted(moved, p), *_sorted(top, p)])))
+        distance, radius = PoseDistance(self.mesh, _POINTS), mode_radius(self.mesh)
+        members: list[tuple[int, NDArray[np.int64]]] = []
+        covered: set[int] = set()
+        for row, T in zip(seeds, self._sensor_poses(seeds), strict=True):
+            if len(members) == _MODES:
+                break
+            if int(row) not in covered:
+                inside = self._within(T, distance, radius, moved)
+                members.append((row, np.union1d(inside, [row])))
+                covered.update(inside.tolist())
+        return _share_out(members, p)
+
+    def _within(self, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Rows whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""
+        # a rotation whose root mean square exceeds three radii has no mean within one
+        turned = distance.turned(T[:3, :3], self.index.rotations) <= 3 * radius
+        near = self.index.of_rotations(np.flatnonzero(turned))
+        here = T[:3, :3] @ distance.anchor + T[:3, 3]
+        there = self.index.points(near, distance.anchor)
+        near = near[(np.abs(there - here.astype(np.float32)) <= radius + distance.slack).all(1)]
+        rows = np.union1d(self._rows_of(near), moved)
+        return rows[distance.within(T, self._sensor_poses(rows), radius)]
+
+    def _rows_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Rows of the pose ids that are held, in no particular order."""
+        if not len(self._sorted) or not len(ids):
+            return np.zeros(0, np.int64)
+        where = np.minimum(np.searchsorted(self._sorted, ids), len(self._sorted) - 1)
+        return self._order[where[self._sorted[where] == ids]]
+
+    def _mode(self, row: int, mass: float) -> Mode:
+        found = self.refined.get(int(self.cells[row]))
+        T = self._sensor_poses(np.array([row]))[0]
+        if found is None:
+            found = Refined(T, self.index.cell_covariance(T), np.zeros((0, 6)), self.mesh.radius_rms, False)
+        T = self.T_frame_sensor @ T
+        return Mode(T, mass, found.covariance, found.observable, found.length, found.moved)
+
+
+def _sorted(rows: NDArray[np.int64], p: Array) -> NDArray[np.int64]:
+    """``rows``, most probable first."""
+    return rows[np.argsort(-p[rows], kind="stable")]
+
+
+def _share_out(members: list[tuple[int, NDArray[np.int64]]], p: Array) -> list[tuple[int, float]]:
+    """Modes with the poses within reach of each, made exclusive: a pose belongs to its most probable mode."""
+    left = p.copy()
+    todo = list(members)
+    out: list[tuple[int, float]] = []
+    while todo:
+        masses = [float(left[inside].sum()) for _, inside in todo]
+        best = int(np.argmax(masses))
+        row, inside = todo.pop(best)
+        if masses[best] <= 0:
+            break
+        out.append((int(row), masses[best]))
+        left[inside] = 0
+    return out
+
+
+def _share(T: Array, seed: int) -> float:
+    """A number in [0, 1) that depends on T and the seed alone."""
+    digest = hashlib.blake2b(np.round(T, 12).tobytes() + seed.to_bytes(8, "little", signed=True), digest_size=8)
+    return int.from_bytes(digest.digest(), "little") / 2**64

@@ -1,0 +1,101 @@
+"""What was known before the touch (the thesis's P(G), 6.2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.index import Index
+from geomtact.contact_space.space import ContactSpace
+from geomtact.errors import InputError, UsageError
+from geomtact.inference.posterior import Posterior
+from geomtact.scoring.calibration import log_weights
+from geomtact.se3 import Array, check_transforms, inverse
+
+_CHUNK = 1 << 16
+
+
+def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) -> NDArray[np.float32]:
+    """Log mass (N,) of every cell under ``prior``, not normalised; the uniform's without one.
+
+    Parameters
+    ----------
+    prior : None, a Posterior or the path of one, a pair (poses (N, 4, 4), log masses (N,)) each of which is spread
+        over one grid cell, or a function of poses (N, 4, 4) giving the log density relative to the uniform. Poses are
+        in ``frame``.
+
+    Raises
+    ------
+    UsageError, InputError
+        Of no known kind, for another object or frame, or ruling out every pose that touches.
+    """
+    uniform = log_weights(index)
+    if prior is None:
+        return uniform
+    if isinstance(prior, str | Path):
+        prior = Posterior.load(prior)
+    if isinstance(prior, Posterior):
+        density = _of_posterior(index, prior, T_frame_sensor, frame)
+    elif callable(prior):
+        density = _by_chunks(index, lambda T: np.asarray(prior(T_frame_sensor @ T), float))
+    elif isinstance(prior, tuple | list) and len(prior) == 2:
+        return _of_poses(index, prior[0], prior[1], T_frame_sensor)
+    else:
+        raise UsageError(
+            "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)) or a "
+            f"function of poses, got {type(prior).__name__}"
+        )
+    if np.isnan(density).any():
+        raise InputError("prior: the log density is NaN at some poses; return -inf where a pose is ruled out")
+    out = (uniform + density).astype(np.float32)
+    if not np.isfinite(out).any():
+        raise InputError("prior: it rules out every pose that touches the sensor; check its frame and its units (metres)")
+    return out
+
+
+def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: str) -> Array:
+    if prior.mesh.sha256 != index.mesh.sha256:
+        raise InputError(f"prior: it is for the object {prior.mesh.name!r}, not for {index.mesh.name!r} as loaded here")
+    if prior.frame != frame:
+        raise InputError(
+            f"prior: its frame is {prior.frame!r} but this posterior's is {frame!r}; "
+            "give T_world_sensor to both touches or to neither"
+        )
+    same_place = np.allclose(prior.T_frame_sensor, T_frame_sensor, atol=1e-9)
+    if prior.index.key == index.key and same_place:
+        if not prior.contact:
+            raise InputError("prior: it says that the object does not touch the sensor, but this image shows a contact")
+        return prior.cell_log_density(np.arange(len(index)))
+    # the prior's own sensor saw the object at some depth: casting it there decides what was ruled out
+    return _by_chunks(index, lambda T: prior.log_density(T_frame_sensor @ T))
+
+
+def _of_poses(index: Index, poses: Any, log_masses: Any, T_frame_sensor: Array) -> NDArray[np.float32]:
+    T = check_transforms(poses, "prior poses").reshape(-1, 4, 4)
+    mass = np.asarray(log_masses, float)
+    if mass.shape != (len(T),) or np.isnan(mass).any():
+        raise InputError(f"prior: expected one log weight a pose, ({len(T)},) and not NaN, got shape {mass.shape}")
+    inside = inverse(T_frame_sensor) @ T
+    depth = ContactSpace(index.mesh, index.sensor, index.approach).penetration(inside)
+    ok = np.isfinite(depth) & np.isfinite(mass)
+    if not ok.any():
+        raise InputError(
+            "prior: none of its poses touches the sensor; check that they are T_sensor_object (or T_world_object where "
+            "T_world_sensor is given), in metres"
+        )
+    out = np.full(len(index), -np.inf)
+    cell = index.lookup(inside[ok], depth[ok])
+    np.logaddexp.at(out, cell, mass[ok])
+    return out.astype(np.float32)
+
+
+def _by_chunks(index: Index, density: Any) -> Array:
+    """``density`` at the pose of every cell (N,)."""
+    out = np.zeros(len(index))
+    for start in range(0, len(index), _CHUNK):
+        ids = np.arange(start, min(start + _CHUNK, len(index)))
+        out[ids] = density(index.poses(ids))
+    return out

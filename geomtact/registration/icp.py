@@ -1,0 +1,83 @@
+"""Open3D's point-to-plane ICP for the rim of a contact, with checks of its own.
+
+Open3D returns the start pose with rmse 0 when nothing corresponds, and moves freely in directions that the rim does not
+tell; so its answer is judged by the rim's own measure, and kept only as far as the rim tells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomtact.registration.filterreg import RimFilter
+from geomtact.registration.fit import Fit, gather, judged, rejected
+from geomtact.registration.observability import Spread, motion_of, moved, without_sink
+from geomtact.registration.protocol import Problem, Refinement, Surface
+from geomtact.registration.rim import near_surface
+from geomtact.se3 import Array, inverse
+
+_MAX_ITERATIONS = 20
+
+
+@dataclass(frozen=True)
+class Icp:
+    """Refines poses of one object against the rim of a contact.
+
+    Attributes
+    ----------
+    surface : the object's surface, points denser than the sensor's pixels
+    spread : how far the start poses may be off
+    """
+
+    surface: Surface
+    spread: Spread
+    name: str = "icp"
+
+    def refine(self, problem: Problem, T: Array) -> Refinement:
+        """Refine the poses ``T`` (k, 4, 4), T_sensor_object, one after the other."""
+        fits = [self._refine_one(problem, start) for start in np.asarray(T, float).reshape(-1, 4, 4)]
+        return gather(fits, problem, self.spread)
+
+    def _refine_one(self, problem: Problem, start: Array) -> Fit:
+        reach = 3 * self.spread.radius(problem.length) + 2 * problem.pitch
+        points, normals = near_surface(self.surface, problem, start, reach)
+        if len(points) < 6:
+            return rejected(start)
+        # Open3D moves the rim onto the surface; the object moves the other way
+        T = inverse(_register(problem, points, normals, reach)) @ start
+        if not np.isfinite(T).all():
+            return rejected(start)
+        rim_filter = RimFilter(problem, start, points, normals)
+        information = rim_filter.meet(T, 0.0, problem.noise).information[:6, :6]
+        information = without_sink(information, problem.sink_std)
+        held = np.diag(self.spread.metres(problem.length) ** -2.0)
+        kept = np.linalg.solve(information + held, information @ motion_of(start, T, problem))
+        T = moved(start, kept, problem)
+        return judged(start, T, rim_filter.meet(T, 0.0, 2 * problem.noise), True, self.spread, problem)
+
+
+def _register(problem: Problem, points: Array, normals: Array, reach: float) -> Array:
+    """(4, 4) that moves the rim onto the surface: first from afar, then within a few standard deviations of its noise."""
+    import open3d as o3d
+
+    registration = o3d.pipelines.registration
+    rim, cloud = o3d.geometry.PointCloud(), o3d.geometry.PointCloud()
+    # Open3D's tolerances are absolute and made for metres of room: in units of a pixel they fit
+    unit = problem.pitch
+    rim.points = o3d.utility.Vector3dVector(problem.rim / unit)
+    cloud.points = o3d.utility.Vector3dVector(points / unit)
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    motion = np.eye(4)
+    for within in (reach, 3 * problem.noise + problem.pitch):
+        motion = registration.registration_icp(
+            rim,
+            cloud,
+            within / unit,
+            motion,
+            registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=within / unit)),
+            registration.ICPConvergenceCriteria(1e-4, 1e-4, _MAX_ITERATIONS),
+        ).transformation
+    motion = np.array(motion)
+    motion[:3, 3] *= unit
+    return motion

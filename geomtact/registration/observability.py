@@ -1,0 +1,107 @@
+"""What a contact tells about a pose, and what it leaves open.
+
+Small motions are taken about the contact's centre, rotations times the contact's length, so that all six are metres
+at the contact: zeta = S A xi, with xi the twist of T exp(xi^). How sharply the rim fixes zeta is compared with how
+well it was known before; directions in which the rim adds little are neither moved nor reported as told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from geomtact.registration.protocol import Problem
+from geomtact.se3 import Array, apply, exp, hat, inverse, log
+
+_GAIN = 4.0  # a direction is told where the rim's information is this many times what was known before
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far start poses may be off: standard deviations of rotation [rad] and of translation at the contact [m]."""
+
+    rotation: float
+    translation: float
+
+    def metres(self, length: float) -> Array:
+        """(6,) standard deviations of zeta [m]."""
+        return np.repeat([self.rotation * length, self.translation], 3)
+
+    def radius(self, length: float) -> float:
+        """How far a point of the contact may be off, standard deviation along one axis [m]."""
+        return float(np.hypot(self.rotation * length, self.translation))
+
+
+def jacobian(points: Array, normals: Array, problem: Problem) -> Array:
+    """Change of normals . (points - surface) (n,) by zeta in sensor axes: (n, 6).
+
+    Moving the object by zeta moves it under the points, so distances to its surface shrink along the normals.
+    """
+    return -np.concatenate([np.cross(points - problem.centre, normals) / problem.length, normals], 1)
+
+
+def without_sink(information: Array, sink_std: float) -> Array:
+    """Information (6, 6) about zeta after the rim's unknown offset along z has been integrated out.
+
+    That offset acts as a shift of the object along z does, so what the rim tells about z is capped at 1 / sink_std^2.
+    """
+    z = information[5]
+    return information - np.outer(z, z) / (1 / sink_std**2 + z[5])
+
+
+def told(information: Array, spread: Spread, length: float) -> tuple[Array, Array, Array]:
+    """The told directions of zeta: rows (r, 6) that measure them, columns (6, r) that move along them, their gains (r,).
+
+    ``information`` (6, 6) [1/m^2] is the inverse covariance that the rim alone would give.
+    """
+    known = spread.metres(length)
+    gain, axes = np.linalg.eigh(known[:, None] * information * known)
+    axes = axes[:, gain > _GAIN]
+    return axes.T / known, known[:, None] * axes, gain[gain > _GAIN]
+
+
+def moved(T: Array, zeta: ArrayLike, problem: Problem) -> Array:
+    """Pose after the motion ``zeta`` (6,), in sensor axes about the contact's centre."""
+    zeta, about = np.asarray(zeta, float), np.eye(4)
+    about[:3, 3] = problem.centre
+    motion = about @ exp(np.concatenate([zeta[:3] / problem.length, zeta[3:]])) @ inverse(about)
+    return motion @ T
+
+
+def motion_of(start: Array, T: Array, problem: Problem) -> Array:
+    """Inverse of :func:`moved`: the zeta (6,) that takes ``start`` to ``T``."""
+    about = np.eye(4)
+    about[:3, 3] = problem.centre
+    xi = log(inverse(about) @ T @ inverse(start) @ about)
+    return np.concatenate([xi[:3] * problem.length, xi[3:]])
+
+
+def summary(T: Array, information: Array, spread: Spread, problem: Problem) -> tuple[Array, Array]:
+    """Covariance (6, 6) of xi and the observable directions (r, 6), from the information (6, 6) about zeta.
+
+    The covariance joins what the rim tells with what was known before; nothing is unknown beyond ``spread``.
+    """
+    known = spread.metres(problem.length)
+    measure, move, gain = told(information, spread, problem.length)
+    # in told directions the variance known**2 becomes known**2 / (1 + gain)
+    covariance = np.diag(known**2) - (move * (gain / (1 + gain))) @ move.T
+    to_zeta = _zeta_of_xi(T, problem)
+    back = np.linalg.inv(to_zeta)
+    scale = np.repeat([problem.length, 1.0], 3)
+    rows = measure @ to_zeta / scale
+    observable = np.linalg.qr(rows.T)[0].T if len(rows) else np.zeros((0, 6))
+    covariance = back @ covariance @ back.T
+    return 0.5 * (covariance + covariance.T), observable
+
+
+def _zeta_of_xi(T: Array, problem: Problem) -> Array:
+    """(6, 6) S A: xi moves the object about its own origin and axes, zeta about the contact's centre in sensor axes."""
+    R = T[:3, :3]
+    centre = apply(inverse(T), problem.centre[None])[0]
+    out = np.zeros((6, 6))
+    out[:3, :3] = problem.length * R
+    out[3:, :3] = -R @ hat(centre)
+    out[3:, 3:] = R
+    return out

@@ -1,0 +1,213 @@
+"""``report.png`` by matplotlib: the touch, the first modes and what is known of each coordinate."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from geomtact.report.marginals import Samples, marginals
+from geomtact.report.summary import ModeSummary, facts
+from geomtact.report.view import Viewer
+from geomtact.se3 import Array, inverse
+from geomtact.sensing.contact import Contact
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import SubFigure
+
+    from geomtact.inference.posterior import Mode, Posterior
+
+# Okabe and Ito's colours, told apart by colour-blind readers too.
+OBSERVED, SIMULATED, FIRST, BARS = "#D55E00", "#56B4E9", "#000000", "#0072B2"
+DPI, WIDTH = 100, 14.0
+_BANDS = {"touch": 3.9, "modes": 6.0, "marginals": 2.9}  # heights in inches
+_COLUMNS = 5
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The whole report as one PNG, and its bands by name as PNGs of their own."""
+
+    whole: bytes
+    bands: dict[str, bytes]
+
+
+def draw(
+    posterior: Posterior, modes: Sequence[Mode], summaries: Sequence[ModeSummary], simulate: Callable[[Array], Contact]
+) -> Picture:
+    """Draw the report.
+
+    Parameters
+    ----------
+    posterior : what was found
+    modes, summaries : the modes to show, at most five, and their plain numbers
+    simulate : the contact at a pose T_sensor_object, without noise
+    """
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    modes, summaries = modes[:_COLUMNS], summaries[:_COLUMNS]
+    names = list(_BANDS) if modes else ["touch"]
+    heights = [_BANDS[name] for name in names]
+    style: Any = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False}
+    with mpl.rc_context(style):
+        figure = Figure(figsize=(WIDTH, sum(heights)), dpi=DPI, layout="constrained", facecolor="white")
+        canvas = FigureCanvasAgg(figure)
+        bands = dict(
+            zip(names, figure.subfigures(len(names), 1, squeeze=False, height_ratios=heights)[:, 0], strict=True)
+        )
+        words = _touch(bands["touch"], posterior, summaries)
+        if modes:
+            _modes(bands["modes"], posterior, modes, simulate)
+            _marginals(bands["marginals"], marginals(posterior, np.asarray(modes[0].T)))
+        canvas.draw()
+        words_start = int(words.get_window_extent().x0)
+        pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    edges = np.round(np.cumsum([0.0, *heights]) * DPI).astype(int)
+    cut = {name: pixels[edges[k] : edges[k + 1]] for k, name in enumerate(names)}
+    # the page has its own text and table instead of the words beside the touch
+    cut["touch"] = cut["touch"][:, :words_start]
+    return Picture(_png(pixels), {name: _png(band) for name, band in cut.items()})
+
+
+def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummary]) -> Axes:
+    """The image, the contact and a summary in words, whose axes are returned."""
+    image_axes, contact_axes, words = band.subplots(1, 3)
+    for observation in posterior.observations[:1]:
+        image = _displayable(observation.image)
+        _in_window(image_axes, posterior, image, "The image")
+        outline(contact_axes, posterior, observation.contact, OBSERVED)
+        shown = np.where(observation.contact.mask, 0.75, 0.97)
+        title = f"The contact ({_area_mm2(observation.contact, posterior):.1f} mm², read as {observation.kind})"
+        _in_window(contact_axes, posterior, shown, title)
+    words.axis("off")
+    lines = [part for line in _words(posterior, summaries) for part in (textwrap.wrap(line, 64) or [""])]
+    words.text(0.02, 1, "\n".join(lines[:20]), va="top", fontsize=9, linespacing=1.5)
+    return words
+
+
+def _modes(band: SubFigure, posterior: Posterior, modes: Sequence[Mode], simulate: Callable[[Array], Contact]) -> None:
+    grid = band.subplots(2, _COLUMNS, height_ratios=[1, 1.25])
+    viewer = Viewer(posterior.mesh, posterior.sensor)
+    for column in range(_COLUMNS):
+        above, below = grid[:, column]
+        if column >= len(modes):
+            above.axis("off")
+            below.axis("off")
+            continue
+        mode = modes[column]
+        T_sensor_object = inverse(posterior.T_frame_sensor) @ mode.T
+        contact = simulate(T_sensor_object)
+        shown = np.ones((*contact.mask.shape, 3))
+        shown[contact.mask] = _rgb(SIMULATED)
+        _in_window(above, posterior, shown, f"mode {column + 1}: {100 * mode.probability:.1f} %", small=True)
+        for observation in posterior.observations[:1]:
+            outline(above, posterior, observation.contact, OBSERVED)
+        view = viewer.view(T_sensor_object)
+        below.imshow(view.image, extent=view.extent)
+        below.axis("off")
+        _draw_frame(below, posterior, view.place)
+    above = grid[0, 0]
+    above.plot([], [], color=OBSERVED, label="observed outline")
+    above.fill_between([], [], color=SIMULATED, label="contact simulated there")
+    band.legend(*above.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
+
+
+def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
+    grid = band.subplots(1, 5)
+    for axes, samples in zip(grid, all_samples, strict=False):
+        mass, edges = samples.histogram()
+        axes.stairs(100 * mass, edges, fill=True, color=BARS)
+        axes.axvline(samples.mark, color=FIRST, lw=1.2, ls="--", label="mode 1")
+        axes.set_xlabel(samples.label)
+        axes.set_ylim(bottom=0)
+        if samples.values.min() >= 0:
+            axes.set_xlim(left=max(0.0, edges[0]))
+        axes.ticklabel_format(useOffset=False)
+    for axes in grid[len(all_samples) :]:
+        axes.axis("off")
+        axes.text(0.5, 0.5, "the part is a ball:\nno turn to tell", ha="center", va="center", transform=axes.transAxes)
+        break
+    for axes in grid[len(all_samples) + 1 :]:
+        axes.axis("off")
+    grid[0].set_ylabel("probability [%]")
+    band.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", frameon=False)
+
+
+def outline(axes: Axes, posterior: Posterior, contact: Contact, colour: str) -> None:
+    """Draw the border of a contact in millimetres on the membrane."""
+    if contact.mask.any():
+        x, y = posterior.sensor.pixel_centres(contact.mask.shape)  # type: ignore[arg-type]
+        axes.contour(1e3 * x, 1e3 * y, np.asarray(contact.mask, float), [0.5], colors=colour, linewidths=1.4)
+
+
+def _in_window(axes: Axes, posterior: Posterior, image: Array, title: str, small: bool = False) -> None:
+    """Show ``image`` over the window in millimetres: x to the right, y downwards as in the image."""
+    x, y = 1e3 * posterior.sensor.half_window
+    axes.imshow(image, extent=(-x, x, y, -y), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    axes.set_title(title)
+    axes.set_xlabel("x [mm]")
+    if not small or axes.get_subplotspec().is_first_col():  # type: ignore[union-attr]
+        axes.set_ylabel("y [mm], downwards")
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+
+
+def _draw_frame(axes: Axes, posterior: Posterior, place: Callable[[Any], Array]) -> None:
+    """The window's border and the sensor's x and y axes, over the picture of the part."""
+    x, y = 1e3 * posterior.sensor.half_window
+    border = place(np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [-x, -y, 0]]))
+    axes.plot(*border.T, color=BARS, lw=0.8)
+    for name, tip in (("x", (x, 0, 0)), ("y", (0, y, 0))):
+        start, end = place(np.array([[0, 0, 0], tip]))
+        axes.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": BARS, "lw": 1.0})
+        right, up = start + 1.12 * (end - start)
+        axes.text(right, up, name, color=BARS, ha="center", va="center")
+
+
+def _words(posterior: Posterior, summaries: Sequence[ModeSummary]) -> list[str]:
+    lines = [f"WARNING: {text}" for text in posterior.warnings]
+    lines += [f"{posterior.mesh.name} on {posterior.sensor.name}", *facts(posterior), ""]
+    for s in summaries[:1]:
+        lines += [
+            f"Mode 1 holds {100 * s.probability:.1f} %.",
+            "Part's centre: "
+            + ", ".join(f"{a} = {v:.2f}" for a, v in zip("xyz", s.centre_mm + 0.0, strict=True))
+            + " mm",
+            f"(standard deviation {s.centre_sd_mm:.2f} mm, turned {s.rotation_sd_deg:.1f}°).",
+            f"What the contact tells: {s.told_in_words()}.",
+        ]
+    return lines
+
+
+def _area_mm2(contact: Contact, posterior: Posterior) -> float:
+    window = 4e6 * float(np.prod(posterior.sensor.half_window))
+    return float(contact.mask.mean()) * window
+
+
+def _displayable(image: Any) -> Array:
+    """Any image as read, (H, W) or (H, W, 3), brought to 0..1."""
+    shown = np.asarray(image)
+    if shown.dtype == np.uint8:
+        return shown / 255.0 if shown.max(initial=0) > 1 else shown.astype(float)
+    shown = np.nan_to_num(shown.astype(float))
+    low, high = min(shown.min(initial=0), 0.0), shown.max(initial=0)
+    return (shown - low) / (high - low) if high > low else np.zeros(shown.shape)
+
+
+def _rgb(colour: str) -> Array:
+    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(out, "PNG")
+    return out.getvalue()

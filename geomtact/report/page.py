@@ -1,0 +1,98 @@
+"""``report.html``: one file with everything in it, readable without a network, in light and in dark."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+from geomtact.report.summary import HEADINGS
+
+_STYLE = """
+:root { color-scheme: light dark; --text: #1b1f24; --back: #ffffff; --line: #d0d7de; --soft: #f6f8fa;
+        --warn: #8a4b00; --warn-back: #fff3e0; }
+@media (prefers-color-scheme: dark) { :root { --text: #e6edf3; --back: #0d1117; --line: #30363d; --soft: #161b22;
+        --warn: #ffc680; --warn-back: #2d1f0a; } }
+body { font: 16px/1.5 system-ui, sans-serif; color: var(--text); background: var(--back); max-width: 72rem;
+       margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
+img { max-width: 100%; background: #ffffff; border: 1px solid var(--line); border-radius: 6px; }
+.table { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { text-align: left; padding: .3rem .9rem .3rem 0; border-bottom: 1px solid var(--line); white-space: nowrap; }
+td:last-child { white-space: normal; min-width: 14rem; }
+.warning { color: var(--warn); background: var(--warn-back); border-left: 4px solid; padding: .5rem .8rem; margin: .6rem 0; }
+details { margin: 1rem 0; } summary { cursor: pointer; }
+pre { background: var(--soft); padding: .8rem; overflow-x: auto; font-size: .85rem; border-radius: 6px; }
+"""
+
+
+def page(
+    content: dict[str, Any], rows: Sequence[Sequence[str]], facts: Sequence[str], pictures: dict[str, bytes]
+) -> str:
+    """The text of report.html.
+
+    Parameters
+    ----------
+    content : of result.json
+    rows : the modes as a table, under ``summary.HEADINGS``
+    facts : sentences under the title
+    pictures : PNGs "touch", "modes" and "marginals"; those that are not there are left out
+    """
+    name, sensor = escape(content["object"]["name"]), escape(content["sensor"])
+    parts = [f"<h1>{name} on {sensor}</h1>"]
+    parts += [f'<p class="warning">{escape(text)}</p>' for text in content["warnings"]]
+    parts += ["<p>" + "<br>".join(map(escape, facts)) + "</p>"]
+    if rows:
+        parts += ["<h2>Where the part may be</h2>", _table(HEADINGS, rows)]
+        parts += [
+            f"<p>In the {escape(content['frame'])} frame: x along image columns, y along image rows downwards, z out of "
+            "the sensor towards the part. ± is the standard deviation in the least certain direction. Tilts, turns and "
+            "shifts are about the middle of the contact. The exact matrices are in result.json and below.</p>"
+        ]
+    parts += _picture("The touch", "the image and the contact found in it", pictures.get("touch"))
+    parts += _picture(
+        "The modes", "simulated contacts over the observed outline, and the part there", pictures.get("modes")
+    )
+    parts += _picture(
+        "What is known of each coordinate", "marginal distributions of position and turn", pictures.get("marginals")
+    )
+    if "marginals" in pictures:
+        parts += [
+            "<p>Turn and tilt are counted from mode 1, modulo the part's own symmetry; the dashed line is mode 1.</p>"
+        ]
+    parts += _folded("Poses T (object to " + content["frame"] + " frame, metres)", [m["T"] for m in content["modes"]])
+    for title, key in (("Settings", "settings"), ("Timing [ms]", "timing_ms"), ("Versions", "versions")):
+        parts += _folded(title, content[key])
+    body = "\n".join(parts)
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{name} on {sensor}</title>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{_STYLE}</style>\n</head>\n'
+        f"<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{escape(h)}</th>" for h in headings)
+    lines = ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    return f'<div class="table"><table>\n<tr>{head}</tr>\n' + "\n".join(lines) + "\n</table></div>"
+
+
+def _picture(title: str, description: str, png: bytes | None) -> list[str]:
+    if png is None:
+        return []
+    data = base64.b64encode(png).decode("ascii")
+    return [f"<h2>{escape(title)}</h2>", f'<img alt="{escape(description)}" src="data:image/png;base64,{data}">']
+
+
+def _folded(title: str, value: Any) -> list[str]:
+    if not value:
+        return []
+    if isinstance(value, dict):
+        text = "\n".join(
+            f"{key}: {entry if isinstance(entry, str) else json.dumps(entry)}" for key, entry in value.items()
+        )
+    else:
+        text = "\n\n".join("\n".join("  ".join(f"{v: .9f}" for v in row) for row in T) for T in value)
+    return [f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"]

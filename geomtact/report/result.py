@@ -1,0 +1,94 @@
+"""``result.json``: a localization for scripts, under the schema ``geomtact/localization/1``."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from geomtact.se3 import quat_xyzw
+
+if TYPE_CHECKING:
+    from geomtact.inference.posterior import Mode, Posterior
+
+SCHEMA = "geomtact/localization/1"
+PACKAGES = ("geomtact", "numpy", "scipy", "open3d", "torch", "embreex", "trimesh")
+
+
+def result(
+    posterior: Posterior,
+    modes: Sequence[Mode],
+    settings: Mapping[str, Any] | None = None,
+    timing_ms: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """The content of ``result.json``, ready for ``json.dumps``.
+
+    Parameters
+    ----------
+    posterior : what was found
+    modes : of the posterior, most probable first
+    settings, timing_ms : added to the posterior's own; its own settings, which are the resolved ones, go first
+    """
+    mesh, sensor = posterior.mesh, posterior.sensor
+    return plain(
+        {
+            "schema": SCHEMA,
+            "object": {"name": mesh.name, "sha256": mesh.sha256, "unit": mesh.unit},
+            "sensor": sensor.name,
+            "frame": posterior.frame,
+            "contact": bool(posterior.contact),
+            "modes": [
+                {
+                    "probability": mode.probability,
+                    "T": mode.T,
+                    "translation_mm": 1e3 * np.asarray(mode.T)[:3, 3],
+                    "quat_xyzw": quat_xyzw(mode.T),
+                    "covariance": mode.covariance,
+                    "observable": mode.observable,
+                }
+                for mode in modes
+            ],
+            "entropy_nats": posterior.entropy_nats,
+            "effective_poses": posterior.effective_poses,
+            "settings": {**(settings or {}), **posterior.settings, "seed": posterior.seed},
+            "versions": versions(),
+            "timing_ms": {**posterior.timing_ms, **(timing_ms or {})},
+            "warnings": list(posterior.warnings),
+        }
+    )
+
+
+def to_text(content: Mapping[str, Any]) -> str:
+    """JSON text, one key of the outermost level a line."""
+    lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def versions() -> dict[str, str]:
+    """Versions of geomtact, of what computes for it, and of Python; "none" for what is not installed."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "none"
+    return found
+
+
+def plain(value: Any) -> Any:
+    """``value`` of JSON's own types: arrays become lists, numbers that are not finite null, anything unknown its text."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)

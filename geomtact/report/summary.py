@@ -1,0 +1,151 @@
+"""A mode in plain numbers: where the part's centre lies, how it is turned, how surely, and what the contact tells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from geomtact.se3 import Array, apply, hat
+from geomtact.sensing.contact import Contact
+from geomtact.sensing.sensor import Sensor
+
+if TYPE_CHECKING:
+    from geomtact.inference.posterior import Mode, Posterior
+
+# Motions of the part in the sensor frame about the contact's centre, in the order of a twist (rotations first).
+MOTIONS = ("tilt about x", "tilt about y", "turn about z", "shift along x", "shift along y", "shift along z")
+HEADINGS = ("mode", "probability", "centre x, y, z [mm]", "±", "rotation vector [°]", "±", "the contact tells")
+TOLD, HARDLY = 0.9, 0.1
+
+
+@dataclass(frozen=True)
+class ModeSummary:
+    """One mode for people.
+
+    Attributes
+    ----------
+    probability : of the mode
+    centre_mm : (3,) the part's centre in the posterior's frame
+    centre_sd_mm : standard deviation of the centre in its least certain direction; nan where unknown
+    rotvec_deg : (3,) rotation vector of the part in the posterior's frame
+    rotation_sd_deg : standard deviation of the rotation about its least certain axis; nan where unknown
+    told : share (0..1) of each motion of ``MOTIONS`` that the contact tells
+    """
+
+    probability: float
+    centre_mm: Array
+    centre_sd_mm: float
+    rotvec_deg: Array
+    rotation_sd_deg: float
+    told: dict[str, float]
+
+    def cells(self, number: int) -> list[str]:
+        """The mode as a row of a table under ``HEADINGS``."""
+        return [
+            str(number),
+            f"{100 * self.probability:.1f} %",
+            _list(self.centre_mm, 2),
+            _sd(self.centre_sd_mm, 2),
+            _list(self.rotvec_deg, 1),
+            _sd(self.rotation_sd_deg, 1),
+            self.told_in_words(),
+        ]
+
+    def told_in_words(self) -> str:
+        """Which motions the contact tells, e.g. ``"all but turn about z, tilt about x (in part)"``."""
+        lost = [m for m, share in self.told.items() if share <= HARDLY]
+        partly = [f"{m} (in part)" for m, share in self.told.items() if HARDLY < share < TOLD]
+        if len(lost) == len(MOTIONS):
+            return "unknown"  # every contact tells at least the depth: this mode was not refined
+        return f"all but {', '.join(lost + partly)}" if lost or partly else "all six motions"
+
+
+def summarise(mode: Mode, centre: ArrayLike, contact_centre: ArrayLike = (0.0, 0.0, 0.0)) -> ModeSummary:
+    """Plain numbers of ``mode``.
+
+    Parameters
+    ----------
+    mode : from ``Posterior.modes``
+    centre : (3,) the part's centre, object frame [m]
+    contact_centre : (3,) where the contact is, in the posterior's frame [m]; tilts and turns are about it
+    """
+    T, c = np.asarray(mode.T, float), np.asarray(centre, float)
+    # T exp(xi^) moves the object's point c by R (t - c x r)
+    move = np.concatenate([-hat(c), np.eye(3)], axis=1)
+    return ModeSummary(
+        probability=float(mode.probability),
+        centre_mm=1e3 * (T[:3, :3] @ c + T[:3, 3]),
+        centre_sd_mm=1e3 * _largest_sd(move @ mode.covariance @ move.T),
+        rotvec_deg=np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec()),
+        rotation_sd_deg=float(np.degrees(_largest_sd(np.asarray(mode.covariance)[:3, :3]))),
+        told=told(mode, contact_centre),
+    )
+
+
+def told(mode: Mode, about: ArrayLike) -> dict[str, float]:
+    """Share (0..1) of each motion of ``MOTIONS`` about the point ``about`` (3,) [m] that lies in the mode's observable."""
+    R, axes = mode.T[:3, :3], np.eye(3)
+    arm = mode.T[:3, 3] - np.asarray(about, float)
+    # a rotation by w about the point moves the object's origin by w x arm; rows @ R are the object's own coordinates
+    turns = np.concatenate([mode.length * axes @ R, np.cross(axes, arm) @ R], axis=1)
+    shifts = np.concatenate([np.zeros((3, 3)), R], axis=1)
+    twists = np.concatenate([turns, shifts])
+    rows = np.asarray(mode.observable, float).reshape(-1, 6)
+    share = ((twists @ rows.T) ** 2).sum(1) / (twists**2).sum(1)
+    return dict(zip(MOTIONS, np.clip(share, 0, 1).tolist(), strict=True))
+
+
+def contact_centre(contact: Contact, sensor: Sensor) -> Array:
+    """Centre (3,) [m] of the contact's area on the membrane, sensor frame; the window's centre without contact."""
+    if not contact.mask.any():
+        return np.zeros(3)
+    x, y = sensor.pixel_centres(contact.mask.shape)  # type: ignore[arg-type]
+    rows, columns = np.nonzero(contact.mask)
+    return sensor.lift(np.array([x[columns].mean(), y[rows].mean()]))
+
+
+def table(summaries: Sequence[ModeSummary]) -> list[list[str]]:
+    """Rows under ``HEADINGS``, numbered from 1."""
+    return [summary.cells(k + 1) for k, summary in enumerate(summaries)]
+
+
+def summaries_of(posterior: Posterior, modes: Sequence[Mode]) -> list[ModeSummary]:
+    """Plain numbers of ``modes``; tilts and turns are about the middle of the observed contact."""
+    about = [
+        apply(posterior.T_frame_sensor, contact_centre(o.contact, posterior.sensor)[None])[0]
+        for o in posterior.observations[:1]
+    ]
+    return [summarise(mode, posterior.mesh.centre, *about) for mode in modes]
+
+
+def facts(posterior: Posterior) -> list[str]:
+    """What the whole distribution amounts to, one sentence each."""
+    if not posterior.contact:
+        return ["No contact was found in the image."]
+    known = max(0.0, -posterior.entropy_nats)
+    return [
+        f"{known:.1f} nats are known: one part in {np.exp(min(known, 700)):,.0f} of all poses that touch is left."
+        if known < 14
+        else f"{known:.1f} nats are known: less than one part in a million of all poses that touch is left.",
+        f"{posterior.effective_poses:,.0f} of {len(posterior.poses):,} poses carry the probability.",
+    ]
+
+
+def _largest_sd(covariance: Array) -> float:
+    if not np.isfinite(covariance).all():
+        return float("nan")
+    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance)[-1])))
+
+
+def _list(values: Array, digits: int) -> str:
+    # adding zero turns -0.0 into 0.0
+    return ", ".join(f"{v:.{digits}f}" for v in values.round(digits) + 0.0)
+
+
+def _sd(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "unknown"

@@ -1,0 +1,55 @@
+"""Writes all of a localization's files into one folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from geomtact.report.figure import draw
+from geomtact.report.files import write_whole
+from geomtact.report.page import page
+from geomtact.report.result import result, to_text
+from geomtact.report.summary import facts, summaries_of, table
+from geomtact.se3 import Array
+from geomtact.sensing.contact import Contact
+
+if TYPE_CHECKING:
+    from geomtact.inference.posterior import Mode, Posterior
+
+
+def write_all(
+    folder: Path,
+    posterior: Posterior,
+    modes: Sequence[Mode],
+    simulate: Callable[[Array], Contact],
+    settings: Mapping[str, Any] | None = None,
+    timing_ms: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """Write posterior.npz, report.png, report.html and result.json into ``folder``, which is made if need be.
+
+    Parameters
+    ----------
+    folder : where to
+    posterior, modes : what was found
+    simulate : the contact at a pose T_sensor_object, without noise
+    settings, timing_ms : added to the posterior's own in result.json
+
+    Returns
+    -------
+    dict
+        The content of result.json.
+    """
+    began = time.perf_counter()
+    folder.mkdir(parents=True, exist_ok=True)
+    posterior.save(folder / "posterior.npz")
+    summaries = summaries_of(posterior, modes)
+    picture = draw(posterior, modes, summaries, simulate)
+    write_whole(folder / "report.png", lambda path: path.write_bytes(picture.whole))
+    timing = {**(timing_ms or {}), "report": 1e3 * (time.perf_counter() - began)}
+    content = result(posterior, modes, settings, timing)
+    html = page(content, table(summaries), facts(posterior), picture.bands)
+    write_whole(folder / "report.html", lambda path: path.write_text(html, "utf-8"))
+    write_whole(folder / "result.json", lambda path: path.write_text(to_text(content), "utf-8"))
+    return content

@@ -1,0 +1,228 @@
+"""The command line: exit statuses, one-line errors, where options come from, and what lands in files and on the screen."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from geomtact import se3
+from geomtact.cli import app, project
+from geomtact.errors import CacheError, InputError, UsageError
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A cache that this module's tests share, so that the ball's index is built once."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def geomtact(tmp_path, monkeypatch, cache):
+    """Runs a command in an empty folder; checks the exit status."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GEOMTACT_CACHE", str(cache))
+
+    def run(*args, status=0):
+        result = CliRunner().invoke(app, [str(a) for a in args])
+        assert result.exit_code == status, f"exit status {result.exit_code}: {result.output} {result.exception!r}"
+        if status == 3:
+            assert result.stderr.startswith("error: ")
+            assert result.stderr.count("\n") == 1
+            assert "Traceback" not in result.output
+        return result
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def touched(tmp_path_factory):
+    """A folder with two simulated touches of the ball on the GelSight Mini."""
+    folder = tmp_path_factory.mktemp("touched")
+    args = ["simulate", "ball", "--sensor", "gelsight-mini", "--n", "2", "--seed", "3", "--out", str(folder)]
+    result = CliRunner().invoke(app, args)
+    assert result.exit_code == 0, result.output
+    return folder
+
+
+def test_help_and_lists(geomtact):
+    commands = {"localize", "prepare", "simulate", "sensors", "objects", "cache"}
+    assert {c.name or c.callback.__name__ for c in app.registered_commands} == commands
+    assert all(name in geomtact("--help").stdout for name in commands)
+    assert geomtact("--version").stdout.startswith("geomtact ")
+    assert "gelsight-mini" in geomtact("sensors").stdout
+    listed = geomtact("objects").stdout
+    assert "elbow_pipe" in listed
+    assert "[mm]" in listed
+    assert "0 indexes" in geomtact("cache", "--cache-dir", "nowhere").stdout
+
+
+@pytest.mark.parametrize(
+    "args", [["localize"], ["prepare", "--unknown"], ["localise"], ["simulate", "pin", "--n", "0"]]
+)
+def test_usage_errors_exit_2(geomtact, args):
+    geomtact(*args, status=2)
+
+
+def test_missing_options_are_named_with_their_choices(geomtact, tmp_path):
+    Image.fromarray(np.zeros((240, 320), np.uint8)).save("plain.png")
+    told = geomtact("localize", "plain.png", status=2).stderr
+    assert "--object" in told
+    assert "pin" in told
+    told = geomtact("localize", "plain.png", "--object", "pin", status=2).stderr
+    assert "--sensor" in told
+    assert "gelsight-mini" in told
+
+
+def test_bad_input_exits_3_with_one_line(geomtact, tmp_path):
+    (tmp_path / "empty.png").touch()
+    (tmp_path / "text.png").write_text("no image")
+    for image in ("absent.png", "empty.png", "text.png"):
+        geomtact("localize", image, "--object", "ball", "--sensor", "gelsight-mini", status=3)
+    assert "'pin'" in geomtact("prepare", "pim", "--sensor", "gelslim", status=3).stderr
+    assert "'gelslim'" in geomtact("prepare", "pin", "--sensor", "gelslem", status=3).stderr
+    (tmp_path / "geomtact.toml").write_text('objekt = "pin"')
+    assert "'object'" in geomtact("prepare", status=3).stderr
+
+
+def test_system_errors_are_one_line_too(geomtact, tmp_path):
+    (tmp_path / "file").touch()
+    told = geomtact("simulate", "ball", "--sensor", "gelslim", "--out", tmp_path / "file" / "below", status=3).stderr
+    assert "file" in told
+
+
+def test_simulated_images_carry_their_part_and_sensor(touched):
+    for k in (1, 2):
+        truth = json.loads((touched / f"ball_{k}.json").read_text())
+        with Image.open(touched / f"ball_{k}.png") as image:
+            assert image.size == (320, 240)
+            assert set(np.unique(image)) == {0, 255}
+            assert image.text["geomtact:object"] == "ball"
+            assert image.text["geomtact:sensor"] == "gelsight-mini"
+            assert json.loads(image.text["geomtact:T_sensor_object"]) == truth["T_sensor_object"]
+        se3.check_transforms(truth["T_sensor_object"])
+        assert 0.3 <= truth["penetration_mm"] <= 1.5
+
+
+def test_simulate_is_repeatable_and_replays_a_pose(geomtact, touched, tmp_path):
+    geomtact("simulate", "ball", "--sensor", "gelsight-mini", "--n", 2, "--seed", 3, "--out", tmp_path / "again")
+    for file in touched.iterdir():
+        assert file.read_bytes() == (tmp_path / "again" / file.name).read_bytes()
+    geomtact("simulate", "ball", "--sensor", "gelsight-mini", "--pose", touched / "ball_2.json", "--out", tmp_path)
+    with Image.open(touched / "ball_2.png") as a, Image.open(tmp_path / "ball_1.png") as b:
+        assert np.array_equal(a, b)
+    (tmp_path / "pose.json").write_text(json.dumps(np.diag([1.0, 1, 1, 1]).tolist()).replace("0.0]", "9.0]", 1))
+    geomtact("simulate", "ball", "--sensor", "gelslim", "--pose", tmp_path / "pose.json", "--out", tmp_path / "far")
+    assert json.loads((tmp_path / "far" / "ball_1.json").read_text())["penetration_mm"] is None
+    (tmp_path / "pose.json").write_text('{"T_sensor_object": [[1, 2], [3, 4]]}')
+    geomtact("simulate", "ball", "--sensor", "gelslim", "--pose", tmp_path / "pose.json", status=3)
+    (tmp_path / "pose.json").write_text("no json")
+    geomtact("simulate", "ball", "--sensor", "gelslim", "--pose", tmp_path / "pose.json", status=3)
+
+
+def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touched, tmp_path, cache):
+    told = geomtact("localize", touched / "ball_1.png", "--out", "out")
+    assert "object: ball (from the image's metadata)" in told.stderr
+    assert "sensor: gelsight-mini (from the image's metadata)" in told.stderr
+    assert "probability" in told.stdout
+    written = sorted(p.name for p in (tmp_path / "out").iterdir())
+    assert written == ["posterior.npz", "report.html", "report.png", "result.json"]
+    content = json.loads((tmp_path / "out" / "result.json").read_text())
+    truth = json.loads((touched / "ball_1.json").read_text())
+    centre = np.array(content["modes"][0]["T"]) @ [0, 0, 0, 1] - np.array(truth["T_sensor_object"]) @ [0, 0, 0, 1]
+    assert np.linalg.norm(centre[:2]) < 1e-3  # the ball's own origin is its centre
+    assert content["settings"]["seed"] == 0
+
+    # only JSON on standard output, and the index comes from the cache now
+    again = geomtact("localize", touched / "ball_1.png", "--json", "--seed", 0)
+    printed = json.loads(again.stdout)
+    assert printed["modes"] == content["modes"]
+
+    shutil.copytree(cache, tmp_path / "copy")
+    assert "ball" in geomtact("cache", "--cache-dir", "copy").stdout
+    assert "1 index," in geomtact("cache", "--cache-dir", "copy", "--limit-gb", 1).stdout
+    assert "0 indexes" in geomtact("cache", "--cache-dir", "copy", "--clear").stdout
+    geomtact("cache", "--clear", "--limit-gb", 1, status=2)
+
+
+def test_no_contact_exits_4_and_writes_its_result(geomtact, tmp_path):
+    Image.fromarray(np.zeros((240, 320), np.uint8)).save("nothing.png")
+    args = ["nothing.png", "--object", "ball", "--sensor", "gelsight-mini", "--kind", "mask", "--out", "out", "--json"]
+    told = geomtact("localize", *args, status=4)
+    assert json.loads(told.stdout)["contact"] is False
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["modes"] == []
+
+
+def test_geomtact_toml_serves_before_the_metadata(tmp_path):
+    (tmp_path / "geomtact.toml").write_text('object = "part.stl"\nunit = "mm"\nsensor = "gelslim"\n')
+    (tmp_path / "part.stl").touch()
+    below = tmp_path / "a" / "b"
+    below.mkdir(parents=True)
+    metadata = {"geomtact:object": "pin", "geomtact:sensor": "digit"}
+    nothing = {"object": None, "unit": None, "sensor": None}
+
+    values, sources = project.resolve(nothing, metadata, below)
+    assert values == {"object": str(tmp_path / "part.stl"), "unit": "mm", "sensor": "gelslim"}
+    assert set(sources.values()) == {str(tmp_path / "geomtact.toml")}
+
+    values, sources = project.resolve({**nothing, "object": "head"}, metadata, below)
+    assert values == {"object": "head", "unit": None, "sensor": "gelslim"}  # the unit is of the file's own part
+
+    (tmp_path / "geomtact.toml").write_text('unit = "mm"\n')
+    values, sources = project.resolve({**nothing, "object": "head.stl"}, metadata, below)
+    assert values == {"object": "head.stl", "unit": "mm", "sensor": "digit"}
+    assert sources["sensor"] == "the image's metadata"
+
+    metadata["geomtact:unit"] = "inch"
+    (tmp_path / "geomtact.toml").write_text("")
+    assert project.resolve({**nothing, "object": "head.stl"}, metadata, below)[0]["unit"] is None
+    assert project.resolve(nothing, metadata, below)[0] == {"object": "pin", "unit": "inch", "sensor": "digit"}
+
+    (below / "geomtact.toml").write_text('sensor = "gelsight-mini"\n')
+    assert project.resolve(nothing, {}, below)[0] == {"object": None, "unit": None, "sensor": "gelsight-mini"}
+
+
+@pytest.mark.parametrize(
+    "text, expected", [("sensr = 'x'", "'sensor'"), ("unit = 3", "text in quotes"), ("= =", "TOML")]
+)
+def test_a_wrong_geomtact_toml_is_named(tmp_path, text, expected):
+    (tmp_path / "geomtact.toml").write_text(text)
+    with pytest.raises(InputError, match="geomtact.toml.*" + expected):
+        project.read(tmp_path / "geomtact.toml")
+
+
+@pytest.mark.parametrize(
+    "error, status", [(UsageError("a\nb"), 2), (CacheError("full"), 3), (OSError(28, "No space"), 3)]
+)
+def test_statuses_of_errors(error, status, capsys):
+    import typer
+
+    from geomtact.cli.shell import one_line_errors
+
+    def command():
+        raise error
+
+    with pytest.raises(typer.Exit) as stopped:
+        one_line_errors(command)()
+    assert stopped.value.exit_code == status
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+def test_interrupt_exits_130_without_a_traceback():
+    code = (
+        "import geomtact.cli as c\n"
+        "def command(): raise KeyboardInterrupt\n"
+        "c.app.command('stop')(c.one_line_errors(command))\n"
+        "import sys; sys.argv = ['geomtact', 'stop']\n"
+        "c.main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,259 @@
+"""Refinement brings poses nearer in what the contact tells, leaves the rest alone, and never claims too much."""
+
+import numpy as np
+import pytest
+
+from geomtact import se3
+from geomtact.registration.filterreg import FilterReg
+from geomtact.registration.icp import Icp
+from geomtact.registration.observability import Spread
+from geomtact.registration.protocol import Problem, Refinement, Surface
+from geomtact.registration.rim import make_problem
+from geomtact.sensing.cast import Caster
+from geomtact.sensing.sensor import Sensor
+
+trimesh = pytest.importorskip("trimesh")
+
+SENSOR = Sensor("test", (64, 48), (0.3e-3, 0.3e-3), 20e-3, 2e-3)
+SHIFT, TURN = 0.8e-3, np.deg2rad(3)
+# each start is off by SHIFT and TURN in a random direction
+SPREAD = Spread(TURN / np.sqrt(3), SHIFT / np.sqrt(3))
+REFINERS = [FilterReg, Icp]
+
+
+def stepped_block():
+    """Two boxes of different width, the narrow one on top: no two corners are alike."""
+    low = trimesh.creation.box((30e-3, 22e-3, 6e-3))
+    high = trimesh.creation.box((12e-3, 8e-3, 6e-3))
+    high.apply_translation((-4e-3, 2e-3, 6e-3))
+    return trimesh.util.concatenate([low, high])
+
+
+def scene(mesh, n=40000, seed=0):
+    points, face = trimesh.sample.sample_surface(mesh, n, seed=seed)
+    return Surface(np.asarray(points), np.asarray(mesh.face_normals[face])), Caster(mesh.vertices, mesh.faces)
+
+
+def touch(caster, T):
+    return caster.contact(SENSOR, T).mask
+
+
+def off(T, problem, rng, shift=SHIFT, turn=TURN):
+    """``T`` turned about the contact's centre and shifted, each by a fixed amount in a random direction."""
+    axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    about = se3.transform(np.eye(3), problem.centre)
+    return about @ se3.exp([*(turn * axis), *(shift * way)]) @ se3.inverse(about) @ T
+
+
+def told_error(result, T_true, T, i=0):
+    """Size of the error of ``T`` along the directions that ``result`` calls observable [m]."""
+    xi = se3.log(se3.inverse(T_true) @ T)
+    return np.linalg.norm(result.observable[i] @ (np.repeat([result.length, 1.0], 3) * xi))
+
+
+def facing_down(x, y, depth, height, tilt=(0.0, 0.0), turn=0.0):
+    """Pose of an object whose top, at z = height in its own frame, is pressed ``depth`` below the membrane."""
+    half_turn = np.diag([1.0, -1.0, -1.0, 1.0])
+    return (
+        se3.transform(np.eye(3), [x, y, -depth])
+        @ se3.exp([*tilt, turn, 0, 0, 0])
+        @ half_turn
+        @ se3.transform(np.eye(3), [0, 0, -height])
+    )
+
+
+def is_sound(result: Refinement, k: int):
+    """What must hold of every result: shapes, no NaN, rigid poses, valid covariances, orthonormal rows."""
+    assert result.T.shape == (k, 4, 4) and result.covariance.shape == (k, 6, 6) and len(result.observable) == k
+    assert result.converged.shape == result.residual.shape == result.support.shape == (k,)
+    assert np.isfinite(result.covariance).all() and not np.isnan(result.residual).any()
+    se3.check_transforms(result.T)
+    for covariance, rows in zip(result.covariance, result.observable, strict=True):
+        scale = np.repeat([result.length, 1.0], 3)
+        assert np.linalg.eigvalsh(covariance * np.outer(scale, scale)).min() > 0
+        assert rows.shape[1] == 6 and np.allclose(rows @ rows.T, np.eye(len(rows)), atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def block():
+    return scene(stepped_block())
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return scene(trimesh.creation.icosphere(5, 8e-3))
+
+
+@pytest.mark.parametrize("refiner, part", [(FilterReg, 0.95), (Icp, 0.9)])
+def test_pose_on_a_corner_comes_nearer_in_what_the_contact_tells(refiner, part, block):
+    """Contacts of the narrow top: its sides and corners fix the position across the membrane and the turn about z."""
+    surface, caster = block
+    nearer, ratio, moved = [], [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        x, y = rng.uniform([-4e-3, -3e-3], [4e-3, 3e-3])
+        T = facing_down(x, y, rng.uniform(0.4e-3, 1.2e-3), 9e-3, rng.normal(0, 0.02, 2), rng.uniform(-np.pi, np.pi))
+        problem = make_problem(touch(caster, T), SENSOR)
+        start = off(T, problem, rng)
+        result = refiner(surface, SPREAD).refine(problem, start[None])
+        is_sound(result, 1)
+        before, after = told_error(result, T, start), told_error(result, T, result.T[0])
+        nearer.append(bool(result.converged[0]) and len(result.observable[0]) >= 2 and after < before)
+        ratio.append(after / before)
+        on_rim = se3.apply(se3.inverse(T), problem.rim)
+        moved.append([np.linalg.norm(se3.apply(P, on_rim) - problem.rim, axis=1).mean() for P in (start, result.T[0])])
+    assert np.mean(nearer) >= part
+    assert np.median(ratio) < 0.3
+    # the contact itself comes nearer too, not just its most favourable directions
+    start_distance, end_distance = np.median(moved, axis=0)
+    assert end_distance < 0.75 * start_distance
+
+
+def test_covariance_covers_the_error_where_the_model_holds(block):
+    """Errors in units of the stated covariance are those of six normal variables, or smaller."""
+    surface, caster = block
+    distances = []
+    for seed in range(60):
+        rng = np.random.default_rng(100 + seed)
+        T = facing_down(*rng.uniform(-3e-3, 3e-3, 2), 0.8e-3, 9e-3, rng.normal(0, 0.03, 2), rng.uniform(-np.pi, np.pi))
+        problem = make_problem(touch(caster, T), SENSOR)
+        result = FilterReg(surface, SPREAD).refine(problem, off(T, problem, rng)[None])
+        xi = se3.log(se3.inverse(result.T[0]) @ T)
+        distances.append(xi @ np.linalg.solve(result.covariance[0], xi))
+    assert np.median(distances) < 7 and np.percentile(distances, 90) < 16
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_a_face_beyond_the_window_tells_nothing_and_nothing_drifts(refiner):
+    """All pixels in contact: no rim. One straight edge: only the shift across it (and turn along it) is told."""
+    plate = trimesh.creation.box((80e-3, 60e-3, 5e-3))
+    surface, caster = scene(plate, 80000)
+    spread = SPREAD
+    full = make_problem(touch(caster, facing_down(0, 0, 0.8e-3, 2.5e-3)), SENSOR)
+    T = facing_down(0, 0, 0.8e-3, 2.5e-3)
+    result = refiner(surface, spread).refine(full, T[None])
+    assert not result.converged[0] and len(result.observable[0]) == 0
+    np.testing.assert_array_equal(result.T[0], T)
+
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        # the plate's edge at object x = +40 mm crosses the window; everything along the edge (y) is unknown
+        T = facing_down(-40e-3 + rng.uniform(-2e-3, 2e-3), 0, 0.8e-3, 2.5e-3)
+        problem = make_problem(touch(caster, T), SENSOR)
+        start = off(T, problem, rng)
+        result = refiner(surface, spread).refine(problem, start[None])
+        is_sound(result, 1)
+        assert result.converged[0] and 1 <= len(result.observable[0]) <= 3
+        along = se3.apply(result.T[0] @ se3.inverse(start), problem.centre[None])[0] - problem.centre
+        assert abs(along[1]) < 0.05e-3
+        assert told_error(result, T, result.T[0]) < 0.5 * told_error(result, T, start) + 0.05e-3
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_a_ball_tells_its_position_along_the_membrane_only(refiner, ball):
+    surface, caster = ball
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        x, y = rng.uniform(-4e-3, 4e-3, 2)
+        T = facing_down(x, y, 1e-3, 8e-3, turn=rng.uniform(-3, 3))
+        problem = make_problem(touch(caster, T), SENSOR)
+        start = off(T, problem, rng)
+        result = refiner(surface, SPREAD).refine(problem, start[None])
+        is_sound(result, 1)
+        assert result.converged[0] and len(result.observable[0]) <= 3
+        # without any turn about the ball's own centre, the start's shift is what is to be undone
+        before, after = (np.linalg.norm(P[:2, 3] - T[:2, 3]) for P in (start, result.T[0]))
+        assert after < max(0.35 * before, 0.15e-3)
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_from_free_space_nothing_converges_and_nothing_moves(refiner, block):
+    surface, caster = block
+    T = facing_down(0, 0, 0.8e-3, 9e-3)
+    problem = make_problem(touch(caster, T), SENSOR)
+    away = np.stack([se3.transform(np.eye(3), [0, 0, z]) @ T for z in (10e-3, 0.2, -30e-3)])
+    result = refiner(surface, SPREAD).refine(problem, away)
+    is_sound(result, 3)
+    assert not result.converged.any()
+    np.testing.assert_array_equal(result.T, away)
+    assert all(len(rows) == 0 for rows in result.observable)
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+@pytest.mark.parametrize("shape", [(48, 64), (240, 320), (2, 2)])
+def test_masks_without_a_rim_are_harmless(refiner, shape, block):
+    surface, _ = block
+    T = np.stack([facing_down(0, 0, 0.8e-3, 9e-3), facing_down(1e-3, 0, 0.3e-3, 9e-3, turn=1.0)])
+    dot, corner, line = np.zeros((3, *shape), bool)
+    dot[shape[0] // 2, shape[1] // 2] = corner[0, 0] = True
+    line[shape[0] // 2] = True
+    for mask in (np.zeros(shape, bool), np.ones(shape, bool), dot, corner, line):
+        result = refiner(surface, SPREAD).refine(make_problem(mask, SENSOR), T)
+        is_sound(result, 2)
+        np.testing.assert_array_equal(result.T[~result.converged], T[~result.converged])
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_modes_do_not_touch_each_other_and_no_mode_is_no_work(refiner, block):
+    surface, caster = block
+    T = facing_down(1e-3, -1e-3, 0.8e-3, 9e-3, turn=0.4)
+    problem = make_problem(touch(caster, T), SENSOR)
+    starts = np.stack([off(T, problem, np.random.default_rng(seed)) for seed in range(4)])
+    together = refiner(surface, SPREAD).refine(problem, starts)
+    for i, start in enumerate(starts):
+        alone = refiner(surface, SPREAD).refine(problem, start[None])
+        np.testing.assert_allclose(alone.T[0], together.T[i], atol=1e-12)
+    is_sound(refiner(surface, SPREAD).refine(problem, np.zeros((0, 4, 4))), 0)
+
+
+def test_result_does_not_depend_on_the_object_frame(block):
+    """The same part in another frame: same poses of the part, and covariances that agree about the contact."""
+    surface, caster = block
+    T = facing_down(1e-3, -1e-3, 0.8e-3, 9e-3, turn=0.4)
+    problem = make_problem(touch(caster, T), SENSOR)
+    start = off(T, problem, np.random.default_rng(3))
+    B = se3.exp([0.4, -0.8, 1.1, 0.05, -0.02, 0.03])
+    other = Surface(se3.apply(B, surface.points), surface.normals @ B[:3, :3].T)
+    here = FilterReg(surface, SPREAD).refine(problem, start[None])
+    there = FilterReg(other, SPREAD).refine(problem, (start @ se3.inverse(B))[None])
+    np.testing.assert_allclose(there.T[0] @ B, here.T[0], atol=1e-7)
+    assert len(here.observable[0]) == len(there.observable[0])
+    # T B exp(xi) = T exp(Ad_B xi) B
+    R, t = B[:3, :3], B[:3, 3]
+    adjoint = np.block([[R, np.zeros((3, 3))], [se3.hat(t) @ R, R]])
+    scale = np.repeat([here.length, 1.0], 3)
+    np.testing.assert_allclose(
+        there.covariance[0] * np.outer(scale, scale),
+        adjoint @ here.covariance[0] @ adjoint.T * np.outer(scale, scale),
+        rtol=1e-4,
+        atol=1e-9,
+    )
+
+
+def test_rim_lies_on_the_outline_and_not_on_the_border_of_the_image():
+    x, y = SENSOR.pixel_centres()
+    centre = np.array([6e-3, 0.0])
+    mask = np.hypot(x - centre[0], y[:, None] - centre[1]) < 5e-3
+    problem = make_problem(mask, SENSOR)
+    assert 30 <= len(problem.rim) <= 120
+    radius = np.linalg.norm(problem.rim[:, :2] - centre, axis=1)
+    assert np.abs(radius - 5e-3).max() < 0.5 * 0.3e-3 and abs(radius.mean() - 5e-3) < 0.05 * 0.3e-3
+    assert problem.rim[:, 0].max() <= SENSOR.half_window[0]
+    expected = (problem.rim[:, :2] - centre) / radius[:, None]
+    # at the border of the image the blur of the mask is one-sided
+    clear = problem.rim[:, 0] < SENSOR.half_window[0] - 4 * 0.3e-3
+    assert (problem.outward[clear, :2] * expected[clear]).sum(1).min() > 0.97
+    gaps = np.linalg.norm(np.diff(problem.rim, axis=0), axis=1)
+    assert np.median(gaps) == pytest.approx(problem.spacing, rel=0.1)
+
+
+def test_specks_have_no_rim_and_a_curved_membrane_lifts_it():
+    x, y = SENSOR.pixel_centres()
+    mask = np.hypot(x, y[:, None]) < 4e-3
+    clean = make_problem(mask, SENSOR)
+    mask[3, 3] = mask[40, 58] = mask[40, 59] = True
+    np.testing.assert_allclose(make_problem(mask, SENSOR).rim.mean(0), clean.rim.mean(0), atol=1e-5)
+    curved = Sensor("curved", (64, 48), (0.3e-3, 0.3e-3), 20e-3, 2e-3, membrane_radius=30e-3)
+    rim = make_problem(mask, curved).rim
+    np.testing.assert_allclose(rim[:, 2], -curved.sag(rim[:, 0], rim[:, 1]), atol=1e-9)
+    assert isinstance(clean, Problem) and (clean.rim[:, 2] == 0).all()

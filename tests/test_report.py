@@ -1,0 +1,280 @@
+"""The report says what the posterior says: in plain numbers, in result.json, in one picture and in one page."""
+
+import io
+import json
+import re
+from dataclasses import dataclass, field
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from geomtact import se3
+from geomtact.geometry.mesh import load_mesh
+from geomtact.report.files import write_whole
+from geomtact.report.marginals import Samples, marginals, turn_and_tilt
+from geomtact.report.result import plain, result, to_text
+from geomtact.report.summary import MOTIONS, contact_centre, facts, summarise, told
+from geomtact.report.write import write_all
+from geomtact.sensing.cast import Caster
+from geomtact.sensing.sensor import Sensor
+
+
+@dataclass
+class FakeMode:
+    T: np.ndarray
+    probability: float = 0.5
+    covariance: np.ndarray = field(default_factory=lambda: np.diag([0.01, 0.02, 0.03, 1e-4, 2e-4, 3e-4]) ** 2)
+    observable: np.ndarray = field(default_factory=lambda: np.eye(6)[[0, 1, 3, 4, 5]])
+    length: float = 0.01
+    refined: bool = True
+
+
+@pytest.fixture(scope="module")
+def touch():
+    """A pin that lies along the sensor's x axis, pressed 0.5 mm deep, its modes, and a cloud of poses about the first."""
+    rng = np.random.default_rng(1)
+    sensor, mesh = Sensor.load("gelsight-mini"), load_mesh("pin")
+    caster = Caster(mesh.vertices, mesh.faces)
+    lying = se3.transform(Rotation.from_euler("y", 90, degrees=True).as_matrix(), np.zeros(3))
+    lying[:3, 3] = -lying[:3, :3] @ mesh.centre
+
+    def pressed(T):
+        return se3.transform(np.eye(3), [0, 0, caster.penetration(sensor, T)[0] - 0.5e-3]) @ T
+
+    lying[2, 3] += 0.03
+    modes = [
+        FakeMode(pressed(se3.transform(Rotation.from_euler("z", a, degrees=True).as_matrix(), [s, 0, 0]) @ lying), p)
+        for a, s, p in ((25, 0.001, 0.62), (-60, 0, 0.21), (100, 0.002, 0.1), (-10, -0.03, 0.05), (5, 0.04, 0.02))
+    ]
+    poses = modes[0].T @ se3.exp(rng.normal(size=(3000, 6)) * [0.05, 0.02, 0.05, 3e-4, 4e-4, 3e-4])
+    log_prob = rng.normal(size=3000)
+    posterior = SimpleNamespace(
+        mesh=mesh,
+        sensor=sensor,
+        frame="sensor",
+        contact=True,
+        poses=poses,
+        log_prob=log_prob - np.log(np.exp(log_prob).sum()),
+        entropy_nats=-4.2,
+        effective_poses=1234.5,
+        settings={"scorer": "overlap", "temperature": np.float64(0.1)},
+        timing_ms={"score": 12.0},
+        warnings=["a <b>bold</b> warning"],
+        seed=7,
+        index=SimpleNamespace(resolution=SimpleNamespace(step=5e-4, level=3, penetrations=(0.5e-3, 1.5e-3))),
+        T_frame_sensor=np.eye(4),
+        save=lambda path: np.savez(path, poses=poses),
+    )
+    contact = caster.contact(sensor, modes[0].T)
+    image = np.where(contact.mask, 255, 0).astype(np.uint8)
+    posterior.observations = [SimpleNamespace(contact=contact, kind="mask", warnings=[], image=image)]
+    return posterior, modes, lambda T: caster.contact(sensor, T)
+
+
+def test_all_files_are_whole_and_agree(touch, tmp_path):
+    posterior, modes, simulate = touch
+    content = write_all(tmp_path / "new" / "folder", posterior, modes, simulate, {"kind": "auto"}, {"prepare": 1.0})
+    folder = tmp_path / "new" / "folder"
+    assert sorted(p.name for p in folder.iterdir()) == ["posterior.npz", "report.html", "report.png", "result.json"]
+
+    read = json.loads((folder / "result.json").read_text())
+    assert read == content
+    assert read["schema"] == "geomtact/localization/1"
+    assert set(read) == {
+        *("schema", "object", "sensor", "frame", "contact", "modes", "entropy_nats", "effective_poses"),
+        *("settings", "versions", "timing_ms", "warnings"),
+    }
+    assert read["settings"] == {"scorer": "overlap", "temperature": 0.1, "kind": "auto", "seed": 7}
+    assert set(read["timing_ms"]) == {"score", "prepare", "report"}
+    for mode, entry in zip(modes, read["modes"], strict=True):
+        T = np.array(entry["T"])
+        assert np.array_equal(T, mode.T)
+        assert np.allclose(entry["translation_mm"], 1e3 * T[:3, 3], atol=1e-12)
+        assert np.allclose(Rotation.from_quat(entry["quat_xyzw"]).as_matrix(), T[:3, :3], atol=1e-12)
+
+    with Image.open(folder / "report.png") as picture:
+        assert picture.format == "PNG"
+        assert picture.width == 1400
+        colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+    for colour in ("D55E00", "56B4E9", "0072B2"):  # the outline, the simulated contact, the bars
+        assert (colours == list(bytes.fromhex(colour))).all(1).sum() > 100
+
+
+def test_page_is_self_contained_and_escaped(touch, tmp_path):
+    posterior, modes, simulate = touch
+    write_all(tmp_path, posterior, modes, simulate)
+    html = (tmp_path / "report.html").read_text("utf-8")
+    assert "a &lt;b&gt;bold&lt;/b&gt; warning" in html
+    assert "<b>" not in html
+    assert not re.search(r"https?:|//", re.sub(r'src="data:[^"]*"', "", html))
+    parser = _Tags()
+    parser.feed(html)
+    assert parser.open == []
+    assert parser.images == 3
+    assert parser.rows == 1 + len(modes)
+
+
+class _Tags(HTMLParser):
+    """Checks that tags close in order; counts images and rows."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.images, self.rows = [], 0, 0
+
+    def handle_starttag(self, tag, attrs):
+        self.images += tag == "img"
+        self.rows += tag == "tr"
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_no_contact_still_makes_a_report(touch, tmp_path):
+    posterior, _, simulate = touch
+    empty = SimpleNamespace(
+        **{**vars(posterior), "contact": False, "poses": np.zeros((0, 4, 4)), "log_prob": np.zeros(0)}
+    )
+    seen = posterior.observations[0]
+    nothing = SimpleNamespace(mask=np.zeros_like(seen.contact.mask), height=None)
+    empty.observations = [SimpleNamespace(contact=nothing, kind="mask", image=np.zeros_like(seen.image))]
+    content = write_all(tmp_path, empty, [], simulate)
+    assert content["modes"] == []
+    assert content["contact"] is False
+    assert "No contact" in (tmp_path / "report.html").read_text()
+    assert (tmp_path / "report.png").stat().st_size > 1000
+
+
+def test_result_has_no_numbers_that_json_lacks(touch):
+    posterior, modes, _ = touch
+    lost = FakeMode(modes[0].T, covariance=np.full((6, 6), np.inf))
+    text = to_text(result(posterior, [lost]))
+    assert json.loads(text)["modes"][0]["covariance"] == [[None] * 6] * 6
+    assert plain({"a": np.float32(0.5), 2: (np.nan, True, None)}) == {"a": 0.5, "2": [None, True, None]}
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    target = tmp_path / "file.txt"
+    target.write_text("old")
+
+    def fail(path):
+        path.write_text("half")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        write_whole(target, fail)
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("file.txt", "old")]
+
+
+def test_told_names_the_motions_by_finite_differences(rng):
+    """A motion in the sensor frame about a point is told by as much as its twist lies in the observable rows."""
+    T = se3.transform(se3.random_rotations(1, rng)[0], rng.normal(size=3) * 0.02)
+    about, length, step = rng.normal(size=3) * 0.01, 0.013, 1e-7
+    scale = np.array([length] * 3 + [1] * 3)
+    rows = np.linalg.qr(rng.normal(size=(6, 6)))[0][:4]
+    shares = told(FakeMode(T, observable=rows, length=length), about)
+    there, back = se3.transform(np.eye(3), about), se3.transform(np.eye(3), -about)
+    for k, name in enumerate(MOTIONS):
+        moved = there @ se3.exp(step * np.eye(6)[k]) @ back @ T
+        twist = scale * se3.log(se3.inverse(T) @ moved)
+        expected = ((rows @ twist) ** 2).sum() / (twist**2).sum()
+        assert shares[name] == pytest.approx(expected, abs=1e-5)
+
+
+def test_summary_in_words_and_numbers(rng):
+    T = se3.transform(Rotation.from_euler("z", 30, degrees=True).as_matrix(), [0.001, 0.002, 0.003])
+    centre = np.array([0.01, 0, 0])
+    summary = summarise(FakeMode(T), centre)
+    assert np.allclose(summary.centre_mm, 1e3 * (T[:3, :3] @ centre + T[:3, 3]))
+    assert np.allclose(summary.rotvec_deg, [0, 0, 30])
+    assert summary.rotation_sd_deg == pytest.approx(np.degrees(0.03))
+    xi = rng.multivariate_normal(np.zeros(6), FakeMode(T).covariance, 20_000)
+    moved = (T @ se3.exp(xi))[:, :3] @ np.append(centre, 1)
+    assert summary.centre_sd_mm == pytest.approx(1e3 * np.sqrt(np.linalg.eigvalsh(np.cov(moved.T))[-1]), rel=0.03)
+    flat = FakeMode(np.eye(4), observable=np.eye(6)[[0, 1, 5]])
+    assert summarise(flat, centre).told_in_words() == "all but turn about z, shift along x, shift along y"
+    half = FakeMode(np.eye(4), observable=np.array([[0, 0, 0, 1, 1, 0]]) / np.sqrt(2))
+    assert summarise(half, centre).told_in_words().endswith("shift along x (in part), shift along y (in part)")
+    assert summarise(FakeMode(T, observable=np.zeros((0, 6))), centre).told_in_words() == "unknown"
+    assert summarise(FakeMode(T, observable=np.eye(6)), centre).told_in_words() == "all six motions"
+    assert "unknown" in summarise(FakeMode(T, covariance=np.full((6, 6), np.nan)), centre).cells(1)
+
+
+@pytest.mark.parametrize("turn, tilt", [(0, 0), (170, 20), (-35, 80), (90, 179)])
+def test_turn_and_tilt_compose(turn, tilt, rng):
+    first = se3.random_rotations(1, rng)[0]
+    axis = np.array([np.cos(1.0), np.sin(1.0), 0])
+    R = Rotation.from_euler("z", turn, degrees=True) * Rotation.from_rotvec(np.radians(tilt) * axis)
+    found = turn_and_tilt((R.as_matrix() @ first)[None], first, None)
+    assert np.allclose(np.concatenate(found), [turn, tilt], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["hex_nut", "damping_pin"])
+def test_turns_of_the_symmetry_count_for_nothing(name, rng):
+    symmetry = load_mesh(name).symmetry
+    first = se3.random_rotations(1, rng)[0]
+    images = symmetry.sampled()[:, :3, :3]
+    turn, tilt = turn_and_tilt(first @ images, first, symmetry)
+    assert np.abs(turn).max() < 1e-3
+    assert tilt.max() < 1e-3
+
+
+def test_marginals_hold_the_mass(touch):
+    posterior, modes, _ = touch
+    found = marginals(posterior, modes[0].T)
+    assert [s.label for s in found] == [
+        "centre x [mm]",
+        "centre y [mm]",
+        "centre z [mm]",
+        "turn about z [°]",
+        "tilt [°]",
+    ]
+    for samples in found:
+        assert samples.weights.sum() == pytest.approx(1)
+        mass, edges = samples.histogram()
+        assert mass.sum() >= 0.998
+        assert len(mass) <= 36
+        assert edges[0] <= samples.mark <= edges[-1]
+        in_steps = np.diff(edges) / samples.step
+        assert np.allclose(in_steps, np.round(in_steps))
+    weights = np.exp(posterior.log_prob)
+    mean = weights @ (posterior.poses[:, 0, :3] @ posterior.mesh.centre + posterior.poses[:, 0, 3])
+    assert found[0].values @ found[0].weights == pytest.approx(1e3 * mean, abs=1e-6)
+
+
+def test_the_grid_does_not_show_as_a_comb():
+    values = np.repeat(np.arange(-40, 40) * 0.75, 3)
+    mass, edges = Samples("x", values, np.full(240, 1 / 240), 0.0, 0.75).histogram()
+    assert np.ptp(mass[1:-1]) < 1e-12
+    alone, _ = Samples("x", np.zeros(5), np.full(5, 0.2), 0.0, 0.75).histogram()
+    assert alone.max() == pytest.approx(1)
+
+
+def test_contact_centre_is_the_pressed_spot():
+    sensor = Sensor.load("gelsight-mini")
+    x, y = sensor.pixel_centres()
+    mask = np.hypot(x - 2e-3, y[:, None] + 1e-3) < 1e-3
+    assert np.allclose(contact_centre(SimpleNamespace(mask=mask), sensor), [2e-3, -1e-3, 0], atol=2e-5)
+    assert np.array_equal(contact_centre(SimpleNamespace(mask=mask & False), sensor), np.zeros(3))
+
+
+def test_facts_are_sentences(touch):
+    posterior, _, _ = touch
+    lines = facts(posterior)
+    assert lines[0].startswith("4.2 nats are known: one part in 67 ")
+    assert "1,234 of 3,000" in lines[1] or "1,235 of 3,000" in lines[1]
+
+
+def test_pictures_open(touch):
+    from geomtact.report.figure import draw
+    from geomtact.report.summary import summaries_of
+
+    posterior, modes, simulate = touch
+    picture = draw(posterior, modes[:2], summaries_of(posterior, modes[:2]), simulate)
+    sizes = {name: Image.open(io.BytesIO(png)).size for name, png in picture.bands.items()}
+    assert sum(height for _, height in sizes.values()) == Image.open(io.BytesIO(picture.whole)).height

@@ -1,0 +1,117 @@
+"""The plan of the house: data walks one way, imports are light, and the library neither prints nor pickles."""
+
+import ast
+import configparser
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "geomtact"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+# A module imports only from its own stage and from stages above it in this list; one line, one height.
+STAGES = [
+    ["errors", "se3"],
+    ["geometry"],
+    ["sensing"],
+    ["contact_space"],
+    ["scoring"],
+    ["registration"],
+    ["inference"],
+    ["evaluation", "report"],
+    ["cli"],
+]
+HEIGHT = {name: k for k, names in enumerate(STAGES) for name in names}
+FORBIDDEN = {"pymeshlab", "tamaas", "pickle", "cloudpickle", "joblib"}
+HEAVY = {"torch", "open3d", "matplotlib", "trimesh", "skimage", "cv2", "kornia", "scipy.spatial", "numpy", "PIL"}
+SHOW_HELP = "import sys; sys.argv = ['geomtact', '--help']; from geomtact.cli import main; main()"
+
+
+def stage(path: Path) -> str:
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def imports(path: Path) -> list[tuple[str, int]]:
+    """Every module named by an import anywhere in a file, and its line; ``from geomtact import x`` names geomtact.x."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, node.lineno) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: relative import"
+            module = node.module or ""
+            names = [f"geomtact.{alias.name}" for alias in node.names] if module == "geomtact" else [module]
+            found += [(name, node.lineno) for name in names]
+    return found
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_go_one_way(path):
+    own = stage(path)
+    for name, line in imports(path):
+        parts = name.split(".")
+        assert parts[0] not in FORBIDDEN, f"{path}:{line} imports {name}"
+        if parts[0] != "geomtact" or len(parts) == 1 or own in ("__init__", "__main__"):
+            continue
+        assert parts[1] in HEIGHT, f"{path}:{line}: {name} is in no stage; add its folder to STAGES"
+        allowed = parts[1] == own or HEIGHT[parts[1]] < HEIGHT[own]
+        assert allowed or {own, parts[1]} == {"errors", "se3"}, (
+            f"{path}:{line}: {own} imports from {parts[1]}, a later stage"
+        )
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_library_does_not_print(path):
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        printed = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+        assert not printed, f"{path}:{node.lineno} prints; return it, or say it in geomtact/cli"
+
+
+@pytest.mark.parametrize("command", ["import geomtact", SHOW_HELP])
+def test_start_is_light(command):
+    """Loading nothing heavy is what makes the start quick, whatever the machine does meanwhile."""
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-c", command], capture_output=True, text=True, check=True
+    )
+    loaded = {line.split("|")[-1].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+    assert "geomtact" in loaded
+    assert not loaded & HEAVY
+
+
+def test_public_names_are_the_promised_ones():
+    import geomtact
+
+    promised = {"Localizer", "Posterior", "Mode", "Sensor", "contact_mask", "Contact", "GeomtactError", "load_mesh"}
+    assert promised <= set(geomtact.__all__)
+    assert sorted(geomtact.__all__) == dir(geomtact)
+    for name in geomtact.__all__:
+        assert getattr(geomtact, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'localiser'"):
+        geomtact.localiser  # noqa: B018
+
+
+def test_every_error_is_a_geomtact_error():
+    from geomtact import errors
+
+    classes = [c for c in vars(errors).values() if isinstance(c, type) and c.__module__ == errors.__name__]
+    assert len(classes) > 3
+    assert all(issubclass(c, errors.GeomtactError) for c in classes)
+
+
+def test_setup_cfg_ships_every_package_and_pins_every_requirement():
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg", "utf-8")
+    packages = config["options"]["packages"].split()
+    folders = {".".join(p.parent.relative_to(ROOT).parts) for p in PACKAGE.rglob("__init__.py")}
+    assert set(packages) == folders | {"geomtact_meshes"}
+    assert all(p.parent.joinpath("__init__.py").is_file() for p in MODULES)
+
+    wanted = config["options"]["install_requires"] + "\n".join(config["options.extras_require"].values())
+    names = {line.split(">")[0].split("=")[0].strip() for line in wanted.splitlines() if line.strip()}
+    lines = (ROOT / "tools" / "constraints.txt").read_text("utf-8").splitlines()
+    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    assert names <= set(pins)
+    assert pins["torch"] == "2.13.0"
