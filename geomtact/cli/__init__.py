@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from geomtact.cli.evaluate import evaluate
 from geomtact.cli.library import cache, objects, sensors
 from geomtact.cli.localize import localize
 from geomtact.cli.prepare import prepare
@@ -16,7 +17,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Localize a known part from the shape of one tactile contact: the whole distribution of its pose.",
 )
-for command in (localize, prepare, simulate, sensors, objects, cache):
+for command in (localize, prepare, simulate, evaluate, sensors, objects, cache):
     app.command()(one_line_errors(command))
 
 

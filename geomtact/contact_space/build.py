@@ -154,8 +154,8 @@ def _join(turns: list[_Turn], directions: Directions, frame: Frame) -> dict[str,
     out["weight"] /= out["weight"].sum(dtype=np.float64)
     out["moments"] = out["moments"].reshape(some.moments.shape[0], p * n)
     # a rotation that cannot touch at all borrows the places of the nearest one before it that can
-    for r in np.flatnonzero(out["table"][:, 0, 0] < 0):
-        out["table"][r] = out["table"][r - 1] if r and out["table"][r - 1, 0, 0] >= 0 else 0
+    for r in np.flatnonzero(out["table"][:, 0, 0] < 0).tolist():
+        out["table"][r] = out["table"][r - 1] if r else 0
     return out
 
 

@@ -56,7 +56,7 @@ class HeightMap:
         np.maximum.at(heights, (ij[:, 1], ij[:, 0]), -corners[:, 2].astype(np.float32))
         heights = np.pad(heights, int(np.ceil(margin / pixel)), constant_values=NOTHING)
         widest = cv2.dilate(heights, np.ones((PIXELS_PER_MASK_PIXEL,) * 2, np.uint8))
-        return cls(heights, widest, pixel)
+        return cls(heights, np.asarray(widest, np.float32), pixel)
 
     def turned(self, turn: float, frame: Frame) -> NDArray[np.float32]:
         """The heights turned by ``turn`` [rad] about the centre, on ``frame``."""
@@ -66,7 +66,7 @@ class HeightMap:
         A = np.zeros((2, 3))
         A[:, :2] = np.array([[c, s], [-s, c]]) * (frame.pixel / self.pixel)
         A[:, 2] = len(self.heights) // 2 - A[:, :2] @ [w // 2, h // 2]
-        return cv2.warpAffine(
+        turned = cv2.warpAffine(
             self.heights,
             A,
             (w, h),
@@ -74,6 +74,7 @@ class HeightMap:
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=NOTHING,
         )
+        return np.asarray(turned, np.float32)
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,9 @@ class Frame:
         return np.stack([x, y], 1) * self.pixel
 
 
-def allowed(heights: NDArray[np.float32], frame: Frame, sensor: Sensor, penetrations: Sequence[float]) -> NDArray[np.bool_]:
+def allowed(
+    heights: NDArray[np.float32], frame: Frame, sensor: Sensor, penetrations: Sequence[float]
+) -> NDArray[np.bool_]:
     """Window centres (P, h, w) of a turned map at which the object touches and clears the sensor's housing elsewhere."""
     kw, kh = (2 * np.floor(sensor.half_window / frame.pixel).astype(int) + 1).tolist()
     kernel = np.ones((kh, kw), np.uint8)

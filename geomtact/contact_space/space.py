@@ -144,7 +144,10 @@ class ContactSpace:
             half = np.array([self.cones[i][1] for i in which])
             c = 1 - rng.random(len(todo)) * (1 - np.cos(half))
             turn = rng.uniform(0, 2 * np.pi, len(todo))
-            side = np.stack([np.cos(turn), np.sin(turn), np.zeros(len(todo))], 1) * np.sqrt(np.maximum(0, 1 - c**2))[:, None]
+            side = (
+                np.stack([np.cos(turn), np.sin(turn), np.zeros(len(todo))], 1)
+                * np.sqrt(np.maximum(0, 1 - c**2))[:, None]
+            )
             side[:, 2] = c
             # facing(-v) has v as its third row: the cone's axis becomes z
             a[todo] = np.einsum("nij,ni->nj", facing(-v), side)

@@ -106,7 +106,9 @@ def cache_entries(cache_dir: str | Path | None = None) -> list[CacheEntry]:
             size = sum(f.stat().st_size for f in meta_file.parent.iterdir())
             used = meta_file.stat().st_mtime
             name = meta_file.parent.name
-            entries.append(CacheEntry(name, meta["object"], meta["sensor"], meta["poses"], size, used, meta_file.parent))
+            entries.append(
+                CacheEntry(name, meta["object"], meta["sensor"], meta["poses"], size, used, meta_file.parent)
+            )
     return sorted(entries, key=lambda e: -e.last_used)
 
 

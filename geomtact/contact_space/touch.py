@@ -44,9 +44,7 @@ def felt_mask(
 
 def draw_noise(noise: Noise, rng: np.random.Generator) -> Noise:
     """Noise no stronger than ``noise``, its strength and its number of specks drawn uniformly: for learning from."""
-    return replace(
-        noise, outline_rms=noise.outline_rms * rng.random(), specks=int(rng.integers(noise.specks + 1))
-    )
+    return replace(noise, outline_rms=noise.outline_rms * rng.random(), specks=int(rng.integers(noise.specks + 1)))
 
 
 def spoilt(mask: NDArray[np.bool_], space: ContactSpace, noise: Noise, rng: np.random.Generator) -> NDArray[np.bool_]:

@@ -190,8 +190,9 @@ class Directions:
         if sym.kind == "axis":
             a = approach_of(T[:, :3, :3])
             target = self.vectors[self.direction_of(a)]
-            angle = _azimuth(a, sym.axis) - _azimuth(target, sym.axis)
-            S = Rotation.from_rotvec(angle[:, None] * sym.axis).as_matrix()
+            axis = _axis(sym)
+            angle = _azimuth(a, axis) - _azimuth(target, axis)
+            S = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
             T = _about(T, sym.centre, T[:, :3, :3] @ S)
         return T
 
@@ -235,16 +236,19 @@ def allowed(a: ArrayLike, cones: list[tuple[Array, float]] | None) -> NDArray[np
     return ok
 
 
-def _canonical(a: Array, symmetry: Symmetry, cones: list[tuple[Array, float]] | None) -> tuple[NDArray[np.int64], Array]:
+def _canonical(
+    a: Array, symmetry: Symmetry, cones: list[tuple[Array, float]] | None
+) -> tuple[NDArray[np.int64], Array]:
     """Which group element (n,) carries each direction to its orbit's canonical allowed image, and that image (n, 3)."""
     images = np.einsum("gji,nj->ngi", symmetry.elements[:, :3, :3], a)
     if symmetry.kind == "axis":
-        score = images @ symmetry.axis
+        axis = _axis(symmetry)
+        score = images @ axis
         ok = np.ones(score.shape, bool)
         if cones is not None:  # a turn about the axis may bring an image into a cone
             ok = np.zeros(score.shape, bool)
             for v, half_angle in cones:
-                tilt = np.arccos(np.clip(score, -1, 1)) - np.arccos(np.clip(v @ symmetry.axis, -1, 1))
+                tilt = np.arccos(np.clip(score, -1, 1)) - np.arccos(np.clip(v @ axis, -1, 1))
                 ok |= np.abs(tilt) <= half_angle + FACE_TOLERANCE
     else:
         score = images @ _GENERIC
@@ -265,7 +269,7 @@ def _bands(level: int) -> int:
 def _bin(a: Array, symmetry: Symmetry, level: int) -> NDArray[np.int64]:
     if symmetry.kind == "axis":
         n = _bands(level)
-        angle = np.arccos(np.clip(a @ symmetry.axis, -1, 1))
+        angle = np.arccos(np.clip(a @ _axis(symmetry), -1, 1))
         return np.minimum((angle / np.pi * n).astype(np.int64), n - 1)
     return np.asarray(healpix.vec2pix(2**level, *a.T, nest=True), np.int64)
 
@@ -276,25 +280,31 @@ def _on_meridian(
     """Directions of the bands' mean polar angle, on an azimuth that the approach allows."""
     image = _canonical(fine, symmetry, cones)[1]
     key = _bin(image, symmetry, level)
-    centre = cones[0][0] if cones else facing(symmetry.axis)[0]
+    axis = _axis(symmetry)
+    centre = cones[0][0] if cones else facing(axis)[0]
     out = []
     for k in np.unique(key):
         member = image[key == k]
-        polar = np.mean(np.arccos(np.clip(member @ symmetry.axis, -1, 1)))
+        polar = np.mean(np.arccos(np.clip(member @ axis, -1, 1)))
         side = member[np.argmax(member @ centre)]
-        side = side - (side @ symmetry.axis) * symmetry.axis
+        side = side - (side @ axis) * axis
         norm = np.linalg.norm(side)
-        side = side / norm if norm > 1e-9 else facing(symmetry.axis)[0]
-        out.append(np.cos(polar) * symmetry.axis + np.sin(polar) * side)
+        side = side / norm if norm > 1e-9 else facing(axis)[0]
+        out.append(np.cos(polar) * axis + np.sin(polar) * side)
     return np.array(out)
 
 
 def _turn_period(a: Array, symmetry: Symmetry) -> float:
     """Turn after which the object pressed along ``a`` looks the same."""
-    if symmetry.kind == "axis" and abs(abs(a @ symmetry.axis) - 1) < FACE_TOLERANCE**2 * 10:
+    if symmetry.kind == "axis" and abs(abs(a @ _axis(symmetry)) - 1) < FACE_TOLERANCE**2 * 10:
         return 0.0
     same = np.linalg.norm(symmetry.elements[:, :3, :3] @ a - a, axis=-1) < 1e-4
     return 2 * np.pi / int(same.sum())
+
+
+def _axis(symmetry: Symmetry) -> Array:
+    assert symmetry.axis is not None
+    return symmetry.axis
 
 
 def _azimuth(a: Array, axis: Array) -> Array:

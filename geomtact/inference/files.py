@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 import zipfile
 from pathlib import Path
 
@@ -16,18 +15,22 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.inference.posterior import Posterior, Refined
 from geomtact.sensing.sensor import Sensor
 
-_KEPT = 0.9999  # of the mass is written cell by cell; the rest is written as one number
+_KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many
 _FORMAT = "geomtact/posterior/1"
 
 
 def save(posterior: Posterior, path: str | Path) -> None:
     """Write ``posterior`` to ``path``: poses, log_prob, frame, object_sha256, sensor_toml, seed, and what
-    :func:`load` needs. Of a posterior spread over a million cells, those that hold 99.99 % are kept one by one.
+    :func:`load` needs.
+
+    A posterior may be spread over a million poses. For other programs the most probable are written out, those that
+    hold 99 % of the mass but at most 50,000, with log_prob normalised over them; ``cell_log_prob`` holds every cell.
     """
     p = np.exp(posterior.log_prob)
     order = np.argsort(-p, kind="stable")
-    kept = np.sort(order[: int(np.searchsorted(np.cumsum(p[order]), _KEPT)) + 1])
-    mass = float(p[kept].sum())
+    some = np.sort(order[: min(_MOST, int(np.searchsorted(np.cumsum(p[order]), _KEPT)) + 1)])
+    every = np.full(len(posterior.index), -np.inf, np.float32)
+    every[posterior.cells] = posterior.log_prob
     refined = posterior.refined
     keys = np.array(sorted(refined), np.int64)
     meta = {
@@ -44,14 +47,13 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "refined": [[refined[int(k)].length, refined[int(k)].moved, refined[int(k)].observable.tolist()] for k in keys],
     }
     arrays = {
-        "poses": posterior.poses[kept],
-        "log_prob": posterior.log_prob[kept] - (np.log(mass) if mass else 0.0),
+        "poses": posterior.poses_of(some),
+        "log_prob": posterior.log_prob[some] - (np.log(p[some].sum()) if len(some) else 0.0),
         "frame": np.array(posterior.frame),
         "object_sha256": np.array(posterior.mesh.sha256),
         "sensor_toml": np.array(posterior.sensor.to_toml()),
         "seed": np.array(posterior.seed),
-        "cells": posterior.cells[kept],
-        "rest": np.array(1 - (1 - posterior.rest) * mass if len(p) else 0.0),
+        "cell_log_prob": every,
         "T_frame_sensor": posterior.T_frame_sensor,
         "vertices": posterior.mesh.vertices,
         "faces": posterior.mesh.faces,
@@ -62,13 +64,13 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "meta": np.array(json.dumps(meta)),
     }
     path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays)
+        with open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
@@ -88,7 +90,8 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
             raise ValueError(f"format {meta['format']!r}")
         mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"])
         sensor = Sensor.from_toml(str(data["sensor_toml"]), str(path))
-        cells, log_prob = data["cells"].astype(np.int64), data["log_prob"].astype(float)
+        every = data["cell_log_prob"].astype(float)
+        cells = np.flatnonzero(np.isfinite(every))
         extra = meta["refined"]
         refined = {
             int(k): Refined(T, C, np.array(rows).reshape(-1, 6), length, moved)
@@ -100,13 +103,12 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         raise InputError(f"{path}: not a posterior that geomtact saved ({error}); give a posterior.npz") from None
     settings = meta["settings"]
     index = open_index(mesh, sensor, meta["approach"], settings.get("max_poses", 1_200_000), cache_dir)
-    if len(cells) and int(cells.max()) >= len(index):
+    if len(every) != len(index):
         raise InputError(f"{path}: its poses are not those of this version's grid; localize again")
     return Posterior(
         index,
         cells,
-        log_prob,
-        rest=float(data["rest"]),
+        every[cells] - np.log(np.exp(every[cells]).sum() or 1.0),
         frame=str(data["frame"]),
         T_frame_sensor=data["T_frame_sensor"],
         contact=bool(meta["contact"]),

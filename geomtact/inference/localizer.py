@@ -126,9 +126,7 @@ class Localizer:
             "timing_ms": timing,
         }
         if not mask.any():
-            return Posterior(
-                self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, warnings=warnings, **common
-            )
+            return Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, warnings=warnings, **common)
         with _timed(timing, "score"):
             log_likelihood, best = self.scorer.log_likelihood(self.index, mask)
         with _timed(timing, "posterior"):
@@ -137,9 +135,7 @@ class Localizer:
             cells = np.flatnonzero(np.isfinite(log_prob))
         if best < self.scorer.calibration.usual:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
-        posterior = Posterior(
-            self.index, cells, log_prob[cells], log_evidence=evidence, warnings=warnings, **common
-        )
+        posterior = Posterior(self.index, cells, log_prob[cells], log_evidence=evidence, warnings=warnings, **common)
         with _timed(timing, "refine"):
             posterior = replace(posterior, refined=self._refinery.refine(posterior, mask, EFFORTS[effort]))
         return posterior

@@ -64,9 +64,8 @@ class Posterior:
     Attributes
     ----------
     index : the discretised contact pose space it lives on
-    cells : (N,) pose ids of the index that it holds one by one
+    cells : (N,) pose ids of the index, ascending; cells that are not among them have no mass
     log_prob : (N,) log probability of each, normalised
-    rest : share of the whole that lies outside ``cells``, spread over them as the uniform is; 0 if all are held
     frame : "sensor" or "world"
     T_frame_sensor : (4, 4)
     contact : whether the image shows any contact
@@ -78,7 +77,6 @@ class Posterior:
     index: Index
     cells: NDArray[np.int64]
     log_prob: Array
-    rest: float = 0.0
     frame: str = "sensor"
     T_frame_sensor: Array = field(default_factory=lambda: np.eye(4))
     contact: bool = True
@@ -110,17 +108,17 @@ class Posterior:
     @cached_property
     def poses(self) -> Array:
         """Poses (N, 4, 4) of the object in ``frame``, one a cell; refined ones where registration found better."""
-        return self.T_frame_sensor @ self._sensor_poses(np.arange(len(self.cells)))
+        return self.poses_of(np.arange(len(self.cells)))
+
+    def poses_of(self, rows: ArrayLike) -> Array:
+        """Some rows (m,) of :attr:`poses` (m, 4, 4), without making them all."""
+        return self.T_frame_sensor @ self._sensor_poses(np.asarray(rows, np.int64))
 
     @cached_property
     def entropy_nats(self) -> float:
         """Minus the mean log density under the posterior itself: 0 for the uniform, lower the more is known."""
         p = np.exp(self.log_prob)
-        held = 1 - self.rest
-        mean = held * float(p @ np.where(p > 0, self._log_density + np.log(held), 0.0))
-        if self.rest:
-            mean += self.rest * self._rest_log_density
-        return -mean if self.contact else 0.0
+        return -float(p @ np.where(p > 0, self._log_density, 0.0)) if self.contact else 0.0
 
     @property
     def effective_poses(self) -> float:
@@ -159,11 +157,8 @@ class Posterior:
     def cell_log_density(self, ids: ArrayLike) -> Array:
         """Log density (n,) in the cells of pose ids (n,) of the index, relative to the uniform distribution."""
         ids = np.asarray(ids)
-        where = np.searchsorted(self._sorted, ids)
-        where = np.minimum(where, len(self._sorted) - 1)
-        held = self._sorted[where] == ids
-        density = self._log_density[self._order[where]] + np.log(1 - self.rest)
-        return np.where(held, density, self._rest_log_density)
+        where = np.minimum(np.searchsorted(self.cells, ids), len(self.cells) - 1)
+        return np.where(self.cells[where] == ids, self._log_density[where], -np.inf)
 
     def credible_level(self, T: ArrayLike) -> Any:
         """Smallest highest-density mass in [0, 1] whose region holds ``T`` (4, 4) or (n, 4, 4).
@@ -219,34 +214,17 @@ class Posterior:
 
     @cached_property
     def _log_density(self) -> Array:
-        """Log density of the held cells (N,), as if they were all."""
+        """Log density (N,) of the cells relative to the uniform distribution."""
         with np.errstate(divide="ignore", invalid="ignore"):
             density = self.log_prob - np.log(np.asarray(self.index.weight).reshape(-1)[self.cells].astype(float))
         return np.where(np.isfinite(density), density, -np.inf)
-
-    @cached_property
-    def _rest_log_density(self) -> float:
-        weight = np.asarray(self.index.weight).reshape(-1)
-        left = float(weight.sum(dtype=float) - weight[self.cells].sum(dtype=float))
-        return float(np.log(self.rest / left)) if self.rest > 0 and left > 0 else -np.inf
-
-    @cached_property
-    def _order(self) -> NDArray[np.int64]:
-        if (np.diff(self.cells) > 0).all():
-            return np.arange(len(self.cells))
-        return np.argsort(self.cells, kind="stable")
-
-    @cached_property
-    def _sorted(self) -> NDArray[np.int64]:
-        return self.cells[self._order]
 
     @cached_property
     def _density_levels(self) -> tuple[Array, Array]:
         """Distinct log densities, highest first, and the mass at or above each."""
         if not len(self.cells):
             return np.zeros(1), np.ones(1)
-        density = np.append(self._log_density + np.log(1 - self.rest), self._rest_log_density)
-        mass = np.append(np.exp(self.log_prob) * (1 - self.rest), self.rest)
+        density, mass = self._log_density, np.exp(self.log_prob)
         order = np.argsort(-density, kind="stable")
         order = order[mass[order] > 0]
         density, mass = density[order], mass[order]
@@ -264,18 +242,12 @@ class Posterior:
     def _draw_cells(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
         total = np.cumsum(np.exp(self.log_prob))
         row = np.searchsorted(total, rng.random(n) * total[-1])
-        cell = self.cells[np.minimum(row, len(total) - 1)]
-        if self.rest:
-            weight = np.array(self.index.weight, float).reshape(-1)
-            weight[self.cells] = 0
-            from_rest = rng.random(n) < self.rest
-            cell[from_rest] = np.searchsorted(np.cumsum(weight), rng.random(int(from_rest.sum())) * weight.sum())
-        return cell
+        return self.cells[np.minimum(row, len(total) - 1)]
 
     @cached_property
     def _modes(self) -> list[tuple[int, float]]:
         """Row of each mode's pose and the mass of the mode, most probable first."""
-        p = np.exp(self.log_prob) * (1 - self.rest)
+        p = np.exp(self.log_prob)
         top = np.argpartition(-p, min(_SEEDS, len(p) - 1))[:_SEEDS]
         top = top[p[top] > 0]
         moved = self._rows_of(np.array(list(self.refined), np.int64))
@@ -304,11 +276,9 @@ class Posterior:
         return rows[distance.within(T, self._sensor_poses(rows), radius)]
 
     def _rows_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Rows of the pose ids that are held, in no particular order."""
-        if not len(self._sorted) or not len(ids):
-            return np.zeros(0, np.int64)
-        where = np.minimum(np.searchsorted(self._sorted, ids), len(self._sorted) - 1)
-        return self._order[where[self._sorted[where] == ids]]
+        """Rows of those of the pose ids that have a row."""
+        where = np.minimum(np.searchsorted(self.cells, ids), len(self.cells) - 1)
+        return where[self.cells[where] == ids]
 
     def _mode(self, row: int, mass: float) -> Mode:
         found = self.refined.get(int(self.cells[row]))

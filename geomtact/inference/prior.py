@@ -52,7 +52,9 @@ def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) 
         raise InputError("prior: the log density is NaN at some poses; return -inf where a pose is ruled out")
     out = (uniform + density).astype(np.float32)
     if not np.isfinite(out).any():
-        raise InputError("prior: it rules out every pose that touches the sensor; check its frame and its units (metres)")
+        raise InputError(
+            "prior: it rules out every pose that touches the sensor; check its frame and its units (metres)"
+        )
     return out
 
 

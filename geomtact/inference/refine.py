@@ -21,6 +21,7 @@ from geomtact.se3 import Array
 from geomtact.sensing.moments import moments, without_specks
 
 _SURFACE_POINTS = 30_000
+_LEAST_TURN = 0.02  # rad
 _SHAPE = (48, 64)  # of the casts that judge a refinement
 
 
@@ -37,7 +38,8 @@ class Refinery:
         return Surface(points, normals)
 
     def _refiners(self, index: Index) -> list[Refiner]:
-        rotation, step = index.angle_step, index.resolution.step
+        # where symmetry leaves no rotation to search, registration is still free to turn a little
+        rotation, step = max(index.angle_step, _LEAST_TURN), index.resolution.step
         spread = Spread(rotation / np.sqrt(12), step / np.sqrt(12))
         return [FilterReg(self._surface, spread), Icp(self._surface, spread)]
 
@@ -99,8 +101,5 @@ class Refinery:
         shift = np.clip(seen - index.moments[:2, cells].T * scale, -index.resolution.step, index.resolution.step)
         out = T.copy()
         out[:, :2, 3] += shift
-        moved, _ = self.space.settle(out, self._depths(posterior, cells), steps=4)
-        return np.where(np.isfinite(moved).all((1, 2))[:, None, None], moved, T)
-
-    def _depths(self, posterior: Posterior, cells: NDArray[np.int64]) -> Array:
-        return np.array(posterior.index.resolution.penetrations)[cells // posterior.index.places]
+        depths = np.array(index.resolution.penetrations)[cells // index.places]
+        return self.space.settle(out, depths, steps=4)[0]

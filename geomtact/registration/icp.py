@@ -44,10 +44,11 @@ class Icp:
         points, normals = near_surface(self.surface, problem, start, reach)
         if len(points) < 6:
             return rejected(start)
-        # Open3D moves the rim onto the surface; the object moves the other way
-        T = inverse(_register(problem, points, normals, reach)) @ start
-        if not np.isfinite(T).all():
+        motion = _register(problem, points, normals, reach)
+        if motion is None or not np.isfinite(motion).all():
             return rejected(start)
+        # Open3D moves the rim onto the surface; the object moves the other way
+        T = inverse(motion) @ start
         rim_filter = RimFilter(problem, start, points, normals)
         information = rim_filter.meet(T, 0.0, problem.noise).information[:6, :6]
         information = without_sink(information, problem.sink_std)
@@ -57,27 +58,43 @@ class Icp:
         return judged(start, T, rim_filter.meet(T, 0.0, 2 * problem.noise), True, self.spread, problem)
 
 
-def _register(problem: Problem, points: Array, normals: Array, reach: float) -> Array:
-    """(4, 4) that moves the rim onto the surface: first from afar, then within a few standard deviations of its noise."""
+def _register(problem: Problem, points: Array, normals: Array, reach: float) -> Array | None:
+    """(4, 4) that moves the rim onto the surface, first from afar, then close by; None where nothing corresponds."""
     import open3d as o3d
 
     registration = o3d.pipelines.registration
     rim, cloud = o3d.geometry.PointCloud(), o3d.geometry.PointCloud()
     # Open3D's tolerances are absolute and made for metres of room: in units of a pixel they fit
     unit = problem.pitch
-    rim.points = o3d.utility.Vector3dVector(problem.rim / unit)
-    cloud.points = o3d.utility.Vector3dVector(points / unit)
-    cloud.normals = o3d.utility.Vector3dVector(normals)
-    motion = np.eye(4)
+    anchors, axes = _anchors(problem, reach)
+    rim.points = o3d.utility.Vector3dVector(np.concatenate([problem.rim, anchors]) / unit)
+    cloud.points = o3d.utility.Vector3dVector(np.concatenate([points, anchors]) / unit)
+    cloud.normals = o3d.utility.Vector3dVector(np.concatenate([normals, axes]))
+    motion, found = np.eye(4), False
     for within in (reach, 3 * problem.noise + problem.pitch):
-        motion = registration.registration_icp(
+        result = registration.registration_icp(
             rim,
             cloud,
             within / unit,
             motion,
             registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=within / unit)),
             registration.ICPConvergenceCriteria(1e-4, 1e-4, _MAX_ITERATIONS),
-        ).transformation
-    motion = np.array(motion)
+        )
+        if result.fitness == 0:
+            break  # it ran off; Open3D says so in no other way
+        motion, found = np.array(result.transformation), True
+    if not found:
+        return None
     motion[:3, 3] *= unit
     return motion
+
+
+def _anchors(problem: Problem, reach: float) -> tuple[Array, Array]:
+    """Points (9, 3) far from all surface and directions (9, 3) in which each is held where it is.
+
+    A wall tells nothing about the way along it; Open3D's normal equations are singular then, and its step is at random.
+    Each anchor weighs as much as a rim point, which is little against the rim.
+    """
+    angle = 2 * np.pi / 9 * np.arange(9)
+    ring = (reach + problem.length) * np.stack([np.cos(angle), np.sin(angle), np.zeros(9)], 1)
+    return problem.centre + ring - [0.0, 0.0, 2 * reach], np.tile(np.eye(3), (3, 1))

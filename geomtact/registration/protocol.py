@@ -97,7 +97,8 @@ class Refinement:
 class Refiner(Protocol):
     """Moves poses so that the object's surface meets the rim of one contact."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     def refine(self, problem: Problem, T: Array) -> Refinement:
         """Refine the poses ``T`` (k, 4, 4), T_sensor_object."""

@@ -65,7 +65,7 @@ def make_problem(
         pitch=pitch,
         noise=float(np.hypot(outline_noise, 0.3 * pitch)),
         correlation=correlation,
-        sink_std=sink_std,
+        sink_std=max(sink_std, 1e-9),
     )
 
 
@@ -78,11 +78,12 @@ def near_surface(surface: Surface, problem: Problem, T: Array, reach: float) -> 
         return np.zeros((0, 3)), np.zeros((0, 3))
     around = float(np.linalg.norm(problem.rim - problem.centre, axis=1).max()) + reach
     centre = apply(inverse(T), problem.centre[None])[0]
-    index = np.asarray(surface.tree.query_ball_point(centre, around), dtype=np.intp)
-    points, normals = apply(T, surface.points[index]), surface.normals[index] @ T[:3, :3].T
-    low, high = problem.rim[:, 2].min() - reach, problem.rim[:, 2].max() + reach
-    keep = (points[:, 2] > low) & (points[:, 2] < high) & (np.hypot(normals[:, 0], normals[:, 1]) > _FLAT)
-    return points[keep], normals[keep]
+    index = np.array(surface.tree.query_ball_point(centre, around, return_sorted=False), dtype=np.intp)
+    # few of these points lie close to the membrane: heights first
+    z = surface.points[index] @ T[2, :3] + T[2, 3]
+    index = index[(z > problem.rim[:, 2].min() - reach) & (z < problem.rim[:, 2].max() + reach)]
+    index = index[np.abs(surface.normals[index] @ T[2, :3]) < np.sqrt(1 - _FLAT**2)]
+    return apply(T, surface.points[index]), surface.normals[index] @ T[:3, :3].T
 
 
 def _outline(mask: NDArray[np.bool_], pitch_xy: Array, max_points: int) -> tuple[Array, Array, float]:

@@ -128,4 +128,3 @@ def posterior_log_prob(
 def _log_sum_exp(x: NDArray[np.float32]) -> float:
     top = x.max()
     return float(top + np.log(np.exp(x - top).sum(dtype=np.float64)))
-

@@ -63,9 +63,7 @@ def fitted_scorer(
             "check the object's unit and the approach"
         )
     n = len(touches.ids) * _FIT // (_FIT + _JUDGE)
-    scorer: Scorer = (
-        Moments.fit(index, touches.masks[:n], touches.ids[:n]) if name == "moments" else OVERLAPS[name]
-    )
+    scorer: Scorer = Moments.fit(index, touches.masks[:n], touches.ids[:n]) if name == "moments" else OVERLAPS[name]
     fitted = FittedScorer(scorer, calibrate(scorer, index, Touches(touches.masks[n:], touches.ids[n:])))
     if path is not None:
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more

@@ -66,7 +66,11 @@ class Moments:
         W = self._whiten.astype(np.float32)
         target = (W @ seen).astype(np.float32)
         d, nu = len(seen), self.freedom
-        norm = gammaln((nu + d) / 2) - gammaln(nu / 2) - 0.5 * (d * np.log(nu * np.pi) + np.linalg.slogdet(self.covariance)[1])
+        norm = (
+            gammaln((nu + d) / 2)
+            - gammaln(nu / 2)
+            - 0.5 * (d * np.log(nu * np.pi) + np.linalg.slogdet(self.covariance)[1])
+        )
         out = np.zeros(index.height.size, np.float32)
         stored = index.moments
         for start in range(0, len(out), _CHUNK):

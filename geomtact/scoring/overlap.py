@@ -58,7 +58,7 @@ class IoU:
         mask = to_grid(mask, index.resolution.mask_shape)
         shared = overlaps(index.bits, mask)
         union = index.area.astype(np.int32) + int(mask.sum()) - shared
-        return shared.astype(np.float32) / np.maximum(union, 1)
+        return (shared / np.maximum(union, 1)).astype(np.float32)
 
 
 def to_grid(mask: NDArray[np.bool_], shape: Sequence[int]) -> NDArray[np.bool_]:

@@ -17,7 +17,8 @@ class Scorer(Protocol):
     evidence is measured, not assumed (``scoring.calibration``).
     """
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Similarity (P, n) of ``mask`` (h, w), over the whole window on any grid, to the mask of every pose of ``index``."""

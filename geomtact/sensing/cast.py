@@ -148,7 +148,7 @@ class Caster:
             return np.zeros(len(T), bool)
         camera = apply(inverse(T), np.array([[0.0, 0.0, -sensor.camera_distance]]))[:, 0] - self._centre
         # an odd direction, so that no ray runs along a face of a machined part
-        direction = np.broadcast_to(np.float32([0.41, 0.33, 0.85]), camera.shape)
+        direction = np.broadcast_to(np.array([0.41, 0.33, 0.85], np.float32), camera.shape)
         hit = self._scene.run(camera.astype(np.float32), np.ascontiguousarray(direction), output=True)
         leaving = (hit["Ng"] * direction).sum(1) > 0
         return leaving & (hit["primID"] >= 0)

@@ -1,0 +1,203 @@
+"""``geomtact evaluate``: how good the answers are, on touches whose true pose is known."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from geomtact.cli.library import CacheDir
+from geomtact.cli.localize import Effort
+from geomtact.cli.prepare import Unit
+from geomtact.cli.shell import print_table, progress_bar, tell
+from geomtact.cli.simulate import NoiseName
+
+if TYPE_CHECKING:
+    from geomtact.evaluation.study import Felt
+    from geomtact.sensing.noise import Noise
+
+SCHEMA = "geomtact/study/1"
+_SAVE_EVERY = 10  # touches, so that a stopped run goes on from there
+
+
+class What(StrEnum):
+    touches = "touches"
+    localize = "localize"
+
+
+def evaluate(
+    what: Annotated[What, typer.Argument(help="touches: what is judged on; localize: the posteriors from it.")],
+    parts: Annotated[list[str], typer.Argument(metavar="OBJECT...", help="Parts or mesh files.")],
+    unit: Unit = None,
+    sensor: Annotated[str, typer.Option(help="Name (see 'geomtact sensors') or TOML file.")] = "gelslim",
+    touches: Annotated[int, typer.Option(min=1, help="How many touches of each part.")] = 200,
+    noise: Annotated[NoiseName, typer.Option(help="How strongly the masks are spoilt.")] = NoiseName.moderate,
+    effort: Annotated[Effort, typer.Option(help="How much to compute.")] = Effort.balanced,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option(help="JSON file for all figures; a study that it holds in part is resumed.")
+    ] = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Judge posteriors on simulated touches with known poses: gain, coverage and pose errors for each part.
+
+    Half of the touches are felt by a rigid threshold, half by an elastic gel; figures are given apart and together.
+    """
+    if what is What.touches:
+        print_touches(parts, unit, sensor, touches, noise, seed)
+    else:
+        judge(parts, unit, sensor, touches, noise, effort, seed, out, cache_dir)
+
+
+def judge(
+    parts: list[str],
+    unit: str | None,
+    sensor: str,
+    touches: int,
+    noise: str,
+    effort: str,
+    seed: int,
+    out: Path | None = None,
+    cache_dir: Path | None = None,
+    felt: Felt | None = None,
+    solver: str = "geomtact",
+) -> dict[str, Any]:
+    """Localize ``touches`` touches of each part, print the figures and write them to ``out``.
+
+    ``felt`` as in ``study.make_touches``; ``solver`` names it in the file.
+    """
+    from geomtact.evaluation import study
+    from geomtact.inference.localizer import Localizer
+
+    content = _load(out)
+    all_figures: dict[tuple[str, str], dict[str, Any]] = {}
+    for part in parts:
+        with progress_bar(f"preparing {part}") as progress:
+            localizer = Localizer.prepare(part, unit=unit, sensor=sensor, cache_dir=cache_dir, progress=progress)
+        settings = study.describe(localizer) | {
+            "touches": touches,
+            "noise": {"name": str(noise), **asdict(_noise(noise))},
+            "effort": str(effort),
+            "seed": seed,
+            "elastic_solver": solver,
+        }
+        outcomes = _earlier(content, localizer.mesh.name, settings)
+        if len(outcomes) < touches:
+            todo = study.make_touches(localizer, touches, seed, _noise(noise), felt)[len(outcomes) :]
+            with progress_bar(f"localizing {localizer.mesh.name}") as progress:
+                for outcome in study.localize_touches(localizer, todo, effort, seed):
+                    outcomes.append(outcome)
+                    progress(len(outcomes) / touches, "")
+                    if out is not None and len(outcomes) % _SAVE_EVERY == 0:
+                        _save(out, content, localizer.mesh.name, settings, outcomes)
+        random_mm = study.expected_random_add(localizer)
+        figures = study.summarise(outcomes, random_mm)
+        extra = {"random_add_mm": random_mm, "figures": figures}
+        _save(out, content, localizer.mesh.name, settings, outcomes, extra)
+        all_figures |= {(localizer.mesh.name, group): values for group, values in figures.items()}
+        tell(f"{localizer.mesh.name}: done")
+    _print(all_figures)
+    return content
+
+
+def _print(figures: dict[tuple[str, str], dict[str, Any]]) -> None:
+    headings = ("part", "touches", "n", "gain [nats]", "claimed", "MSSD [mm]", "of 10", "ADD [mm]", "of 10", "P(first)")
+    rows = []
+    for names, f in figures.items():
+        error = "" if f["gain_standard_error"] is None else f" ± {f['gain_standard_error']:.2f}"
+        lengths = [f"{f[f'{name}_median']:.1f}" for name in ("mssd_mm", "mssd10_mm", "add_mm", "add10_mm")]
+        gain = [str(f["n"]), f"{f['gain_mean']:.2f}{error}", f"{f['claimed_mean']:.2f}"]
+        rest = [f"{f['probability_median']:.3f}", f"{100 * f['wrong']:.0f} %", f"{f['ms_median']:.0f}"]
+        rows.append([*names, *gain, *lengths, *rest])
+    typer.echo("Mean gain with its standard error, and medians")
+    print_table([*headings, "wrong", "ms"], rows, {*headings[2:], "wrong", "ms"})
+    rows = []
+    for names, f in figures.items():
+        inside = [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in f["coverage"]]
+        rows.append([*names, *inside])
+    typer.echo("Percentage of truths inside the region of each mass, with 95 % intervals")
+    masses = [f"in {100 * c['nominal']:.0f} %" for c in f["coverage"]]
+    print_table(["part", "touches", *masses], rows, masses)
+
+
+def print_touches(parts: list[str], unit: str | None, sensor: str, n: int, noise: str, seed: int) -> None:
+    """Print what the touches of each part are like: depth, area, and how many run over the window's border."""
+    from types import SimpleNamespace
+
+    import numpy as np
+
+    from geomtact.contact_space.space import ContactSpace
+    from geomtact.evaluation.study import make_touches
+    from geomtact.geometry.mesh import load_mesh
+    from geomtact.sensing.sensor import Sensor
+
+    pressed = Sensor.load(sensor)
+    pixel_mm2 = 1e6 * float(np.prod(pressed.pixel_pitch))
+    rows = []
+    for part in parts:
+        mesh = load_mesh(part, unit, sensor=pressed)
+        touches = make_touches(SimpleNamespace(space=ContactSpace(mesh, pressed)), n, seed, _noise(noise))
+        for name, elastic in (("geometric", False), ("elastic", True)):
+            some = [t for t in touches if t.elastic == elastic]
+            if not some:
+                continue
+            areas = np.quantile([t.mask.sum() * pixel_mm2 for t in some], (0.1, 0.5, 0.9))
+            border = np.mean([np.pad(t.mask[1:-1, 1:-1], 1).sum() < t.mask.sum() for t in some])
+            depth = np.median([1e3 * t.penetration for t in some])
+            row = [f"{depth:.2f}", *(f"{a:.1f}" for a in areas), f"{100 * border:.0f} %"]
+            rows.append([mesh.name, name, str(len(some)), *row])
+    headings = ("part", "touches", "n", "depth [mm]", "area [mm2]: 10 %", "50 %", "90 %", "over the border")
+    print_table(headings, rows, headings[2:])
+
+
+def _noise(name: str) -> Noise:
+    from geomtact.sensing import noise
+
+    return {"none": noise.CLEAN, "moderate": noise.MODERATE, "heavy": noise.HEAVY}[name]
+
+
+def _load(out: Path | None) -> dict[str, Any]:
+    import json
+
+    from geomtact.errors import InputError
+
+    if out is None or not out.exists():
+        return {"schema": SCHEMA, "parts": {}}
+    try:
+        content = json.loads(out.read_text("utf-8"))
+        if content["schema"] != SCHEMA:
+            raise ValueError(content["schema"])
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{out}: is there, but is no study of geomtact; give another file with --out") from None
+    return content
+
+
+def _earlier(content: dict[str, Any], part: str, settings: dict[str, Any]) -> list:
+    """The outcomes of an earlier run with the very same settings."""
+    import json
+
+    from geomtact.evaluation.study import Outcome
+    from geomtact.report.result import plain
+
+    found = content["parts"].get(part)
+    if found is None or found["settings"] != json.loads(json.dumps(plain(settings))):
+        return []
+    return [Outcome(**outcome) for outcome in found["outcomes"]]
+
+
+def _save(
+    out: Path | None, content: dict[str, Any], part: str, settings: dict, outcomes: list, extra: Any = None
+) -> None:
+    from geomtact.report.files import write_whole
+    from geomtact.report.result import plain, to_text, versions
+
+    content["versions"] = versions()
+    entry = {"settings": settings, **(extra or {}), "outcomes": [asdict(o) for o in outcomes]}
+    content["parts"][part] = plain(entry)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        text = to_text(content)
+        write_whole(out, lambda path: path.write_text(text, "utf-8"))

@@ -1,0 +1,97 @@
+"""How wrong an estimate is: the field's pose errors, and how often a posterior's regions hold the truth.
+
+ADD and ADD-S: Hinterstoisser et al., ACCV 2012. MSSD: Hodan et al., BOP challenge, ECCVW 2020. The normalised ADD is the
+thesis's (7.2): in units of what two random poses of the contact pose space differ by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from geomtact.contact_space.space import ContactSpace
+from geomtact.geometry.distance import PoseDistance
+from geomtact.geometry.mesh import Mesh
+from geomtact.se3 import Array, apply
+
+
+def add(T_true: ArrayLike, T: ArrayLike, points: ArrayLike) -> Array:
+    """ADD (m,) [m]: mean distance of corresponding points (n, 3) of the object at ``T_true`` (4, 4) and ``T`` (m, 4, 4).
+
+    Symmetry is not taken into account; ``PoseDistance.mean`` is ADD modulo the object's symmetry.
+    """
+    return np.linalg.norm(apply(_poses(T), points) - apply(T_true, points), axis=-1).mean(-1)
+
+
+def add_s(T_true: ArrayLike, T: ArrayLike, points: ArrayLike) -> Array:
+    """ADD-S (m,) [m]: mean distance from each point (n, 3) at ``T_true`` (4, 4) to the nearest point at ``T`` (m, 4, 4)."""
+    from scipy.spatial import cKDTree
+
+    here = apply(T_true, points)
+    return np.array([cKDTree(there).query(here)[0].mean() for there in apply(_poses(T), points)])
+
+
+def mssd(T_true: ArrayLike, T: ArrayLike, mesh: Mesh) -> Array:
+    """MSSD (m,) [m]: largest distance of corresponding surface points of ``mesh`` at ``T_true`` (4, 4) and ``T`` (m, 4, 4).
+
+    Over a finite symmetry group it is the least over the group; over a continuous one it is taken at the image that is
+    nearest in mean square. A point's distance is convex in the point, so the hull's vertices hold the largest.
+    """
+    from scipy.spatial import ConvexHull
+
+    corners = mesh.vertices[ConvexHull(mesh.vertices).vertices]
+    symmetry = mesh.symmetry
+    if symmetry is not None and symmetry.kind == "discrete":
+        images = _poses(T)[:, None] @ symmetry.elements
+    else:
+        images = PoseDistance(mesh).aligned(T_true, _poses(T))[:, None]
+    here = apply(T_true, corners)
+    return np.array([np.linalg.norm(apply(some, corners) - here, axis=-1).max(-1).min() for some in images])
+
+
+def random_add(distance: PoseDistance, space: ContactSpace, n: int = 400, seed: int = 0) -> float:
+    """Expected ADD [m], modulo symmetry, between two random poses of the contact pose space, from ``n`` pairs."""
+    T, _ = space.sample(2 * n, np.random.default_rng(seed))
+    return float(np.mean([distance.mean(a, b[None])[0] for a, b in zip(T[:n], T[n:], strict=True)]))
+
+
+def normalised_add(T_true: ArrayLike, T: ArrayLike, distance: PoseDistance, expected: float) -> Array:
+    """The thesis's normalised pose distance (m,): ADD modulo symmetry over ``expected`` [m], see :func:`random_add`."""
+    return distance.mean(T_true, _poses(T)) / expected
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of truths inside the region of ``nominal`` mass, with the interval (low, high) that its count allows."""
+
+    nominal: float
+    share: float
+    low: float
+    high: float
+
+
+def coverage(levels: ArrayLike, nominal: Sequence[float], confidence: float = 0.95) -> list[Coverage]:
+    """How often the truth lies in the highest-density region of each nominal mass.
+
+    Parameters
+    ----------
+    levels : (n,) credible levels of the true poses, in [0, 1]
+    nominal : masses in (0, 1)
+    confidence : of the binomial intervals (Clopper and Pearson 1934)
+    """
+    from scipy.stats import binomtest
+
+    levels = np.asarray(levels, float)
+    out = []
+    for mass in nominal:
+        hits = int((levels <= mass).sum())
+        interval = binomtest(hits, len(levels)).proportion_ci(confidence, "exact")
+        out.append(Coverage(float(mass), hits / len(levels), float(interval.low), float(interval.high)))
+    return out
+
+
+def _poses(T: ArrayLike) -> Array:
+    return np.asarray(T, float).reshape(-1, 4, 4)

@@ -1,0 +1,148 @@
+"""A study: touches at known poses are localized, and the posteriors are held against the truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.space import ContactSpace
+from geomtact.evaluation.pose_error import coverage, mssd, random_add
+from geomtact.evaluation.touches import Touch, random_touches
+from geomtact.geometry.distance import PoseDistance
+from geomtact.inference.localizer import Localizer
+from geomtact.se3 import Array
+from geomtact.sensing.noise import Noise
+
+NOMINAL = (0.5, 0.8, 0.9, 0.95)
+MODES = 10  # the thesis's best10, of modes instead of poses
+WRONG_MM = 10.0  # MSSD beyond which a first mode is wrong
+CERTAIN = 0.5  # a first mode below this probability is one of high entropy
+Felt = Callable[[ContactSpace, Array, bool], NDArray[np.bool_]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one touch told. Lengths in millimetres, information in nats.
+
+    Attributes
+    ----------
+    gain : log density at the true pose, relative to the uniform distribution
+    claimed : minus the entropy: the gain that the posterior itself expects
+    level : credible level of the true pose
+    mssd_mm, add_mm, mssd10_mm, add10_mm : of the first mode, and of the best of ten; inf without contact found
+    probability : of the first mode
+    """
+
+    elastic: bool
+    penetration_mm: float
+    gain: float
+    claimed: float
+    level: float
+    mssd_mm: float
+    add_mm: float
+    mssd10_mm: float
+    add10_mm: float
+    probability: float
+    ms: float
+
+
+def make_touches(scene: Any, n: int, seed: int, noise: Noise, felt: Felt | None = None) -> list[Touch]:
+    """``n`` touches of ``scene`` (anything with a ``space``), geometric and elastic in turn.
+
+    ``felt`` (space, T, elastic) -> (H, W) bool replaces the elastic touches' masks: with another solver than the one
+    that the posterior was calibrated with.
+    """
+    touches = random_touches(scene, n, seed, noise=noise)
+    if felt is None:
+        return touches
+    from geomtact.contact_space.touch import spoilt
+
+    rng = np.random.default_rng([seed, n])
+    space = scene.space
+    return [
+        replace(t, mask=spoilt(felt(space, t.T_sensor_object, True), space, noise, rng)) if t.elastic else t
+        for t in touches
+    ]
+
+
+def localize_touches(localizer: Localizer, touches: Sequence[Touch], effort: str, seed: int) -> Iterator[Outcome]:
+    """Localizes each touch and says how that went."""
+    distance = PoseDistance(localizer.mesh)
+    for touch in touches:
+        T = touch.T_sensor_object
+        began = time.perf_counter()
+        posterior = localizer.localize(touch.mask, kind="mask", effort=effort, seed=seed)
+        ms = 1e3 * (time.perf_counter() - began)
+        modes = posterior.modes(MODES)
+        poses = np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
+        largest, mean = 1e3 * mssd(T, poses, localizer.mesh), 1e3 * distance.mean(T, poses)
+        yield Outcome(
+            elastic=touch.elastic,
+            penetration_mm=1e3 * touch.penetration,
+            gain=float(posterior.log_density(T)),
+            claimed=-float(posterior.entropy_nats),
+            level=float(posterior.credible_level(T)),
+            mssd_mm=float(largest[:1].min(initial=np.inf)),
+            add_mm=float(mean[:1].min(initial=np.inf)),
+            mssd10_mm=float(largest.min(initial=np.inf)),
+            add10_mm=float(mean.min(initial=np.inf)),
+            probability=modes[0].probability if modes else 0.0,
+            ms=ms,
+        )
+
+
+def summarise(outcomes: Sequence[Outcome], random_add_mm: float) -> dict[str, dict[str, Any]]:
+    """Figures over all touches, the geometric and the elastic ones; ``random_add_mm`` as of ``pose_error.random_add``."""
+    groups = {
+        "all": list(outcomes),
+        "geometric": [o for o in outcomes if not o.elastic],
+        "elastic": [o for o in outcomes if o.elastic],
+    }
+    return {name: _figures(some, random_add_mm) for name, some in groups.items() if some}
+
+
+def expected_random_add(localizer: Localizer) -> float:
+    """Expected ADD of a random guess [mm], in whose units the thesis gives its errors."""
+    return 1e3 * random_add(PoseDistance(localizer.mesh), localizer.space)
+
+
+def describe(localizer: Localizer) -> dict[str, Any]:
+    """What the figures of a localizer depend on."""
+    index, calibration = localizer.index, localizer.scorer.calibration
+    return {
+        "object": localizer.mesh.name,
+        "object_sha256": localizer.mesh.sha256,
+        "sensor": localizer.sensor.name,
+        "sensor_sha256": localizer.sensor.sha256,
+        "index": index.key,
+        "poses": len(index),
+        "grid": index.resolution.to_json(),
+        "scorer": localizer.scorer.scorer.name,
+        "calibration": asdict(calibration),
+    }
+
+
+def _figures(outcomes: Sequence[Outcome], random_add_mm: float) -> dict[str, Any]:
+    column = {name: np.array([getattr(o, name) for o in outcomes], float) for name in Outcome.__annotations__}
+    n = len(outcomes)
+    gain = column["gain"]
+    out: dict[str, Any] = {
+        "n": n,
+        "gain_mean": float(gain.mean()),
+        "gain_standard_error": float(gain.std(ddof=1) / np.sqrt(n)) if n > 1 else None,
+        "claimed_mean": float(column["claimed"].mean()),
+        "coverage": [asdict(c) for c in coverage(column["level"], NOMINAL)],
+        "coverage_error": max(abs(c.share - c.nominal) for c in coverage(column["level"], NOMINAL)),
+        "wrong": float((column["mssd_mm"] > WRONG_MM).mean()),
+        "high_entropy": float((column["probability"] < CERTAIN).mean()),
+    }
+    names = ("gain", "mssd_mm", "add_mm", "mssd10_mm", "add10_mm", "probability", "ms")
+    out |= {f"{name}_median": float(np.median(column[name])) for name in names}
+    out["normalised_add_median"] = out["add_mm_median"] / random_add_mm
+    out["normalised_add10_median"] = out["add10_mm_median"] / random_add_mm
+    return out
