@@ -50,7 +50,7 @@ def touched(tmp_path_factory):
 
 
 def test_help_and_lists(geomtact):
-    commands = {"localize", "prepare", "simulate", "sensors", "objects", "cache"}
+    commands = {"localize", "prepare", "simulate", "sensors", "objects", "cache", "evaluate"}
     assert {c.name or c.callback.__name__ for c in app.registered_commands} == commands
     assert all(name in geomtact("--help").stdout for name in commands)
     assert geomtact("--version").stdout.startswith("geomtact ")

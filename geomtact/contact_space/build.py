@@ -109,19 +109,23 @@ def _touches(there: HeightMap, turn: float, frame: Frame, window: Window) -> _Tu
     ok = frame.blocks(allowed(there.turned(turn, frame), frame, window.sensor, window.penetrations))
     share = ok.mean(2, dtype=np.float32)
     cell = np.flatnonzero(share.any(0))
-    # a place is represented by the touching pixel nearest to the mean of those that touch
-    inside = ok[:, cell].any(0)
+    # a place is represented by one of the pixels that touch at most depths, the nearest to their mean
+    depths = ok[:, cell].sum(0)
+    inside = depths == depths.max(1, keepdims=True)
     i, j = np.divmod(np.arange(CELL_PIXELS**2), CELL_PIXELS)
     n = inside.sum(1)
     far = (i - (inside @ i / n)[:, None]) ** 2 + (j - (inside @ j / n)[:, None]) ** 2
     centres = frame.positions(cell, np.where(inside, far, np.inf).argmin(1))
     masks, z = window.masks(there, turn, centres)
     # a sliver at the window's edge may fall between the finer pixels of the height map
-    seen = z.min(0, initial=0.0) > NOTHING / 2
-    cell, centres, masks, z = cell[seen], centres[seen], masks[:, seen], z[:, seen]
+    seen = z > NOTHING / 2
+    share = share[:, cell] * seen
+    z = np.where(seen, z, z.max(0))
+    kept = share.any(0)
+    cell, centres, masks, z, share = cell[kept], centres[kept], masks[:, kept], z[:, kept], share[:, kept]
     summed = moments(masks.reshape(-1, *window.mask_shape), window.sensor).reshape(*masks.shape[:2], -1)
     packed = pack(masks).swapaxes(1, 2)
-    return _Turn(cell, -centres, z, share[:, cell], packed, masks.sum(2), np.moveaxis(summed, 2, 0))
+    return _Turn(cell, -centres, z, share, packed, masks.sum(2), np.moveaxis(summed, 2, 0))
 
 
 def _join(turns: list[_Turn], directions: Directions, frame: Frame) -> dict[str, NDArray]:

@@ -119,17 +119,37 @@ def allowed(
     heights: NDArray[np.float32], frame: Frame, sensor: Sensor, penetrations: Sequence[float]
 ) -> NDArray[np.bool_]:
     """Window centres (P, h, w) of a turned map at which the object touches and clears the sensor's housing elsewhere."""
-    kw, kh = (2 * np.floor(sensor.half_window / frame.pixel).astype(int) + 1).tolist()
-    kernel = np.ones((kh, kw), np.uint8)
-    touching = cv2.dilate((heights > NOTHING / 2).astype(np.uint8), kernel) > 0
-    if sensor.housing_depth is None:
-        return np.broadcast_to(touching, (len(penetrations), *touching.shape))
+    deepest: dict[tuple[int, int], NDArray[np.float32]] = {}
+    out = []
+    for d in penetrations:
+        kw, kh = (2 * np.floor(_half_window_at(sensor, d) / frame.pixel).astype(int) + 1).tolist()
+        if (kw, kh) not in deepest:
+            deepest[kw, kh] = _deepest_allowed(heights, (kw, kh), sensor.housing_depth)
+        out.append(deepest[kw, kh] >= d)
+    return np.stack(out)
+
+
+def _deepest_allowed(
+    heights: NDArray[np.float32], window: tuple[int, int], housing_depth: float | None
+) -> NDArray[np.float32]:
+    """How deep (h, w) [m] the object may press into a window (w, h) pixels wide; negative where nothing is in it."""
+    kernel = np.ones(window[::-1], np.uint8)
+    if housing_depth is None:
+        there = cv2.dilate((heights > NOTHING / 2).astype(np.uint8), kernel)
+        return np.where(there > 0, np.float32(np.inf), np.float32(-1))
     inside = cv2.dilate(heights, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=NOTHING)
-    left, right = _beyond(heights.max(0), kw // 2)
-    above, below = _beyond(heights.max(1), kh // 2)
+    left, right = _beyond(heights.max(0), window[0] // 2)
+    above, below = _beyond(heights.max(1), window[1] // 2)
     outside = np.maximum(np.maximum(left, right)[None], np.maximum(above, below)[:, None])
     # pressed d deep, the object outside reaches d less the difference below the membrane
-    return np.stack([touching & (d <= inside - outside + sensor.housing_depth) for d in penetrations])
+    return np.where(inside > NOTHING / 2, inside - outside + np.float32(housing_depth), np.float32(-1))
+
+
+def _half_window_at(sensor: Sensor, depth: float) -> Array:
+    """Half width and height (2,) [m] of what the camera sees ``depth`` below the membrane: it narrows towards it."""
+    rim = sensor.lift(np.diag(sensor.half_window))
+    half = np.diag(rim[:, :2])
+    return half * (1 - depth / (sensor.camera_distance + rim[:, 2])) if sensor.camera_distance else half
 
 
 @dataclass(frozen=True)

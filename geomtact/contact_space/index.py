@@ -142,7 +142,7 @@ class Index:
         bins = len(self.resolution.penetrations)
         depth = np.asarray(penetration, float) / self.sensor.max_penetration
         level = np.clip((depth * bins).astype(np.int64), 0, bins - 1)
-        # the housing may leave only the deeper bins of a place, never only the shallower
+        # the housing may forbid the deeper bins of a place
         some = self.weight[:, place] > 0
         level = np.where(some[level, np.arange(len(place))], level, _nearest_true(some, level))
         return level * self.places + place

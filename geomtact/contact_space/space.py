@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import MeshError
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.rotations import Approach, allowed, approach_of, check_approach, facing
+from geomtact.geometry.rotations import Approach, allowed, approach_of, check_approach, facing, in_cone
 from geomtact.se3 import Array, random_rotations, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
@@ -141,16 +141,7 @@ class ContactSpace:
         while len(todo):
             which = rng.choice(len(self.cones), len(todo), p=size / size.sum())
             v = np.stack([self.cones[i][0] for i in which])
-            half = np.array([self.cones[i][1] for i in which])
-            c = 1 - rng.random(len(todo)) * (1 - np.cos(half))
-            turn = rng.uniform(0, 2 * np.pi, len(todo))
-            side = (
-                np.stack([np.cos(turn), np.sin(turn), np.zeros(len(todo))], 1)
-                * np.sqrt(np.maximum(0, 1 - c**2))[:, None]
-            )
-            side[:, 2] = c
-            # facing(-v) has v as its third row: the cone's axis becomes z
-            a[todo] = np.einsum("nij,ni->nj", facing(-v), side)
+            a[todo] = in_cone(v, np.array([self.cones[i][1] for i in which]), rng)
             # a direction inside m cones is drawn m times too often
             m = sum(allowed(a[todo], [cone]).astype(int) for cone in self.cones)
             todo = todo[rng.random(len(todo)) > 1 / m]

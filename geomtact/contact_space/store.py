@@ -26,7 +26,7 @@ from geomtact.geometry.rotations import Approach, check_approach
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.sensing.sensor import Sensor
 
-FORMAT = 1  # raise whenever a built index would differ
+FORMAT = 2  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
 
 
@@ -59,10 +59,12 @@ def open_index(
     max_poses: int = 1_200_000,
     cache_dir: str | Path | None = None,
     progress: Progress | None = None,
+    key: str | None = None,
 ) -> Index:
     """The index of ``mesh`` on ``sensor``: from the cache, or built and cached.
 
-    Two processes that want the same one build it once: the second waits for the first.
+    Two processes that want the same one build it once: the second waits for the first. ``key`` names the entry to
+    look for, where it is known.
 
     Raises
     ------
@@ -72,7 +74,7 @@ def open_index(
     import filelock
 
     folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
-    key = _key(mesh, sensor, approach, max_poses)
+    key = key or _key(mesh, sensor, approach, max_poses)
     index = _read(folder / key, mesh, sensor, approach)
     if index is not None:
         return index
@@ -135,7 +137,10 @@ def clear_cache(cache_dir: str | Path | None = None) -> list[CacheEntry]:
 def _key(mesh: Mesh, sensor: Sensor, approach: Approach | None, max_poses: int) -> str:
     cones = check_approach(approach)
     approach_text = None if cones is None else [(v.tolist(), angle) for v, angle in cones]
-    symmetry = None if mesh.symmetry is None else mesh.symmetry.elements.round(9).tolist()
+    s = mesh.symmetry
+    symmetry = (
+        None if s is None else (s.kind, s.elements.round(9).tolist(), None if s.axis is None else s.axis.tolist())
+    )
     text = json.dumps([FORMAT, mesh.sha256, symmetry, sensor.sha256, approach_text, max_poses])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 

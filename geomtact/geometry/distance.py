@@ -1,7 +1,8 @@
 """How far apart two poses of an object are, in the motion of its points, modulo its symmetry.
 
 Mean point distance is ADD (Hinterstoisser et al. 2012), the thesis's pose error; the largest point distance is MSSD
-(Hodan et al. 2020). Both are minimised over the object's symmetry.
+(Hodan et al. 2020). Both are taken at the image under the object's symmetry that is nearest in mean square: between poses
+far apart they may be a little above their least over the symmetry group, between near ones they are that.
 """
 
 from __future__ import annotations

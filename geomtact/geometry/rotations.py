@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from geomtact.errors import UsageError
-from geomtact.geometry.symmetry import Symmetry
-from geomtact.se3 import Array, hat, transform
+from geomtact.geometry.symmetry import Symmetry, about
+from geomtact.se3 import Array, hat, random_rotations, transform
 
 Approach = Sequence[tuple[ArrayLike, float]]
 FACE_TOLERANCE = 1e-6  # rad: how near a pose must come to an approach of half angle 0
@@ -110,7 +110,7 @@ class Directions:
         cones = check_approach(approach)
         if symmetry.kind == "sphere" or (cones and cones[0][1] == 0):
             return cls._faces(symmetry, cones, turn_step or level_step(level))
-        nside = 2 ** (level + _FINE)
+        nside = 2 ** max(level + _FINE, 6)
         fine = np.stack(healpix.pix2vec(nside, np.arange(12 * nside**2), nest=True), -1)
         fine = fine[allowed(fine, cones)]
         if not len(fine):  # a cone thinner than the finest pixel
@@ -120,32 +120,39 @@ class Directions:
         key = _bin(image, symmetry, level)
         n_keys = int(key.max()) + 1
         count = np.bincount(key, minlength=n_keys)
-        mean = np.stack([np.bincount(key, image[:, i], n_keys) for i in range(3)], -1)
+        mean = np.stack([np.bincount(key, image[:, i], n_keys) for i in range(3)], -1).astype(float)
         kept = np.flatnonzero(count)
-        vectors = mean[kept] / np.linalg.norm(mean[kept], axis=1, keepdims=True)
-        if symmetry.kind == "axis":
-            vectors = _on_meridian(vectors, fine, symmetry, cones, level)
         cell = np.full(_bin_count(symmetry, level), -1)
         cell[kept] = np.arange(len(kept))
+        weights = count[kept] / count.sum()
+        if symmetry.kind == "axis":
+            vectors = _on_meridian(image, key, symmetry, cones)
+            if cones is None:  # the rows of fine points may line up with the bands, whose areas are known
+                weights = -np.diff(_edges(symmetry, level))[kept]
+                weights /= weights.sum()
+        else:
+            vectors = _inside(mean[kept], image, cell[key], symmetry, cones, level)
         turns = np.full(len(kept), level_turns(level))
         periods = np.full(len(kept), 2 * np.pi)
-        return cls(vectors, count[kept] / count.sum(), turns, periods, symmetry, cones, level, cell)
+        return cls(vectors, weights, turns, periods, symmetry, cones, level, cell)
 
     @classmethod
     def _faces(cls, symmetry: Symmetry, cones: list[tuple[Array, float]] | None, turn_step: float) -> Directions:
         if symmetry.kind == "sphere":
             vectors = np.array([cones[0][0] if cones else [0.0, 0.0, 1.0]])
-            periods = np.zeros(1)
+            periods, weights = np.zeros(1), np.ones(1)
         else:
             assert cones is not None
             faces = np.stack([v for v, _ in cones])
-            image = _canonical(faces, symmetry, cones)[1]
-            far = np.linalg.norm(image[:, None] - image[None], axis=-1) > FACE_TOLERANCE
-            first = [i for i in range(len(image)) if far[i, :i].all()]
+            near = np.linalg.norm(faces[:, None] - faces, axis=-1) <= FACE_TOLERANCE
+            image = _canonical(faces[_first_of_each(near)], symmetry, cones)[1]
+            same = _apart(image, image, symmetry) <= FACE_TOLERANCE
+            first = _first_of_each(same)
             vectors = image[first]
             periods = np.array([_turn_period(v, symmetry) for v in vectors])
+            # faces that symmetry makes equal are one, which stands for all of them
+            weights = same[first].sum(1) / len(image)
         turns = np.maximum(1, np.ceil(periods / turn_step - 1e-9)).astype(np.int64)
-        weights = np.full(len(vectors), 1 / len(vectors))
         return cls(vectors, weights, turns, periods, symmetry, cones, None, np.arange(len(vectors)))
 
     def rotations(self) -> tuple[Array, NDArray[np.int64], Array]:
@@ -160,22 +167,54 @@ class Directions:
         _, direction, turn = self.rotations()
         k = direction[np.asarray(cells)]
         psi = turn[np.asarray(cells)] + rng.uniform(-0.5, 0.5, len(k)) * self.periods[k] / self.turns[k]
-        a = self.vectors[k].copy()
-        todo = np.arange(len(k)) if self.level is not None else np.arange(0)
-        for _ in range(50):  # a disk that holds the pixel, until the draw falls into the pixel
-            if not len(todo):
-                break
-            radius = 1.1 * np.sqrt(4 * np.pi / (12 * 4 ** float(self.level or 0)))
-            rho, phi = radius * np.sqrt(rng.random(len(todo))), rng.uniform(0, 2 * np.pi, len(todo))
-            x, y, _ = np.moveaxis(facing(self.vectors[k[todo]]), 1, 0)
-            off = np.tan(rho)[:, None] * (np.cos(phi)[:, None] * x + np.sin(phi)[:, None] * y)
-            new = self.vectors[k[todo]] + off
-            new /= np.linalg.norm(new, axis=1, keepdims=True)
-            fits = (self._cell[_bin(new, self.symmetry, int(self.level or 0))] == k[todo]) & allowed(new, self.cones)
-            a[todo[fits]] = new[fits]
-            todo = todo[~fits]
+        a = self._draw_directions(k, rng)
         Rz = Rotation.from_euler("z", psi[:, None]).as_matrix()
         return Rz @ facing(self.vectors[k]) @ np.swapaxes(_smallest_rotation(self.vectors[k], a), -1, -2)
+
+    def _draw_directions(self, k: NDArray[np.int64], rng: np.random.Generator) -> Array:
+        """Canonical approach directions (n, 3) uniform within direction cells ``k`` (n,)."""
+        a = self.vectors[k].copy()
+        if self.level is None:
+            return a
+        kept, level, sym = np.flatnonzero(self._cell >= 0), self.level, self.symmetry
+        todo = np.arange(len(k))
+        for _ in range(200):  # until the draw falls into the cell; a cell too thin to be hit keeps its own direction
+            if not len(todo):
+                break
+            cell = kept[k[todo]]
+            if sym.axis is not None:
+                edges = _edges(sym, level)
+                new = _at_polar(np.atleast_1d(rng.uniform(edges[cell + 1], edges[cell])), a[todo], sym.axis)
+            else:  # a disk that holds the pixel
+                middle = np.stack(healpix.pix2vec(2**level, cell, nest=True), -1)
+                widest = 1.1 * np.sqrt(4 * np.pi / (12 * 4**level))
+                new = in_cone(middle, np.full(len(cell), widest), rng)
+                own = np.abs(_canonical(new, sym, self.cones)[1] - new).max(-1) < 1e-9
+                new[(_bin(new, sym, level) != cell) | ~own] = np.nan
+            fits = np.isfinite(new).all(-1) & allowed(new, self.cones)
+            a[todo[fits]] = new[fits]
+            todo = todo[~fits]
+        return a
+
+    def any_image(self, T: ArrayLike, rng: np.random.Generator) -> Array:
+        """``T`` (n, 4, 4) replaced by its images under the object's symmetry, drawn uniformly among those allowed."""
+        T = np.array(T, float)
+        sym, n = self.symmetry, len(T)
+        todo = np.arange(n)
+        for _ in range(200):
+            if sym.kind == "none" or not len(todo):
+                break
+            S = sym.elements[rng.integers(len(sym.elements), size=len(todo))]
+            if sym.axis is not None:
+                turn = Rotation.from_rotvec(rng.uniform(0, 2 * np.pi, (len(todo), 1)) * sym.axis)
+                S = about(turn.as_matrix(), sym.centre) @ S
+            elif sym.kind == "sphere":
+                S = about(random_rotations(len(todo), rng), sym.centre)
+            new = T[todo] @ S
+            ok = allowed(approach_of(new[:, :3, :3]), self.cones)
+            T[todo[ok]] = new[ok]
+            todo = todo[~ok]
+        return T
 
     def canonical(self, T: ArrayLike) -> Array:
         """The image (n, 4, 4) under the object's symmetry, ``T @ S``, that the grid stores."""
@@ -200,7 +239,7 @@ class Directions:
         """Cell (n,) of canonical approach directions ``a`` (n, 3); where a pixel is not kept, the nearest that is."""
         a = np.asarray(a, float)
         if self.level is None:
-            return np.argmax(a @ self.vectors.T, axis=1)
+            return np.argmin(_apart(a, self.vectors, self.symmetry), axis=1)
         cell = self._cell[_bin(a, self.symmetry, self.level)]
         missing = np.flatnonzero(cell < 0)
         if len(missing):
@@ -274,30 +313,94 @@ def _bin(a: Array, symmetry: Symmetry, level: int) -> NDArray[np.int64]:
     return np.asarray(healpix.vec2pix(2**level, *a.T, nest=True), np.int64)
 
 
+def _edges(symmetry: Symmetry, level: int) -> Array:
+    """Cosines of the polar angles between the bands; what a flip makes equal counts once, for the upper end."""
+    cosine = np.cos(np.linspace(0, np.pi, _bands(level) + 1))
+    return np.maximum(cosine, 0) if len(symmetry.elements) > 1 else cosine
+
+
 def _on_meridian(
-    vectors: Array, fine: Array, symmetry: Symmetry, cones: list[tuple[Array, float]] | None, level: int
+    image: Array, key: NDArray[np.int64], symmetry: Symmetry, cones: list[tuple[Array, float]] | None
 ) -> Array:
-    """Directions of the bands' mean polar angle, on an azimuth that the approach allows."""
-    image = _canonical(fine, symmetry, cones)[1]
-    key = _bin(image, symmetry, level)
+    """Directions of the mean polar angle of each band ``key`` (n,), on an azimuth that the approach allows."""
     axis = _axis(symmetry)
-    centre = cones[0][0] if cones else facing(axis)[0]
+    middles = np.stack([v for v, _ in cones]) if cones else facing(axis)[:1]
+    halves = np.array([half for _, half in cones]) if cones else np.array([np.pi])
     out = []
     for k in np.unique(key):
-        member = image[key == k]
-        polar = np.mean(np.arccos(np.clip(member @ axis, -1, 1)))
-        side = member[np.argmax(member @ centre)]
-        side = side - (side @ axis) * axis
-        norm = np.linalg.norm(side)
-        side = side / norm if norm > 1e-9 else facing(axis)[0]
-        out.append(np.cos(polar) * axis + np.sin(polar) * side)
+        polar = np.mean(np.arccos(np.clip(image[key == k] @ axis, -1, 1)))
+        # of a band, the direction on the azimuth of a cone's own is the deepest inside it
+        each = _at_polar(np.full(len(middles), np.cos(polar)), middles, axis)
+        inside = halves - np.arccos(np.clip((each * middles).sum(-1), -1, 1))
+        out.append(each[inside.argmax()])
     return np.array(out)
+
+
+def _at_polar(cosine: Array, a: Array, axis: Array) -> Array:
+    """Directions (n, 3) at polar angles of ``cosine`` (n,) from ``axis``, on the azimuths of ``a`` (n, 3)."""
+    side = a - (a @ axis)[:, None] * axis
+    norm = np.linalg.norm(side, axis=-1, keepdims=True)
+    side = np.where(norm > 1e-9, side / np.maximum(norm, 1e-9), facing(axis)[0])
+    return cosine[:, None] * axis + np.sqrt(np.maximum(0, 1 - cosine**2))[:, None] * side
+
+
+def _inside(
+    mean: Array,
+    image: Array,
+    cell: NDArray[np.int64],
+    symmetry: Symmetry,
+    cones: list[tuple[Array, float]] | None,
+    level: int,
+) -> Array:
+    """The mean direction of each cell, or the canonical image nearest to it where the mean lies off its own cell."""
+    vectors = mean / np.linalg.norm(mean, axis=1, keepdims=True)
+    canonical = _canonical(vectors, symmetry, cones)[1]
+    here = np.arange(len(vectors))
+    off = np.abs(canonical - vectors).max(-1) > 1e-9
+    off |= ~allowed(vectors, cones)
+    pixel = _bin(vectors, symmetry, level)
+    own = np.zeros(_bin_count(symmetry, level), np.int64) - 1
+    own[_bin(image, symmetry, level)] = cell
+    off |= own[pixel] != here
+    for k in np.flatnonzero(off):
+        member = image[cell == k]
+        vectors[k] = member[np.argmax(member @ vectors[k])]
+    return vectors
+
+
+def _apart(a: Array, b: Array, symmetry: Symmetry) -> Array:
+    """How far apart (n, m) [rad, for small angles] directions ``a`` (n, 3) and ``b`` (m, 3) are, up to turns of an axis."""
+    if symmetry.axis is None:
+        return np.linalg.norm(a[:, None] - b, axis=-1)
+    polar_a, polar_b = (
+        np.arctan2(np.linalg.norm(np.cross(v, symmetry.axis), axis=-1), v @ symmetry.axis) for v in (a, b)
+    )
+    return np.abs(polar_a[:, None] - polar_b)
+
+
+def _first_of_each(same: NDArray[np.bool_]) -> list[int]:
+    """The first of each class, of a relation (n, n)."""
+    return [i for i in range(len(same)) if not same[i, :i].any()]
+
+
+def in_cone(middle: Array, half_angle: Array, rng: np.random.Generator) -> Array:
+    """Directions (n, 3) uniform over cones of ``half_angle`` (n,) [rad] about ``middle`` (n, 3)."""
+    cosine = 1 - rng.random(len(middle)) * (1 - np.cos(half_angle))
+    turn = rng.uniform(0, 2 * np.pi, len(middle))
+    side = np.sqrt(np.maximum(0, 1 - cosine**2))
+    local = np.stack([side * np.cos(turn), side * np.sin(turn), cosine], -1)
+    # the third row of facing(-v) is v: the cone's axis is the local z
+    return np.einsum("nij,ni->nj", facing(-middle), local)
 
 
 def _turn_period(a: Array, symmetry: Symmetry) -> float:
     """Turn after which the object pressed along ``a`` looks the same."""
-    if symmetry.kind == "axis" and abs(abs(a @ _axis(symmetry)) - 1) < FACE_TOLERANCE**2 * 10:
-        return 0.0
+    if symmetry.axis is not None:
+        cosine = abs(float(a @ symmetry.axis))
+        if abs(cosine - 1) < FACE_TOLERANCE**2 * 10:
+            return 0.0
+        # lying on its side, an object whose ends can be swapped looks the same after half a turn
+        return np.pi if len(symmetry.elements) > 1 and cosine < 1e-4 else 2 * np.pi
     same = np.linalg.norm(symmetry.elements[:, :3, :3] @ a - a, axis=-1) < 1e-4
     return 2 * np.pi / int(same.sum())
 

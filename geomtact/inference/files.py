@@ -6,12 +6,14 @@ import json
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from geomtact.contact_space.store import open_index
 from geomtact.errors import InputError
 from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.posterior import Posterior, Refined
 from geomtact.sensing.sensor import Sensor
 
@@ -31,12 +33,14 @@ def save(posterior: Posterior, path: str | Path) -> None:
     some = np.sort(order[: min(_MOST, int(np.searchsorted(np.cumsum(p[order]), _KEPT)) + 1)])
     every = np.full(len(posterior.index), -np.inf, np.float32)
     every[posterior.cells] = posterior.log_prob
-    refined = posterior.refined
+    refined, symmetry = posterior.refined, posterior.mesh.symmetry
+    assert symmetry is not None
     keys = np.array(sorted(refined), np.int64)
     meta = {
         "format": _FORMAT,
         "object": posterior.mesh.name,
         "unit": posterior.mesh.unit,
+        "symmetry": symmetry.kind,
         "approach": None
         if posterior.index.approach is None
         else [(np.asarray(v, float).tolist(), float(a)) for v, a in posterior.index.approach],
@@ -55,6 +59,8 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "seed": np.array(posterior.seed),
         "cell_log_prob": every,
         "T_frame_sensor": posterior.T_frame_sensor,
+        "symmetry_elements": symmetry.elements,
+        "symmetry_line": np.stack([symmetry.centre, np.zeros(3) if symmetry.axis is None else symmetry.axis]),
         "vertices": posterior.mesh.vertices,
         "faces": posterior.mesh.faces,
         "index_key": np.array(posterior.index.key),
@@ -88,7 +94,7 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         meta = json.loads(str(data["meta"]))
         if meta["format"] != _FORMAT:
             raise ValueError(f"format {meta['format']!r}")
-        mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"])
+        mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"], symmetry=_symmetry(data, meta))
         sensor = Sensor.from_toml(str(data["sensor_toml"]), str(path))
         every = data["cell_log_prob"].astype(float)
         cells = np.flatnonzero(np.isfinite(every))
@@ -102,7 +108,8 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(f"{path}: not a posterior that geomtact saved ({error}); give a posterior.npz") from None
     settings = meta["settings"]
-    index = open_index(mesh, sensor, meta["approach"], settings.get("max_poses", 1_200_000), cache_dir)
+    max_poses, key = settings.get("max_poses", 1_200_000), str(data["index_key"])
+    index = open_index(mesh, sensor, meta["approach"], max_poses, cache_dir, key=key)
     if len(every) != len(index):
         raise InputError(f"{path}: its poses are not those of this version's grid; localize again")
     return Posterior(
@@ -118,3 +125,8 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         settings=settings,
         warnings=meta["warnings"],
     )
+
+
+def _symmetry(data: dict[str, Any], meta: dict[str, Any]) -> Symmetry:
+    centre, axis = data["symmetry_line"]
+    return Symmetry(meta["symmetry"], data["symmetry_elements"], axis if axis.any() else None, centre)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import UsageError
@@ -178,7 +179,7 @@ class Posterior:
         return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """``n`` poses (n, 4, 4) drawn from the posterior, uniform within each cell.
+        """``n`` poses (n, 4, 4) drawn from the posterior, uniform within each cell and over the object's symmetry.
 
         Raises
         ------
@@ -187,17 +188,8 @@ class Posterior:
         """
         if not self.contact:
             raise UsageError("sample: the image shows no contact, so there is no distribution of touching poses")
-        out: list[Array] = []
-        for _ in range(100):
-            if sum(map(len, out)) >= n:
-                break
-            cell = self._draw_cells(max(16, n), rng)
-            T, depth = self.index.draw(cell, rng)
-            T, ok = self.space.settle(T, depth)
-            ok[ok] = np.isfinite(self.space.penetration(T[ok]))
-            ok[ok] = self.index.lookup(T[ok], depth[ok]) == cell[ok]
-            out.append(T[ok])
-        return self.T_frame_sensor @ np.concatenate(out)[:n]
+        cells = self._draw_cells(n, rng)
+        return self.T_frame_sensor @ draw_within(self.index, self.space, cells, rng)[0]
 
     def save(self, path: Any) -> None:
         """Write ``posterior.npz`` (no pickles); see :func:`geomtact.inference.files.load`."""

@@ -2,7 +2,7 @@
 
 Small motions are taken about the contact's centre, rotations times the contact's length, so that all six are metres
 at the contact: zeta = S A xi, with xi the twist of T exp(xi^). How sharply the rim fixes zeta is compared with how
-well it was known before; directions in which the rim adds little are neither moved nor reported as told.
+well it was known before; directions in which the rim adds little keep their variance and are not called told.
 """
 
 from __future__ import annotations

@@ -14,13 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import CALIBRATION_NOISE, draw_noise, felt_mask, spoilt
 from geomtact.scoring.protocol import Scorer
 from geomtact.se3 import Array
 
-TEMPERATURES = np.geomspace(0.02, 4.0, 16)
+TEMPERATURES = np.geomspace(0.02, 5.0, 80)
+_BINS = 1 << 14
 FLOORS = np.geomspace(1e-3, 0.5, 16)
 _SHAPE = {True: (72, 96), False: (96, 72)}  # of the simulated touches, for wide and for tall windows
 _LEAST_CONTACT = 1e-6  # m^2
@@ -64,14 +66,9 @@ def simulate_touches(index: Index, n: int, seed: int, progress: Callable[[float,
     ids: list[int] = []
     for _ in range(100):
         drawn = np.searchsorted(total, rng.random(64) * total[-1])
-        T, depth = index.draw(np.minimum(drawn, len(weight) - 1), rng)
-        T, ok = space.settle(T, depth)
-        ok[ok] = np.isfinite(space.penetration(T[ok]))
-        if not ok.any():
-            continue
-        T, depth = T[ok], depth[ok]
-        cell = index.lookup(T, depth)
-        for pose, i in zip(T, cell, strict=True):
+        cells = np.minimum(drawn, len(weight) - 1)
+        T, _, found = draw_within(index, space, cells, rng, tries=5)
+        for pose, i in zip(T[found], cells[found], strict=True):
             mask = felt_mask(space, pose, elastic=len(masks) % 2 == 1, shape=shape)
             if mask.sum() * pixel < min(_LEAST_CONTACT, 12 * pixel):
                 continue
@@ -86,21 +83,28 @@ def simulate_touches(index: Index, n: int, seed: int, progress: Callable[[float,
 
 def calibrate(scorer: Scorer, index: Index, touches: Touches) -> Calibration:
     """The temperature and floor under which the true poses of ``touches`` are most probable."""
-    log_weight = log_weights(index)
+    weight = np.asarray(index.weight).ravel()
     ratio = np.zeros((len(TEMPERATURES), len(touches.ids)))
     best_score = np.zeros(len(touches.ids))
     for i, (mask, true) in enumerate(zip(touches.masks, touches.ids, strict=True)):
         score = scorer.score(index, mask).ravel()
         best_score[i] = score.max()
-        score = score - score.max()
-        for j, temperature in enumerate(TEMPERATURES):
-            scaled = score * np.float32(1 / temperature)
-            ratio[j, i] = scaled[true] - _log_sum_exp(scaled + log_weight)
+        below, mass = _histogram(best_score[i] - score, weight)
+        # the likelihood at the true pose over its mean, for all temperatures from one pass over the scores
+        evidence = np.log(np.exp(-below / TEMPERATURES[:, None]) @ mass)
+        ratio[:, i] = (score[true] - best_score[i]) / TEMPERATURES - evidence
     # the density at the truth is a mixture of the scored and the uniform one
     mixed = np.log((1 - FLOORS[:, None, None]) * np.exp(np.minimum(ratio, 500)) + FLOORS[:, None, None]).mean(2)
     best_floor, best = np.unravel_index(mixed.argmax(), mixed.shape)
     usual = float(np.quantile(best_score, 0.02))
     return Calibration(float(TEMPERATURES[best]), float(FLOORS[best_floor]), float(mixed.max()), usual)
+
+
+def _histogram(below: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[Array, Array]:
+    """How far below the best the scores lie, in fine bins (b,), and the uniform measure of the poses in each (b,)."""
+    width = max(float(below.max()), 1e-9) / (_BINS - 1)
+    mass = np.bincount((below / np.float32(width)).astype(np.int32), weight, minlength=_BINS)
+    return (np.arange(len(mass)) + 0.5) * width, mass
 
 
 def log_weights(index: Index) -> NDArray[np.float32]:

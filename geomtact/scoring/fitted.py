@@ -20,9 +20,9 @@ from geomtact.scoring.moments import Moments
 from geomtact.scoring.overlap import OVERLAPS
 from geomtact.scoring.protocol import Scorer
 
-FORMAT = 1
+FORMAT = 2
 SCORERS = (*OVERLAPS, "moments")
-_FIT, _JUDGE = 300, 100  # touches the moments are learned from, and touches the temperature is chosen on
+_FIT, _JUDGE = 300, 200  # touches the moments are learned from, and touches the temperature is chosen on
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,504 @@
+"""Laws of the contact pose space: its index agrees with exact casts and with poses drawn without it, and its cache is safe."""
+
+import json
+import multiprocessing
+import shutil
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest
+
+from geomtact.contact_space import store
+from geomtact.contact_space.draw import draw_within
+from geomtact.contact_space.index import Index, pack
+from geomtact.contact_space.resolution import choose
+from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache, open_index
+from geomtact.errors import CacheError, MeshError, UsageError
+from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.rotations import allowed, approach_of
+from geomtact.se3 import exp, random_rotations, transform
+from geomtact.sensing.sensor import Sensor
+
+MM = 1e-3
+TINY = Sensor("tiny", (64, 48), (0.3 * MM, 0.3 * MM), 0.0, 2 * MM)
+
+
+def weights(index):
+    return np.asarray(index.weight, float).ravel()
+
+
+def some_poses(index, n, rng):
+    """Ids (n,) drawn by weight."""
+    p = weights(index)
+    return rng.choice(len(p), n, p=p / p.sum())
+
+
+# --- the index against exact casts
+
+
+def test_stored_masks_are_what_an_exact_cast_shows(localizer, rng):
+    index, space = localizer.index, localizer.space
+    ids = some_poses(index, 400, rng)
+    exact = space.caster.depths(index.sensor, index.poses(ids), index.resolution.mask_shape) > 0
+    stored = index.masks(ids)
+    both, either = (exact & stored).sum((1, 2)), (exact | stored).sum((1, 2))
+    large = exact.sum((1, 2)) > 20
+    assert large.sum() > 60
+    iou = (both / np.maximum(either, 1))[large]
+    assert np.median(iou) > 0.9
+    assert np.quantile(iou, 0.1) > 0.6
+
+
+def test_stored_heights_press_as_deep_as_they_say(localizer, rng):
+    index, space = localizer.index, localizer.space
+    ids = some_poses(index, 400, rng)
+    pressed = space.caster.penetration(index.sensor, index.poses(ids))
+    off = pressed - np.array(index.resolution.penetrations)[ids // index.places]
+    assert abs(np.median(off)) < 0.05 * MM
+    assert (np.abs(off) < 0.1 * MM).mean() > 0.8
+    assert (np.abs(off) < 0.5 * MM).mean() > 0.95
+
+
+def test_area_moments_and_packing_are_those_of_the_masks(localizer, rng):
+    from geomtact.sensing.moments import moments
+
+    index = localizer.index
+    ids = some_poses(index, 200, rng)
+    masks = index.masks(ids)
+    assert (masks.sum((1, 2)) == index.area.ravel()[ids]).all()
+    assert masks.any((1, 2)).all(), "a contact smaller than a pixel still touches somewhere"
+    assert np.abs(index.moments[:, ids].T - moments(masks, index.sensor)).max() < 1e-5
+    level, place = np.divmod(ids, index.places)
+    assert (pack(masks.reshape(len(ids), -1)) == index.bits[level, :, place]).all()
+
+
+def test_a_mean_mask_pixel_lies_where_the_object_presses(localizer, rng):
+    """Frames and signs: the contact's centroid in pixels is the projection of the object's points below the membrane."""
+    index, sensor = localizer.index, localizer.sensor
+    points = localizer.mesh.surface_points(20_000)
+    ids = some_poses(index, 100, rng)
+    off = []
+    for T, mask in zip(index.poses(ids), index.masks(ids), strict=True):
+        p = points @ T[:3, :3].T + T[:3, 3]
+        p = p[-p[:, 2] - sensor.sag(p[:, 0], p[:, 1]) > 0]
+        xy = sensor.project(p)
+        xy = xy[(np.abs(xy) <= sensor.half_window).all(1)]
+        if len(xy) < 20 or mask.sum() < 10:
+            continue
+        x, y = sensor.pixel_centres(mask.shape)
+        rows, columns = np.nonzero(mask)
+        off.append(np.array([x[columns].mean(), y[rows].mean()]) - xy.mean(0))
+    assert len(off) > 20
+    assert np.abs(np.median(off, 0)).max() < 0.1 * MM
+    assert np.median(np.linalg.norm(off, axis=1)) < 1.5 * MM
+
+
+def test_each_pose_of_the_index_looks_up_itself(localizer):
+    index = localizer.index
+    w = weights(index)
+    level = np.arange(len(index)) // index.places
+    depth = np.array(index.resolution.penetrations)[level]
+    found = index.lookup(index.poses(), depth)
+    assert (found == np.arange(len(index)))[w > 0].all()
+
+
+def test_weights_are_a_distribution_and_the_arrays_small(localizer):
+    index = localizer.index
+    w = weights(index)
+    assert w.sum() == pytest.approx(1, abs=1e-6) and (w >= 0).all()
+    assert index.bytes_per_pose <= 500
+    n = index.places
+    assert index.shift.shape == (n, 2) and index.rotation.shape == (n,)
+    assert len(index) == n * len(index.resolution.penetrations)
+    assert (np.diff(index.rotation) >= 0).all()
+    ids = index.of_rotations(np.array([0, 3 % len(index.rotations)]))
+    assert set(index.rotation[ids % n]) <= {0, 3 % len(index.rotations)}
+
+
+def test_points_are_those_of_the_poses(localizer, rng):
+    index = localizer.index
+    ids, point = some_poses(index, 50, rng), localizer.mesh.vertices[7]
+    expected = index.poses(ids) @ np.append(point, 1)
+    assert np.abs(index.points(ids, point) - expected[:, :3]).max() < 1e-6
+
+
+def test_the_covariance_of_a_cell_is_that_of_draws_from_it(plug, rng):
+    """Shifts along the sensor's axes, turns about the object's centre; and the twist is in the object's own frame."""
+    index = plug.index
+    i = int(np.argmax(weights(index)))
+    T = index.poses([i])[0]
+    C = index.cell_covariance(T)
+    assert np.abs(C - C.T).max() < 1e-12 and (np.linalg.eigvalsh(C) > 0).all()
+    # the centre of the object is moved by the lattice cell alone
+    J = np.concatenate([-_hat(index.mesh.centre), np.eye(3)], 1)
+    shift = T[:3, :3] @ (J @ C @ J.T) @ T[:3, :3].T
+    depth = index.sensor.max_penetration / len(index.resolution.penetrations)
+    expected = np.diag([index.resolution.step**2] * 2 + [depth**2]) / 12
+    assert np.abs(shift - expected).max() < 1e-12
+    # and to first order moves by twists drawn with this covariance
+    xi = rng.multivariate_normal(np.zeros(6), C * 1e-4, 4000)
+    moved = (T @ exp(xi)) @ np.append(index.mesh.centre, 1)
+    centre = moved[:, :3] - (T @ np.append(index.mesh.centre, 1))[:3]
+    assert np.cov(centre.T) == pytest.approx(shift * 1e-4, abs=0.1 * shift.max() * 1e-4)
+
+
+def _hat(w):
+    x, y, z = w
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+# --- the index against poses drawn without it
+
+
+def chi_square(observed, expected, most_off):
+    """The p-value of counts, after allowing each expectation to be wrong by the share ``most_off``."""
+    few = expected < 8
+    observed = np.append(observed[~few], observed[few].sum())
+    expected = np.append(expected[~few], expected[few].sum())
+    off = np.maximum(np.abs(observed - expected) - most_off * expected, 0)[expected > 0]
+    return chi2.sf((off**2 / expected[expected > 0]).sum(), max(1, len(off) - 1))
+
+
+def test_uniform_poses_fill_the_cells_by_their_weight(localizer, uniform_poses):
+    """By depth, by direction, and by half of the window: the shares of the index hold, up to its own coarseness."""
+    index = localizer.index
+    T, depth = uniform_poses(localizer)
+    ids, w = index.lookup(T, depth), weights(index)
+    place = np.arange(len(index)) % index.places
+    direction = np.repeat(np.arange(len(index.directions.turns)), index.directions.turns)[index.rotation[place]]
+    labels = {
+        "depth": np.arange(len(index)) // index.places,
+        "direction": direction,
+        "left or right": (index.shift[place, 0] > 0).astype(int),
+        "up or down": (index.shift[place, 1] > 0).astype(int),
+    }
+    for name, label in labels.items():
+        expected = np.bincount(label, w) * len(ids)
+        observed = np.bincount(label[ids], minlength=len(expected))
+        assert chi_square(observed, expected, 0.05) > 1e-4, name
+
+
+def test_cells_on_the_border_weigh_what_of_them_touches(ball):
+    """A ball has no rotation to blur the border: x and y of uniform poses are as the weights say, within a pixel."""
+    index, sensor = ball.index, ball.sensor
+    # without the housing the centre of the ball may be anywhere over the window, or within a radius of it
+    open_sensor = replace(sensor, housing_depth=None, camera_distance=0.0)
+    index = open_index(ball.mesh, open_sensor, None, 20_000, None or index_cache(ball))
+    step, R = index.resolution.step, 6 * MM
+    a, b = open_sensor.half_window
+    area = 4 * a * b + 4 * (a + b) * R + np.pi * R**2
+    w = weights(index)
+    full = w.max()
+    assert len(index.resolution.penetrations) * area / step**2 * full == pytest.approx(1, rel=0.02)
+    assert index.height == pytest.approx(index.height, nan_ok=False)
+
+
+_CACHES: dict[str, object] = {}
+
+
+def index_cache(localizer):
+    import tempfile
+
+    return _CACHES.setdefault("folder", tempfile.mkdtemp())
+
+
+def test_uniform_poses_lie_in_the_space_and_press_uniformly(localizer, uniform_poses):
+    space = localizer.space
+    T, depth = uniform_poses(localizer)
+    assert np.abs(space.penetration(T) - depth).max() < 5e-6
+    assert allowed(approach_of(T[:, :3, :3]), space.cones).all()
+    if space.sensor.housing_depth is None:
+        assert kstest(depth, "uniform", args=(0, space.sensor.max_penetration)).pvalue > 1e-4
+    else:
+        lowest = space.caster.lowest_outside(space.sensor, T)
+        assert (lowest >= -space.sensor.housing_depth - 1e-6).all()
+
+
+def test_no_pose_of_the_index_enters_the_housing(ball, cone, flat_nut, rng):
+    for localizer in (ball, cone, flat_nut):
+        ids = some_poses(localizer.index, 500, rng)
+        lowest = localizer.space.caster.lowest_outside(localizer.sensor, localizer.index.poses(ids))
+        clear = lowest >= -localizer.sensor.housing_depth - 0.3 * MM
+        assert clear.mean() > 0.97
+
+
+def test_draws_lie_within_their_cell_and_touch(localizer, rng):
+    index, space = localizer.index, localizer.space
+    ids = some_poses(index, 60, rng)
+    T, depth, found = draw_within(index, space, ids, rng)
+    assert found.mean() > 0.7
+    assert (index.lookup(T[found], depth[found]) == ids[found]).all()
+    assert np.abs(space.penetration(T[found]) - depth[found]).max() < 5e-6
+
+
+def test_settle_presses_as_deep_as_asked(localizer, uniform_poses):
+    space = localizer.space
+    T, _ = uniform_poses(localizer)
+    T = T[:60].copy()
+    T[:, 2, 3] += 0.5 * MM
+    moved, ok = space.settle(T, 0.7 * MM)
+    assert ok.mean() > 0.8
+    assert np.abs(space.caster.penetration(space.sensor, moved[ok]) - 0.7 * MM).max() < 2e-6
+    assert (moved[:, :3, :3] == T[:, :3, :3]).all() and (moved[:, :2, 3] == T[:, :2, 3]).all()
+
+
+def test_settle_finds_nothing_beside_the_window(ball):
+    _, ok = ball.space.settle(transform(np.eye(3), [0.2, 0, 5 * MM]), 1 * MM)
+    assert not ok.any()
+
+
+def test_penetration_is_nan_off_the_space(ball, cone):
+    def depth(z, localizer=ball, R=None):
+        return localizer.space.penetration(transform(np.eye(3) if R is None else R, [0, 0, z]))[0]
+
+    assert depth(5 * MM) == pytest.approx(1 * MM, abs=2e-5)
+    assert np.isnan(depth(6.1 * MM)) and np.isnan(depth(3.9 * MM)) and np.isnan(depth(-20 * MM))
+    # a bracket approached from below, where only touches from above are allowed
+    R = np.diag([1.0, -1, -1])
+    assert approach_of(R)[2] == 1
+    T, _ = cone.space.settle(np.stack([transform(R, [0, 0, 30 * MM]), transform(np.eye(3), [0, 0, 30 * MM])]), 0.5 * MM)
+    free = ContactSpace(cone.mesh, replace(cone.sensor, housing_depth=None))
+    T, ok = free.settle(T, 0.5 * MM)
+    assert ok.all() and np.isfinite(free.penetration(T)).all()
+    assert np.isnan(cone.space.penetration(T))[1]
+
+
+def test_an_approach_that_nothing_can_reach_is_refused():
+    """A housing that starts at the membrane leaves a plate that is far wider than the window nothing to press with."""
+    mesh = load_mesh("ball")
+    shallow = replace(TINY, housing_depth=0.0, pixel_pitch=(0.01 * MM, 0.01 * MM), max_penetration=2 * MM)
+    space = ContactSpace(mesh, shallow)
+    T = transform(np.eye(3), [0, 0, 5 * MM])
+    assert np.isnan(space.penetration(T))[0]
+
+
+# --- how fine
+
+
+def test_a_larger_budget_gives_a_finer_grid():
+    mesh = load_mesh("connector_plug")
+    sensor = Sensor.load("gelslim")
+    grids = [choose(mesh.radius_rms, 3e-3, mesh.symmetry, sensor, None, n) for n in (10_000, 100_000, 1_000_000)]
+    size = [np.hypot(g.turn_step * mesh.radius_rms, g.step) for g in grids]
+    assert size[0] > size[1] > size[2]
+    with pytest.raises(UsageError, match="max_poses: expected at least 1000, got 999"):
+        choose(mesh.radius_rms, 3e-3, mesh.symmetry, sensor, None, 999)
+
+
+def test_symmetry_and_approach_buy_finer_lattices(ball, curved, flat_nut, plug):
+    assert ball.index.resolution.step < 0.5 * MM
+    assert len(ball.index.rotations) == 1
+    assert (flat_nut.index.directions.periods == pytest.approx(np.pi / 3)) and len(
+        flat_nut.index.directions.vectors
+    ) == 1
+    assert flat_nut.index.angle_step < 0.3
+    assert plug.index.resolution.step > 2 * MM
+
+
+def test_the_budget_of_poses_is_about_kept(localizer):
+    assert 0.4 * 20_000 < len(localizer.index) < 2.2 * 60_000
+
+
+# --- the cache
+
+
+def tiny_index(cache_dir, **options):
+    return open_index(load_mesh("ball"), TINY, None, 2000, cache_dir, **options)
+
+
+def never(*_):
+    raise AssertionError("built again")
+
+
+def same(a, b):
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in Index.ARRAYS)
+
+
+def test_the_second_opening_reads_what_the_first_built(tmp_path, monkeypatch):
+    built = tiny_index(tmp_path)
+    monkeypatch.setattr(store, "build", never)
+    again = tiny_index(tmp_path)
+    assert same(built, again) and again.key == built.key and again.resolution == built.resolution
+    assert isinstance(again.bits, np.memmap), "read in place, not copied"
+    assert again.mesh.symmetry.kind == "sphere"
+    assert not list(tmp_path.glob("building-*"))
+
+
+def test_what_goes_into_an_index_goes_into_its_key(tmp_path):
+    ball = load_mesh("ball")
+    keys = {
+        tiny_index(tmp_path).key,
+        open_index(ball, TINY, None, 2500, tmp_path).key,
+        open_index(ball, replace(TINY, max_penetration=1.5 * MM), None, 2000, tmp_path).key,
+        open_index(ball, TINY, [((0, 0, 1), 0.3)], 2000, tmp_path).key,
+        open_index(replace(ball, vertices=ball.vertices * 1.1, symmetry=None), TINY, None, 2000, tmp_path).key,
+    }
+    assert len(keys) == 5
+    assert open_index(ball, replace(TINY, note="other words"), None, 2000, tmp_path).key in keys
+    assert {e.key for e in cache_entries(tmp_path)} == keys
+
+
+@pytest.mark.parametrize("name", [f"{a}.npy" for a in Index.ARRAYS] + ["meta.json"])
+@pytest.mark.parametrize("harm", ["truncated", "empty", "gone"])
+def test_a_damaged_entry_is_built_anew(tmp_path, name, harm):
+    built = tiny_index(tmp_path)
+    file = tmp_path / built.key / name
+    whole = file.read_bytes()
+    file.unlink()
+    if harm != "gone":
+        file.write_bytes(whole[: len(whole) // 2] if harm == "truncated" else b"")
+    again = tiny_index(tmp_path)
+    assert same(built, again)
+    assert same(built, tiny_index(tmp_path))
+
+
+def test_an_entry_of_another_version_is_not_read(tmp_path, monkeypatch):
+    old = tiny_index(tmp_path)
+    monkeypatch.setattr(store, "FORMAT", store.FORMAT + 1)
+    assert tiny_index(tmp_path).key != old.key
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_line(tmp_path):
+    file = tmp_path / "cache"
+    file.write_text("not a folder")
+    for folder in (file, file / "deeper"):
+        with pytest.raises(CacheError, match="cannot be written .*--cache-dir or GEOMTACT_CACHE") as error:
+            tiny_index(folder)
+        assert "\n" not in str(error.value)
+
+
+def test_a_full_disk_leaves_nothing_behind(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(store.np, "save", full)
+    with pytest.raises(CacheError, match="No space left on device"):
+        tiny_index(tmp_path)
+    monkeypatch.undo()
+    assert [p.suffix for p in tmp_path.iterdir()] in ([], [".lock"])
+    assert len(tiny_index(tmp_path))
+
+
+def test_an_interrupted_build_leaves_no_entry(tmp_path):
+    def interrupt(share, _):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tiny_index(tmp_path, progress=interrupt)
+    assert not cache_entries(tmp_path) and not list(tmp_path.glob("*/*"))
+
+
+def _build_slowly(folder, log):
+    """Run in a process of its own."""
+    real = store.build
+
+    def counted(*args, **kwargs):
+        with open(log, "a") as file:
+            file.write("built\n")
+        time.sleep(0.5)
+        return real(*args, **kwargs)
+
+    store.build = counted
+    index = tiny_index(folder)
+    with open(f"{log}.done", "a") as file:
+        file.write(f"{len(index)}\n")
+
+
+def test_two_processes_at_once_build_once(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    log = tmp_path / "log"
+    both = [context.Process(target=_build_slowly, args=(tmp_path / "cache", log)) for _ in range(2)]
+    for p in both:
+        p.start()
+    for p in both:
+        p.join(60)
+    assert [p.exitcode for p in both] == [0, 0]
+    assert log.read_text() == "built\n"
+    lengths = (tmp_path / "log.done").read_text().split()
+    assert len(lengths) == 2 and len(set(lengths)) == 1
+
+
+def _build_and_wait(folder, flag):
+    def stall(*_, **__):
+        flag.touch()
+        time.sleep(60)
+
+    store.np.save = stall
+    tiny_index(folder)
+
+
+def test_a_killed_build_leaves_no_entry_and_no_lock(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    flag = tmp_path / "writing"
+    p = context.Process(target=_build_and_wait, args=(tmp_path / "cache", flag))
+    p.start()
+    for _ in range(600):
+        if flag.exists():
+            break
+        time.sleep(0.1)
+    assert flag.exists()
+    p.kill()
+    p.join(20)
+    assert not cache_entries(tmp_path / "cache")
+    assert len(tiny_index(tmp_path / "cache"))
+    assert len(cache_entries(tmp_path / "cache")) == 1
+    clear_cache(tmp_path / "cache")
+    assert not list((tmp_path / "cache").iterdir()), "what the killed build left is cleared too"
+
+
+def test_the_cache_is_listed_bounded_and_cleared(tmp_path):
+    first = tiny_index(tmp_path)
+    second = open_index(load_mesh("ball"), TINY, None, 3000, tmp_path)
+    entries = cache_entries(tmp_path)
+    assert {e.key for e in entries} == {first.key, second.key}
+    assert {e.poses for e in entries} == {len(first), len(second)}
+    assert all(e.object == "ball" and e.sensor == "tiny" and e.size_bytes > 1000 for e in entries)
+    newest = entries[0].key
+    removed = bound_cache(entries[0].size_bytes, tmp_path)
+    assert [e.key for e in cache_entries(tmp_path)] == [newest] and len(removed) == 1
+    clear_cache(tmp_path)
+    assert cache_entries(tmp_path) == [] and not list(tmp_path.iterdir())
+
+
+def test_progress_goes_from_0_to_1(tmp_path):
+    seen = []
+    open_index(load_mesh("hex_nut"), TINY, None, 2000, tmp_path, lambda share, what: seen.append((share, what)))
+    shares = [s for s, _ in seen]
+    assert shares == sorted(shares) and 0 < shares[0] <= 1 and shares[-1] == 1
+    assert all(isinstance(what, str) and what for _, what in seen)
+
+
+def test_the_index_says_what_it_was_built_from(tmp_path):
+    index = tiny_index(tmp_path)
+    meta = json.loads((tmp_path / index.key / "meta.json").read_text())
+    assert meta["object_sha256"] == index.mesh.sha256 and meta["poses"] == len(index)
+
+
+def test_without_any_touch_the_part_is_named(tmp_path):
+    """Everything that could touch would enter the housing."""
+    mesh = load_mesh("head")
+    blocked = replace(TINY, housing_depth=0.0, pixel_pitch=(0.001 * MM, 0.001 * MM))
+    with pytest.raises(MeshError, match="head: .*widen the approach"):
+        ContactSpace(mesh, blocked, [((0, 0, 1), 0.0)]).sample(5, np.random.default_rng(0))
+    shutil.rmtree(tmp_path, ignore_errors=True)
+
+
+def test_samples_are_the_same_for_the_same_seed(ball):
+    one, other = (ball.space.sample(20, np.random.default_rng(5)) for _ in range(2))
+    assert (one[0] == other[0]).all() and (one[1] == other[1]).all()
+
+
+def test_rotations_of_samples_are_uniform_over_the_cones(cone, rng):
+    """Two overlapping cones: no direction is drawn twice as often for lying in both."""
+    a = approach_of(cone.space._rotations(8000, rng))
+    assert allowed(a, cone.space.cones).all()
+    v = approach_of(random_rotations(60_000, rng))
+    v = v[allowed(v, cone.space.cones)]
+    for i in range(3):
+        edges = np.quantile(v[:, i], np.linspace(0, 1, 11))
+        edges[[0, -1]] = -1.1, 1.1
+        count = np.histogram(a[:, i], edges)[0]
+        assert chi_square(count, np.full(10, 800.0), 0.03) > 1e-4

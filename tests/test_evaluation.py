@@ -1,0 +1,218 @@
+"""Evaluation: pose errors obey their definitions, coverage its binomial law, and a study repeats, resumes and adds up."""
+
+import importlib.util
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from geomtact import Localizer, Mesh, load_mesh
+from geomtact.cli import app
+from geomtact.evaluation import study
+from geomtact.evaluation.pose_error import add, add_s, coverage, mssd, normalised_add, random_add
+from geomtact.geometry.distance import PoseDistance
+from geomtact.se3 import exp, random_rotations, transform
+from geomtact.sensing.noise import CLEAN, MODERATE
+
+MM = 1e-3
+ROOT = Path(__file__).parents[1]
+
+
+def random_poses(n, rng, spread=20 * MM):
+    return transform(random_rotations(n, rng), rng.normal(0, spread, (n, 3)))
+
+
+@pytest.fixture(scope="module")
+def nut():
+    return load_mesh("hex_nut").with_symmetry()
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def localizer(cache):
+    return Localizer.prepare("ball", sensor="gelsight-mini", cache_dir=cache)
+
+
+def test_a_shift_moves_every_point_as_far(nut, rng):
+    points = nut.surface_points(200)
+    (T,) = random_poses(1, rng)
+    for shift in rng.normal(0, 5 * MM, (5, 3)):
+        moved = T.copy()
+        moved[:3, 3] += shift
+        far = np.linalg.norm(shift)
+        assert add(T, moved, points)[0] == pytest.approx(far)
+        assert 0 < add_s(T, moved, points)[0] <= far
+        assert far * (1 - 1e-9) <= mssd(T, moved, load_mesh("bracket"))[0] <= far * (1 + 1e-9)
+
+
+def test_mssd_of_a_turn_is_the_chord_of_the_farthest_corner(rng):
+    """For a brick without symmetry but the identity known, in closed form."""
+    brick = trimesh.creation.box((20 * MM, 30 * MM, 50 * MM))
+    mesh = Mesh(brick.vertices, brick.faces, "brick", "m")
+    for angle in (0.1, 1.0, 3.0):
+        turn = exp(np.array([0, 0, angle, 0, 0, 0]))
+        (T,) = random_poses(1, rng)
+        chord = 2 * np.hypot(10 * MM, 15 * MM) * np.sin(angle / 2)
+        assert mssd(T, T @ turn, mesh)[0] == pytest.approx(chord)
+
+
+def test_errors_bound_one_another(nut, rng):
+    """ADD-S <= ADD; ADD modulo symmetry <= ADD, at the image nearest in mean square; no point moves further than MSSD."""
+    points, distance = nut.surface_points(256), PoseDistance(nut)
+    T, others = random_poses(1, rng)[0], random_poses(30, rng)
+    plain, modulo, largest = add(T, others, points), distance.mean(T, others), mssd(T, others, nut)
+    assert (add_s(T, others, points) <= plain + 1e-12).all()
+    assert (modulo <= 1.02 * plain).all()
+    assert (modulo <= largest).all()
+    assert (largest <= 1e-6 + np.linalg.norm(others[:, :3, 3] - T[:3, 3], axis=1) + nut.diameter).all()
+
+
+def test_mssd_and_add_do_not_see_the_symmetry(nut, rng):
+    T, T_true = random_poses(1, rng)[0], random_poses(1, rng)[0]
+    images = T @ nut.symmetry.elements
+    assert len(images) == 12
+    assert np.ptp(mssd(T_true, images, nut)) < 1e-9
+    assert np.ptp(PoseDistance(nut).mean(T_true, images)) < 1e-9
+    assert mssd(T, images, nut).max() < 1e-9
+    assert add(T, images, nut.surface_points(100)).max() > 1 * MM
+
+
+def test_mssd_of_a_ball_is_the_distance_of_the_centres(rng):
+    ball = load_mesh("ball").with_symmetry()
+    assert ball.symmetry.kind == "sphere"
+    T, others = random_poses(1, rng)[0], random_poses(10, rng)
+    apart = np.linalg.norm((others - T)[:, :3, :3] @ ball.centre + (others - T)[:, :3, 3], axis=1)
+    np.testing.assert_allclose(mssd(T, others, ball), apart, rtol=1e-9)
+
+
+def test_a_random_guess_has_normalised_add_one(localizer):
+    distance, rng = PoseDistance(localizer.mesh), np.random.default_rng(5)
+    expected = random_add(distance, localizer.space, n=150)
+    T, _ = localizer.space.sample(150, rng)
+    guess, _ = localizer.space.sample(150, rng)
+    found = [normalised_add(a, b, distance, expected)[0] for a, b in zip(T, guess, strict=True)]
+    assert np.mean(found) == pytest.approx(1, abs=5 * np.std(found) * np.sqrt(2 / 150))
+
+
+def test_coverage_of_calibrated_levels_and_its_intervals():
+    none = coverage(np.ones(10), [0.5])[0]
+    assert (none.share, none.low) == (0, 0)
+    assert none.high == pytest.approx(1 - 0.025 ** (1 / 10))  # Clopper and Pearson in closed form for no hit
+    rng = np.random.default_rng(0)
+    hits = [c.low <= c.nominal <= c.high for _ in range(100) for c in coverage(rng.random(60), study.NOMINAL)]
+    assert np.mean(hits) >= 0.95  # exact intervals are never too short
+    shares = [c.share for c in coverage(rng.random(20_000), study.NOMINAL)]
+    np.testing.assert_allclose(shares, study.NOMINAL, atol=0.012)
+
+
+def test_touches_repeat_and_only_elastic_ones_are_felt_anew(localizer):
+    space = localizer.space
+    blob = np.zeros(localizer.sensor.image_size_px[::-1], bool)
+    blob[100:130, 150:190] = True
+    own = study.make_touches(localizer, 6, 3, CLEAN)
+    again = study.make_touches(localizer, 6, 3, CLEAN)
+    felt = study.make_touches(localizer, 6, 3, CLEAN, lambda s, T, elastic: blob)
+    assert [t.elastic for t in own] == [False, True] * 3
+    for a, b, c in zip(own, again, felt, strict=True):
+        np.testing.assert_array_equal(a.T_sensor_object, c.T_sensor_object)
+        np.testing.assert_array_equal(a.mask, b.mask)
+        np.testing.assert_array_equal(c.mask, blob if c.elastic else a.mask)
+        assert np.isfinite(space.penetration(a.T_sensor_object)).all()
+
+
+def test_a_study_says_what_the_posterior_says(localizer):
+    touches = study.make_touches(localizer, 8, 1, MODERATE)
+    outcomes = list(study.localize_touches(localizer, touches, "fast", 1))
+    for touch, outcome in zip(touches, outcomes, strict=True):
+        posterior = localizer.localize(touch.mask, kind="mask", effort="fast", seed=1)
+        assert outcome.gain == posterior.log_density(touch.T_sensor_object)
+        assert outcome.level == posterior.credible_level(touch.T_sensor_object)
+        assert outcome.claimed == -posterior.entropy_nats
+        off = np.linalg.norm((posterior.modes(1)[0].T - touch.T_sensor_object)[:3, 3]) / MM
+        assert outcome.mssd_mm == pytest.approx(off) == outcome.add_mm  # of a ball about its origin
+        assert outcome.mssd10_mm <= outcome.mssd_mm
+    figures = study.summarise(outcomes, 5.0)
+    assert [figures[g]["n"] for g in ("all", "geometric", "elastic")] == [8, 4, 4]
+    gain = [o.gain for o in outcomes]
+    assert figures["all"]["gain_mean"] == pytest.approx(np.mean(gain))
+    assert figures["all"]["gain_standard_error"] == pytest.approx(np.std(gain, ddof=1) / np.sqrt(8))
+    assert figures["all"]["normalised_add_median"] == pytest.approx(np.median([o.add_mm for o in outcomes]) / 5)
+    assert figures["all"]["gain_mean"] > 1, "a ball is located far better than by a random guess"
+
+
+def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tmp_path, monkeypatch):
+    out = tmp_path / "study.json"
+    monkeypatch.setattr(study, "expected_random_add", lambda localizer: 5.0)
+    common = ["evaluate", "localize", "ball", "--sensor", "gelsight-mini", "--effort", "fast"]
+    common += ["--cache-dir", str(cache), "--touches", "6"]
+    done = CliRunner().invoke(app, [*common, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    whole = json.loads(out.read_text())
+    part = whole["parts"]["ball"]
+    assert whole["schema"] == "geomtact/study/1" and whole["versions"]["numpy"] == np.__version__
+    assert part["settings"]["object_sha256"] == localizer.mesh.sha256 and part["settings"]["seed"] == 1
+    assert len(part["outcomes"]) == 6 and part["figures"]["all"]["n"] == 6
+
+    asked = []
+    monkeypatch.setattr(
+        study,
+        "localize_touches",
+        lambda localizer, todo, effort, seed: asked.append(len(todo)) or _as_before(part, todo),
+    )
+    stopped = json.loads(out.read_text())
+    stopped["parts"]["ball"]["outcomes"] = part["outcomes"][:4]
+    out.write_text(json.dumps(stopped))
+    assert CliRunner().invoke(app, [*common, "--out", str(out)]).exit_code == 0
+    assert asked == [2]
+    assert json.loads(out.read_text())["parts"]["ball"] == part
+    assert CliRunner().invoke(app, [*common, "--out", str(out), "--seed", "2"]).exit_code == 0
+    assert asked == [2, 6], "other settings start anew"
+
+
+def _as_before(part, todo):
+    return iter([study.Outcome(**o) for o in part["outcomes"][-len(todo) :]])
+
+
+def test_a_file_that_is_no_study_is_left_alone(cache, tmp_path):
+    out = tmp_path / "other.json"
+    out.write_text("{}")
+    done = CliRunner().invoke(app, ["evaluate", "localize", "ball", "--out", str(out), "--cache-dir", str(cache)])
+    assert done.exit_code == 3 and out.read_text() == "{}"
+
+
+def test_touches_are_described(tmp_path):
+    done = CliRunner().invoke(app, ["evaluate", "touches", "ball", "--sensor", "gelsight-mini", "--touches", "6"])
+    assert done.exit_code == 0, done.output
+    assert "geometric" in done.output and "elastic" in done.output
+
+
+def test_outcomes_are_plain_numbers(localizer):
+    touches = study.make_touches(localizer, 1, 0, MODERATE)
+    (outcome,) = study.localize_touches(localizer, touches, "fast", 0)
+    assert json.loads(json.dumps(asdict(outcome))) == asdict(outcome)
+
+
+def test_the_judging_solver_agrees_with_hertz_and_with_our_own():
+    pytest.importorskip("tamaas")
+    from geomtact.sensing.elastic import elastic_mask
+
+    spec = importlib.util.spec_from_file_location("judge_elastic", ROOT / "tools" / "judge_elastic.py")
+    judge = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(judge)
+    pitch, radius, depth = (0.1 * MM, 0.1 * MM), 20 * MM, 0.8 * MM
+    x = (np.arange(121) - 60) * pitch[0]
+    r2 = x**2 + x[:, None] ** 2
+    ball = depth - r2 / (2 * radius)
+    mask = judge.tamaas_mask(ball, pitch)
+    assert np.sqrt(mask.sum() * pitch[0] * pitch[1] / np.pi) == pytest.approx(np.sqrt(radius * depth), rel=0.015)
+    assert (mask ^ elastic_mask(ball, pitch)).sum() < 0.03 * mask.sum()
+    punch = np.where(r2 < (4 * MM) ** 2, depth, -np.inf)
+    assert (judge.tamaas_mask(punch, pitch) ^ (punch > 0)).sum() < 0.03 * (punch > 0).sum()

@@ -1,0 +1,164 @@
+"""Real readings: balls pressed into a GelSight Mini lie where the eye sees them, and the simulated DIGIT of others runs
+from RGB to a report. ``pytest -s`` prints a table of all presses."""
+
+import csv
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from geomtact import Localizer, Mesh, Posterior, Sensor
+from geomtact.evaluation.touches import random_touches
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.se3 import random_rotations, transform
+
+CIRCLES = Path(__file__).with_name("circles_gelslam_gsmini.csv")
+MM = 1e-3
+DIAMETERS = ("6.310", "9.500")
+
+
+@dataclass
+class Press:
+    """One press: what the eye saw, the posterior of the ball that was pressed, and the log evidence of both."""
+
+    file: str
+    ball: str
+    inside: bool
+    seen: np.ndarray  # centre of the circle drawn by eye (2,) [m]
+    posterior: Posterior
+    log_evidence: dict
+
+    @property
+    def centre(self):
+        """Where the first mode has the ball's centre (3,) [m]; the ball's mesh is centred on its origin."""
+        return self.posterior.modes(1)[0].T[:3, 3]
+
+    @property
+    def off_mm(self):
+        return np.linalg.norm(self.centre[:2] - self.seen) / MM
+
+    @property
+    def mask_off_mm(self):
+        rows, cols = np.nonzero(self.posterior.observation.contact.mask)
+        return np.linalg.norm(self.posterior.sensor.from_pixels([cols.mean(), rows.mean()]) - self.seen) / MM
+
+    @property
+    def ratio(self):
+        """How many times likelier the likelier of the two balls is."""
+        small, large = (self.log_evidence[d] for d in DIAMETERS)
+        return np.exp(abs(small - large))
+
+
+@pytest.fixture(scope="module")
+def balls(data_folder, tmp_path_factory):
+    cache, out = tmp_path_factory.mktemp("cache"), {}
+    for diameter in DIAMETERS:
+        ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5 * float(diameter) * MM)
+        mesh = Mesh(ball.vertices, ball.faces, f"ball of {diameter} mm", "m")
+        out[diameter] = Localizer.prepare(mesh, sensor="gelsight-mini", cache_dir=cache)
+    return out
+
+
+@pytest.fixture(scope="module")
+def presses(data_folder, balls):
+    folder = data_folder / "gelslam_gsmini_balls"
+    lines = [line for line in CIRCLES.read_text("utf-8").splitlines() if not line.startswith("#")]
+    out = []
+    for row in csv.DictReader(lines):
+        seen = Sensor.load("gelsight-mini").from_pixels([float(row["cx_px"]), float(row["cy_px"])])
+        found = balls[row["ball_mm"]].localize(folder / row["file"], background=folder / "background.png")
+        (other,) = set(DIAMETERS) - {row["ball_mm"]}
+        mask = found.observation.contact.mask
+        evidence = {
+            row["ball_mm"]: found.log_evidence,
+            other: balls[other].localize(mask, kind="mask", effort="fast").log_evidence,
+        }
+        out.append(Press(row["file"], row["ball_mm"], row["inside"] == "1", seen, found, evidence))
+    print_table(out)
+    return out
+
+
+def print_table(presses):
+    print("\npress          off[mm] mask off  depth  P(first)  6.310 : 9.500")
+    for inside, title in ((True, "wholly inside"), (False, "over the border")):
+        some = [p for p in presses if p.inside == inside]
+        print(f"{title} ({len(some)})")
+        for p in some:
+            depth = 0.5 * float(p.ball) - p.centre[2] / MM
+            odds = np.exp(p.log_evidence["6.310"] - p.log_evidence["9.500"])
+            first = p.posterior.modes(1)[0].probability
+            print(f"{p.file:14} {p.off_mm:7.2f} {p.mask_off_mm:8.2f} {depth:6.2f} {first:9.3f} {odds:8.2f} : 1")
+        off = [p.off_mm for p in some]
+        print(
+            f"off: median {np.median(off):.2f}, largest {max(off):.2f} mm; evidence ratio <= {max(p.ratio for p in some):.2f}"
+        )
+
+
+def test_a_ball_wholly_inside_lies_within_half_a_millimetre_of_where_the_eye_sees_it(presses):
+    inside = [p for p in presses if p.inside]
+    assert len(inside) == 29
+    assert {p.file: p.off_mm for p in inside if p.off_mm > 0.5} == {}
+
+
+def test_the_whole_posterior_of_a_ball_lies_there_too(presses):
+    """Not the first mode alone: the mean of x and y, which no choice between neighbouring cells moves."""
+    for p in presses:
+        if p.inside:
+            mean = np.exp(p.posterior.log_prob) @ p.posterior.poses[:, :2, 3]
+            assert np.linalg.norm(mean - p.seen) <= 0.5 * MM, p.file
+
+
+def test_all_rotations_of_a_ball_are_one_mode(balls, presses, rng):
+    """Modes differ in where the ball is and in nothing else; turning it changes neither density nor credible level."""
+    for localizer in balls.values():
+        assert len(localizer.index.rotations) == 1
+    turns = transform(random_rotations(5, rng), np.zeros(3))
+    for p in presses[::4]:
+        distance, radius = PoseDistance(p.posterior.mesh), mode_radius(p.posterior.mesh)
+        modes = p.posterior.modes(5)
+        for mode in modes:
+            turned = mode.T @ turns
+            assert distance.largest(mode.T, turned).max() < 1e-9
+            assert np.ptp(p.posterior.log_density(turned)) == 0
+        for a, b in itertools.combinations(modes, 2):
+            apart = np.linalg.norm(a.T[:3, 3] - b.T[:3, 3])
+            assert distance.mean(a.T, b.T[None])[0] == pytest.approx(apart)
+            assert apart > radius
+
+
+def test_a_ball_touches_no_deeper_than_the_gel(presses):
+    for p in presses:
+        depth = 0.5 * float(p.ball) * MM - p.centre[2]
+        assert 0 <= depth <= p.posterior.sensor.max_penetration, p.file
+
+
+def test_a_mask_hardly_tells_the_balls_apart(presses):
+    """A small ball pressed deeper looks like a large one: no press makes either ball five times likelier."""
+    assert {p.file: p.ratio for p in presses if p.ratio >= 5} == {}
+
+
+def test_a_reading_of_another_simulator_runs_from_rgb_to_a_report(data_folder, tmp_path):
+    """On the marker's featureless side the answer is broad: broader than for a touch that tells much."""
+    from geomtact.report.write import write_all
+
+    folder = data_folder / "hsp_digit_sim_ycb"
+    localizer = Localizer.prepare(
+        folder / "meshes" / "040_large_marker.obj", unit="m", sensor="digit-hsp", max_poses=20_000, cache_dir=tmp_path
+    )
+    background = folder / "background.png"
+    found = [
+        localizer.localize(folder / "040_large_marker" / "triplet_1" / f"Image_heatmap_{k}.png", background=background)
+        for k in range(3)
+    ]
+    touches = random_touches(localizer, 12, seed=0)
+    distinctive = min(localizer.localize(t.mask, kind="mask", effort="fast").entropy_nats for t in touches)
+    print(f"\nentropy [nats]: readings {[round(p.entropy_nats, 2) for p in found]}, distinctive {distinctive:.2f}")
+    for posterior in found:
+        assert posterior.contact and posterior.observation.kind == "reading"
+        assert distinctive + 0.2 < posterior.entropy_nats < 0
+    write_all(tmp_path / "out", found[0], found[0].modes(3), localizer.simulate, {}, {})
+    names = {"result.json", "posterior.npz", "report.html", "report.png"}
+    assert names <= {path.name for path in (tmp_path / "out").iterdir()}

@@ -1,0 +1,262 @@
+"""Laws of the rotation grid: every rotation has one cell, cells are as large as they say, symmetry makes no difference."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from geomtact.errors import UsageError
+from geomtact.geometry.rotations import Directions, allowed, approach_of, check_approach, facing
+from geomtact.geometry.symmetry import Symmetry, about, group_of
+from geomtact.se3 import random_rotations, transform
+
+CENTRE = np.array([0.01, -0.02, 0.03])
+ONE = np.eye(4)[None]
+Z = np.array([0.0, 0.0, 1.0])
+TILTED = np.array([0.36, 0.48, 0.8])
+ACROSS = np.array([0.8, 0.36, -0.48]) / np.linalg.norm([0.8, 0.36, -0.48])
+ACROSS = np.cross(TILTED, ACROSS) / np.linalg.norm(np.cross(TILTED, ACROSS))
+HALF_TURN = about(Rotation.from_rotvec([[0, 0, 0], np.pi * ACROSS]).as_matrix(), CENTRE)
+SYMMETRIES = {
+    "none": Symmetry("none", ONE, None, CENTRE),
+    "six turns": Symmetry("discrete", group_of([[0, 0, np.pi / 3]], CENTRE), None, CENTRE),
+    "nut": Symmetry("discrete", group_of([[0, 0, np.pi / 3], [np.pi, 0, 0]], CENTRE), None, CENTRE),
+    "cube": Symmetry("discrete", group_of([[0, 0, np.pi / 2], [np.pi / 2, 0, 0]], CENTRE), None, CENTRE),
+    "axis": Symmetry("axis", ONE, Z, CENTRE),
+    "axis with flip": Symmetry("axis", HALF_TURN, TILTED, CENTRE),
+    "sphere": Symmetry("sphere", ONE, None, CENTRE),
+}
+APPROACHES = {
+    "all": None,
+    "overlapping cones": [((0, 0, 1), 0.5), ((0, 0.3, 1), 0.4), ((1, 0, 0), 0.6)],
+    "half": [((1, 1, 1), np.pi / 2)],
+}
+each_symmetry = pytest.mark.parametrize("symmetry", SYMMETRIES.values(), ids=SYMMETRIES)
+each_approach = pytest.mark.parametrize("approach", APPROACHES.values(), ids=APPROACHES)
+
+
+def random_poses(n, rng, cones=None):
+    T = transform(random_rotations(n, rng), 0.01 * rng.normal(size=(n, 3)))
+    return T[allowed(approach_of(T[:, :3, :3]), cones)]
+
+
+def random_elements(symmetry, n, rng):
+    S = symmetry.elements[rng.integers(len(symmetry.elements), size=n)]
+    if symmetry.kind == "axis":
+        turn = Rotation.from_rotvec(rng.uniform(0, 2 * np.pi, (n, 1)) * symmetry.axis).as_matrix()
+        S = about(turn, CENTRE) @ S
+    if symmetry.kind == "sphere":
+        S = about(random_rotations(n, rng), CENTRE)
+    return S
+
+
+def cells_of(directions, T):
+    _, k, j = directions.lookup(T)
+    return np.concatenate([[0], np.cumsum(directions.turns)])[k] + j
+
+
+def cell_weights(directions):
+    return np.repeat(directions.weights / directions.turns, directions.turns)
+
+
+def chi_square(observed, expected):
+    """The p-value, cells that expect fewer than five taken together."""
+    few = expected < 5
+    observed = np.append(observed[~few], observed[few].sum())
+    expected = np.append(expected[~few], expected[few].sum())
+    some = expected > 0
+    assert (observed[~some] == 0).all()
+    observed, expected = observed[some], expected[some]
+    if len(observed) < 2:
+        return 1.0
+    return chi2.sf(((observed - expected) ** 2 / expected).sum(), len(observed) - 1)
+
+
+@pytest.mark.parametrize(("level", "n"), [(1, 576), (2, 4608), (3, 36864)])
+def test_complete_levels_have_their_number_of_rotations(level, n):
+    directions = Directions.make(SYMMETRIES["none"], level=level)
+    R, direction, turn = directions.rotations()
+    assert len(R) == len(direction) == len(turn) == n
+    assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-12
+    assert np.linalg.det(R) == pytest.approx(np.ones(n))
+    assert cell_weights(directions) == pytest.approx(np.full(n, 1 / n), rel=1e-12)
+
+
+@each_symmetry
+def test_symmetry_saves_what_it_makes_equal(symmetry):
+    n = len(Directions.make(symmetry, level=3).rotations()[0])
+    if symmetry.kind == "sphere":
+        assert n == 1
+    elif symmetry.kind == "axis":
+        assert n < 36864 / 20
+    else:  # cells on the border of the part that is kept are kept whole
+        assert 36864 / len(symmetry.elements) <= n < 1.6 * 36864 / len(symmetry.elements)
+
+
+@each_symmetry
+@each_approach
+@pytest.mark.parametrize("level", [1, 2])
+def test_uniform_rotations_fall_into_each_cell_by_its_weight(symmetry, approach, level, rng):
+    directions = Directions.make(symmetry, approach, level)
+    T = random_poses(30_000, rng, directions.cones)
+    expected = cell_weights(directions)
+    assert expected.sum() == pytest.approx(1) and directions.weights.sum() == pytest.approx(1)
+    observed = np.bincount(cells_of(directions, T), minlength=len(expected))
+    assert chi_square(observed, expected * len(T)) > 1e-4
+
+
+@each_symmetry
+@each_approach
+@pytest.mark.parametrize("level", [1, 2])
+def test_each_rotation_of_the_grid_is_in_its_own_cell(symmetry, approach, level):
+    directions = Directions.make(symmetry, approach, level)
+    R, _, _ = directions.rotations()
+    assert allowed(approach_of(R), directions.cones).mean() > 0.9
+    assert (cells_of(directions, transform(R, np.zeros(3))) == np.arange(len(R))).all()
+
+
+@each_symmetry
+@each_approach
+def test_the_objects_symmetry_changes_neither_cell_nor_canonical_pose(symmetry, approach, rng):
+    directions = Directions.make(symmetry, approach, 2)
+    T = random_poses(3000, rng, directions.cones)
+    image = T @ random_elements(symmetry, len(T), rng)
+    both = allowed(approach_of(image[:, :3, :3]), directions.cones)
+    assert both.sum() > 50
+    T, image = T[both], image[both]
+    assert (cells_of(directions, image) == cells_of(directions, T)).all()
+    assert np.abs(directions.canonical(image) - directions.canonical(T)).max() < 1e-9
+    # the canonical pose is an image itself: it keeps the symmetry's centre where it is
+    centre = np.append(CENTRE, 1)
+    assert np.abs(directions.canonical(T) @ centre - T @ centre).max() < 1e-12
+
+
+@each_symmetry
+@each_approach
+def test_draws_fall_into_their_own_cell(symmetry, approach, rng):
+    directions = Directions.make(symmetry, approach, 2)
+    n = len(directions.rotations()[0])
+    cells = rng.integers(n, size=2000)
+    R = directions.draw(cells, rng)
+    assert (cells_of(directions, transform(R, np.zeros(3))) == cells).all()
+    assert allowed(approach_of(R), directions.cones).mean() > 0.99
+
+
+@pytest.mark.parametrize("name", ["none", "nut", "axis", "axis with flip"])
+def test_draws_are_uniform_within_their_cell(name, rng):
+    """Cells of a coarse grid drawn by weight hit the cells of a finer grid as uniform rotations do."""
+    symmetry = SYMMETRIES[name]
+    coarse, fine = Directions.make(symmetry, level=1), Directions.make(symmetry, level=2)
+    p = cell_weights(coarse)
+    cells = rng.choice(len(p), 20_000, p=p / p.sum())
+    R = coarse.draw(cells, rng)
+    expected = cell_weights(fine)
+    observed = np.bincount(cells_of(fine, transform(R, np.zeros(3))), minlength=len(expected))
+    assert chi_square(observed, expected * len(cells)) > 1e-4
+
+
+@each_symmetry
+@each_approach
+def test_any_image_is_an_allowed_image_and_they_are_all_met(symmetry, approach, rng):
+    directions = Directions.make(symmetry, approach, 1)
+    T = random_poses(400, rng, directions.cones)[:1]
+    images = directions.any_image(np.repeat(T, 2000, 0), rng)
+    assert allowed(approach_of(images[:, :3, :3]), directions.cones).all()
+    assert np.abs(directions.canonical(images) - directions.canonical(T)).max() < 1e-9
+    if symmetry.kind in ("none", "discrete"):
+        found, count = np.unique(images[:, :3, :3].round(6), axis=0, return_counts=True)
+        own = T @ symmetry.elements
+        assert len(found) == allowed(approach_of(own[:, :3, :3]), directions.cones).sum()
+        assert chi_square(count, np.full(len(count), 2000 / len(count))) > 1e-4
+    elif approach is None:
+        assert Rotation.from_matrix(images[:, :3, :3]).mean().magnitude() < np.pi  # no error: they are spread
+        assert np.abs(images[:, :3, 0].mean(0)).max() < (0.99 if symmetry.kind == "axis" else 0.1)
+
+
+def test_the_sensor_lies_where_the_approach_points(rng):
+    """The membrane is at the sensor's origin, the object on +z: seen from the object the sensor is at R^T (0, 0, -1)."""
+    a = rng.normal(size=(50, 3))
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    R = facing(a)
+    assert np.abs(approach_of(R) - a).max() < 1e-14
+    assert np.linalg.det(R) == pytest.approx(np.ones(50))
+    # an object at (0, 0, 5 cm): the sensor's origin in object coordinates
+    T = transform(R, np.array([0, 0, 0.05]))
+    sensor_in_object = np.linalg.inv(T)[:, :3, 3]
+    assert np.abs(sensor_in_object - 0.05 * a).max() < 1e-14
+
+
+def test_cones_hold_what_lies_within_their_angle(rng):
+    cones = check_approach([((0, 0, 2), 0.3), ((1, 0, 0), 0.5)])
+    a = rng.normal(size=(5000, 3))
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    inside = (np.arccos(a[:, 2]) <= 0.3) | (np.arccos(a[:, 0]) <= 0.5)
+    assert (allowed(a, cones) == inside).all()
+    on_the_face = check_approach([((0, 0, 1), 0.0)])
+    tilt = np.array([0, 5e-7, 9e-7, 1.2e-6, 1e-5])
+    near = np.stack([np.sin(tilt), 0 * tilt, np.cos(tilt)], 1)
+    assert allowed(near, on_the_face).tolist() == [True, True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("approach", "message"),
+    [
+        ([((0, 0, 0), 0.1)], "expected a direction of three numbers"),
+        ([((0, 1), 0.1)], "expected a direction of three numbers"),
+        ([((0, 0, np.nan), 0.1)], "expected a direction of three numbers"),
+        ([((0, 0, 1), -0.1)], "half angle is in radians, 0 to pi"),
+        ([((0, 0, 1), 45)], "half angle is in radians, 0 to pi"),
+        ([((0, 0, 1), 0), ((0, 1, 0), 0.2)], "cannot be mixed with cones"),
+        ([], "an empty list rules out every touch"),
+    ],
+)
+def test_an_approach_that_makes_no_sense_is_refused(approach, message):
+    with pytest.raises(UsageError, match=message):
+        check_approach(approach)
+
+
+@pytest.mark.parametrize(
+    ("name", "faces", "weights", "periods"),
+    [
+        ("none", [(0, 0, 1), (1, 0, 0)], [1 / 2, 1 / 2], [2 * np.pi, 2 * np.pi]),
+        ("none", [(0, 0, 1), (0, 0, 2)], [1], [2 * np.pi]),
+        ("nut", [(0, 0, 1)], [1], [np.pi / 3]),
+        ("nut", [(0, 0, 1), (0, 0, -1)], [1], [np.pi / 3]),
+        ("nut", [(1, 0, 0)], [1], [np.pi]),
+        ("nut", [(0, 0, 1), (0, 0, -1), (1, 0, 0)], [2 / 3, 1 / 3], [np.pi / 3, np.pi]),
+        ("axis", [(0, 0, 1)], [1], [0]),
+        ("axis", [(0, 0, 1), (0, 0, -1)], [1 / 2, 1 / 2], [0, 0]),
+        ("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1)], [2 / 3, 1 / 3], [2 * np.pi, 0]),
+        ("axis with flip", [TILTED, -TILTED], [1], [0]),
+        ("axis with flip", [ACROSS, np.cross(TILTED, ACROSS), TILTED], [2 / 3, 1 / 3], [np.pi, 0]),
+        ("cube", [(1, 0, 0), (0, -1, 0), (0, 0, 1)], [1], [np.pi / 2]),
+        ("sphere", [(0, 0, 1), (1, 0, 0)], [1], [0]),
+    ],
+)
+def test_exact_faces_are_counted_modulo_symmetry(name, faces, weights, periods, rng):
+    symmetry = SYMMETRIES[name]
+    directions = Directions.make(symmetry, [(f, 0.0) for f in faces], turn_step=0.1)
+    assert directions.weights == pytest.approx(weights)
+    assert directions.periods == pytest.approx(periods)
+    assert (directions.turns == np.maximum(1, np.ceil(np.array(periods) / 0.1 - 1e-9))).all()
+    R, _, _ = directions.rotations()
+    assert (cells_of(directions, transform(R, np.zeros(3))) == np.arange(len(R))).all()
+    # uniform over the faces that the scene allows, each with every turn
+    distinct = np.unique([np.array(f) / np.linalg.norm(f) for f in faces], axis=0)
+    n = 5000
+    turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, (n, 1))).as_matrix()
+    T = transform(turn @ facing(distinct[rng.integers(len(distinct), size=n)]), 0.01 * rng.normal(size=(n, 3)))
+    expected = cell_weights(directions)
+    if symmetry.kind != "sphere":
+        assert chi_square(np.bincount(cells_of(directions, T), minlength=len(expected)), expected * n) > 1e-4
+    image = T @ random_elements(symmetry, n, rng)
+    both = allowed(approach_of(image[:, :3, :3]), directions.cones)
+    assert both.any() == (symmetry.kind != "sphere")
+    # a pose on the border of two turns may fall to either side by a rounding error
+    assert (cells_of(directions, image[both]) != cells_of(directions, T[both])).sum() <= 5
+
+
+def test_a_cone_thinner_than_the_grid_still_has_a_direction():
+    directions = Directions.make(SYMMETRIES["none"], [((1, 2, 3), 1e-4)], 1)
+    assert len(directions.vectors) == 1
+    assert np.abs(directions.vectors[0] - np.array([1, 2, 3]) / np.sqrt(14)).max() < 1e-9

@@ -1,0 +1,213 @@
+"""What geomtact costs on this machine.
+
+    python tools/benchmark.py --out docs/results/benchmark.json
+
+Prints medians and spreads and writes them to a JSON file with the machine's facts. Indexes are built in a folder of
+their own, which is removed afterwards; --keep names one that stays. Run it on a quiet machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+PART, SENSOR = "damping_pin", "gelslim"
+ROTATIONS = 40  # poses whose casts make the rate of rays
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--part", default=PART)
+    parser.add_argument("--sensor", default=SENSOR)
+    parser.add_argument("--repeats", type=int, default=20, help="touches localized, and starts of the command line / 4")
+    parser.add_argument("--keep", type=Path, help="cache folder to use and keep; an index in it is not built anew")
+    parser.add_argument("--out", type=Path, help="JSON file for the figures")
+    given = parser.parse_args()
+    load = os.getloadavg()[0]
+    with tempfile.TemporaryDirectory() as scratch:
+        cache = given.keep or Path(scratch)
+        figures = {"machine": machine(), "rays": rays(given.part, given.sensor)}
+        figures["prepare"] = in_process("prepare", given.part, given.sensor, cache)
+        figures["localize_warm"] = in_process("localize", given.part, given.sensor, cache, given.repeats)
+        figures["start"] = starts(given.part, given.sensor, cache, max(3, given.repeats // 4))
+    figures["machine"]["load_before"] = load
+    show(figures)
+    if given.out:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        temporary = given.out.with_suffix(".part")
+        temporary.write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
+        temporary.replace(given.out)
+
+
+def machine() -> dict[str, Any]:
+    """Facts that the figures depend on."""
+    from geomtact.report.result import versions
+
+    model = platform.processor()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [
+            line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"processor": model, "cores": cores, "system": platform.platform(), "versions": versions()}
+
+
+def rays(part: str, sensor_name: str) -> dict[str, Any]:
+    """Camera rays per second against the part, one thread and two."""
+    from geomtact.contact_space.space import ContactSpace
+    from geomtact.geometry.mesh import load_mesh
+    from geomtact.sensing.cast import Caster
+    from geomtact.sensing.sensor import Sensor
+
+    sensor = Sensor.load(sensor_name)
+    mesh = load_mesh(part, sensor=sensor)
+    T, _ = ContactSpace(mesh, sensor).sample(ROTATIONS, np.random.default_rng(0))
+    n = ROTATIONS * sensor.image_size_px[0] * sensor.image_size_px[1]
+    out: dict[str, Any] = {"part": part, "faces": len(mesh.faces)}
+    for threads in (1, 2):
+        caster = Caster(mesh.vertices, mesh.faces, threads)
+        out[f"per_second_{threads}_threads"] = n / float(np.median(timed(lambda c=caster: c.depths(sensor, T), 5)))
+    return out
+
+
+def in_process(what: str, *args: Any) -> dict[str, Any]:
+    """``_prepare`` or ``_localize`` in a process of its own, so that peak memory is its own."""
+    command = [sys.executable, __file__, f"--{what}", *map(str, args)]
+    return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
+
+
+def _prepare(part: str, sensor: str, cache: str) -> dict[str, Any]:
+    import resource
+
+    from geomtact.contact_space.store import open_index
+    from geomtact.geometry.mesh import load_mesh
+    from geomtact.inference.localizer import Localizer
+    from geomtact.sensing.sensor import Sensor
+
+    began = time.perf_counter()
+    pressed = Sensor.load(sensor)
+    mesh = load_mesh(part, sensor=pressed)
+    index = open_index(mesh, pressed, cache_dir=cache)
+    built = time.perf_counter()
+    Localizer.prepare(mesh, sensor=sensor, cache_dir=cache)
+    ready = time.perf_counter()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return {
+        "part": part,
+        "sensor": sensor,
+        "faces": len(mesh.faces),
+        "poses": len(index),
+        "index_s": built - began,
+        "calibration_s": ready - built,
+        "prepare_s": ready - began,
+        "poses_per_second": len(index) / (built - began),
+        "index_bytes_per_pose": index.bytes_per_pose,
+        "peak_bytes": peak,
+    }
+
+
+def _localize(part: str, sensor: str, cache: str, repeats: str) -> dict[str, Any]:
+    from geomtact.evaluation.touches import random_touches
+    from geomtact.inference.localizer import Localizer
+
+    localizer = Localizer.prepare(part, sensor=sensor, cache_dir=cache)
+    touches = random_touches(localizer, int(repeats), seed=0)
+    for touch in touches[:2]:
+        localizer.localize(touch.mask, kind="mask").modes(5)
+    stages: dict[str, list[float]] = {"localize": [], "modes": []}
+    for touch in touches:
+        began = time.perf_counter()
+        posterior = localizer.localize(touch.mask, kind="mask")
+        localized = time.perf_counter()
+        modes = posterior.modes(5)
+        stages["localize"].append(1e3 * (localized - began))
+        stages["modes"].append(1e3 * (time.perf_counter() - localized))
+        for stage, ms in posterior.timing_ms.items():
+            stages.setdefault(stage, []).append(ms)
+    return {
+        "poses": len(localizer.index),
+        "touches": len(touches),
+        "refined_modes": len(posterior.refined),
+        "modes": len(modes),
+        "ms": {stage: spread(ms) for stage, ms in stages.items()},
+    }
+
+
+def starts(part: str, sensor: str, cache: Path, repeats: int) -> dict[str, Any]:
+    """Wall time of whole processes, first to last line."""
+    from PIL import Image
+
+    from geomtact.evaluation.touches import random_touches
+    from geomtact.inference.localizer import Localizer
+
+    with tempfile.TemporaryDirectory() as folder:
+        image = Path(folder) / "touch.png"
+        touch = random_touches(Localizer.prepare(part, sensor=sensor, cache_dir=cache), 1, seed=0)[0]
+        Image.fromarray(255 * touch.mask.astype(np.uint8)).save(image)
+        python, run = sys.executable, [sys.executable, "-m", "geomtact"]
+        localize = [*run, "localize", str(image), "--object", part, "--sensor", sensor, "--cache-dir", str(cache)]
+        commands = {
+            "import_geomtact_s": [python, "-c", "import geomtact"],
+            "help_s": [*run, "--help"],
+            "localize_s": localize,
+            "localize_with_report_s": [*localize, "--out", str(Path(folder) / "out")],
+        }
+
+        def start(command: list[str]) -> None:
+            subprocess.run(command, check=True, capture_output=True)
+
+        return {name: spread(timed(lambda c=c: start(c), repeats)) for name, c in commands.items()}
+
+
+def timed(what: Callable[[], Any], repeats: int) -> list[float]:
+    """Seconds that each of ``repeats`` calls takes, after one that is not counted."""
+    what()
+    out = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        what()
+        out.append(time.perf_counter() - began)
+    return out
+
+
+def spread(values: list[float]) -> dict[str, float]:
+    low, median, high = np.quantile(values, (0.1, 0.5, 0.9))
+    return {"median": float(median), "10 %": float(low), "90 %": float(high)}
+
+
+def show(figures: dict[str, Any]) -> None:
+    facts, cast, made, warm = (figures[k] for k in ("machine", "rays", "prepare", "localize_warm"))
+    print(f"{facts['processor']}, {facts['cores']} cores, load {facts['load_before']:.1f} before the run")
+    rate = " and ".join(f"{cast[f'per_second_{t}_threads'] / 1e6:.1f} M/s ({t} threads)" for t in (1, 2))
+    print(f"rays at {cast['part']} ({cast['faces']} faces): {rate}")
+    print(
+        f"prepare: {made['poses']} poses in {made['index_s']:.1f} s ({made['poses_per_second']:.0f} a second), "
+        f"calibration {made['calibration_s']:.1f} s, peak {made['peak_bytes'] / 1e9:.2f} GB, "
+        f"{made['index_bytes_per_pose']:.0f} bytes a pose"
+    )
+    print(f"localize warm, {warm['poses']} poses, {warm['refined_modes']} refined modes [ms]: median (10 % to 90 %)")
+    for stage, ms in warm["ms"].items():
+        print(f"  {stage:10} {ms['median']:7.1f} ({ms['10 %']:.1f} to {ms['90 %']:.1f})")
+    print("cold processes [s]: median (10 % to 90 %)")
+    for name, s in figures["start"].items():
+        print(f"  {name:24} {s['median']:.2f} ({s['10 %']:.2f} to {s['90 %']:.2f})")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] in (["--prepare"], ["--localize"]):
+        print(json.dumps((_prepare if sys.argv[1] == "--prepare" else _localize)(*sys.argv[2:])))
+    else:
+        main()
