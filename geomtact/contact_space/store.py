@@ -1,6 +1,6 @@
 """The cache of built indexes: a folder an index, named by the hash of all that went into it.
 
-An entry is written under a temporary name and renamed, so it is whole or absent; arrays are memory-mapped when read.
+An entry is written under a temporary name and renamed, so it is whole or absent; its masks are memory-mapped when read.
 """
 
 from __future__ import annotations
@@ -179,12 +179,16 @@ def _read(folder: Path, mesh: Mesh, sensor: Sensor, approach: Approach | None) -
     """The cached index, or None where it is absent or damaged (it is then built anew)."""
     try:
         meta = json.loads((folder / "meta.json").read_text("utf-8"))
-        arrays = {a: np.load(folder / f"{a}.npy", mmap_mode="r", allow_pickle=False) for a in Index.ARRAYS}
+        # the masks, most of the bytes, stay on disk until they are asked for; a touch reads the rest every time
+        arrays = {
+            a: np.load(folder / f"{a}.npy", mmap_mode="r" if a == "bits" else None, allow_pickle=False)
+            for a in Index.ARRAYS
+        }
         s = meta["symmetry"]
         axis = None if s["axis"] is None else np.array(s["axis"])
         symmetry = Symmetry(s["kind"], np.array(s["elements"]), axis, np.array(s["centre"]))
         resolution = Resolution.from_json(meta["resolution"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, EOFError, ValueError, KeyError, TypeError):
         return None
     with contextlib.suppress(OSError):  # a read-only cache still serves
         os.utime(folder / "meta.json")

@@ -20,7 +20,7 @@ from geomtact.se3 import Array, check_transforms, inverse
 from geomtact.sensing.sensor import Sensor
 
 _SEEDS = 400  # of the most probable cells, from which modes are grown
-_MODES = 16  # grown at most
+_SPARE = 4  # modes grown beyond those asked for
 _POINTS = 128  # of the surface, for distances between modes
 
 
@@ -131,12 +131,12 @@ class Posterior:
         """The ``k`` most probable modes, most probable first; none without contact."""
         if not self.contact or k < 1:
             return []
-        found = self._modes[:k]
+        found = self._grown(k)
         return [self._mode(i, mass) for i, mass in found]
 
     def leading_cells(self, k: int) -> NDArray[np.int64]:
         """Pose ids (m,) of the index at the heart of the ``k`` most probable modes."""
-        return self.cells[[row for row, _ in self._modes[:k]]] if self.contact and k > 0 else self.cells[:0]
+        return self.cells[[row for row, _ in self._grown(k)]] if self.contact and k > 0 else self.cells[:0]
 
     def log_density(self, T: ArrayLike) -> Any:
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
@@ -236,9 +236,11 @@ class Posterior:
         row = np.searchsorted(total, rng.random(n) * total[-1])
         return self.cells[np.minimum(row, len(total) - 1)]
 
-    @cached_property
-    def _modes(self) -> list[tuple[int, float]]:
-        """Row of each mode's pose and the mass of the mode, most probable first."""
+    def _grown(self, k: int) -> list[tuple[int, float]]:
+        """Row of each of the ``k`` leading modes and the mass of the mode, most probable first.
+
+        A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most.
+        """
         p = np.exp(self.log_prob)
         top = np.argpartition(-p, min(_SEEDS, len(p) - 1))[:_SEEDS]
         top = top[p[top] > 0]
@@ -248,13 +250,13 @@ class Posterior:
         members: list[tuple[int, NDArray[np.int64]]] = []
         covered: set[int] = set()
         for row, T in zip(seeds, self._sensor_poses(seeds), strict=True):
-            if len(members) == _MODES:
+            if len(members) == k + _SPARE:
                 break
             if int(row) not in covered:
                 inside = self._within(T, distance, radius, moved)
                 members.append((row, np.union1d(inside, [row])))
                 covered.update(inside.tolist())
-        return _share_out(members, p)
+        return _share_out(members, p)[:k]
 
     def _within(self, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]) -> NDArray[np.int64]:
         """Rows whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""

@@ -7,8 +7,10 @@ tell; so its answer is judged by the rim's own measure, and kept only as far as 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from geomtact.registration.filterreg import RimFilter
 from geomtact.registration.fit import Fit, gather, judged, rejected
@@ -63,6 +65,7 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
     import open3d as o3d
 
     registration = o3d.pipelines.registration
+    threads = _threads()
     rim, cloud = o3d.geometry.PointCloud(), o3d.geometry.PointCloud()
     # Open3D's tolerances are absolute and made for metres of room: in units of a pixel they fit
     unit = problem.pitch
@@ -72,14 +75,16 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
     cloud.normals = o3d.utility.Vector3dVector(np.concatenate([normals, axes]))
     motion, found = np.eye(4), False
     for within in (reach, 3 * problem.noise + problem.pitch):
-        result = registration.registration_icp(
-            rim,
-            cloud,
-            within / unit,
-            motion,
-            registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=within / unit)),
-            registration.ICPConvergenceCriteria(1e-4, 1e-4, _MAX_ITERATIONS),
-        )
+        # sums over several threads end in another order each time, and with them the pose
+        with threads.limit(limits=1, user_api="openmp"):
+            result = registration.registration_icp(
+                rim,
+                cloud,
+                within / unit,
+                motion,
+                registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=within / unit)),
+                registration.ICPConvergenceCriteria(1e-4, 1e-4, _MAX_ITERATIONS),
+            )
         if result.fitness == 0:
             break  # it ran off; Open3D says so in no other way
         motion, found = np.array(result.transformation), True
@@ -87,6 +92,12 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
         return None
     motion[:3, 3] *= unit
     return motion
+
+
+@cache
+def _threads() -> ThreadpoolController:
+    """The thread pools of the libraries that are loaded by now, Open3D's among them."""
+    return ThreadpoolController()
 
 
 def _anchors(problem: Problem, reach: float) -> tuple[Array, Array]:

@@ -88,15 +88,20 @@ def summarise(mode: Mode, centre: ArrayLike, contact_centre: ArrayLike = (0.0, 0
 
 
 def told(mode: Mode, about: ArrayLike) -> dict[str, float]:
-    """Share (0..1) of each motion of ``MOTIONS`` about the point ``about`` (3,) [m] that lies in the mode's observable."""
-    R, axes = mode.T[:3, :3], np.eye(3)
-    arm = mode.T[:3, 3] - np.asarray(about, float)
-    # a rotation by w about the point moves the object's origin by w x arm; rows @ R are the object's own coordinates
-    turns = np.concatenate([mode.length * axes @ R, np.cross(axes, arm) @ R], axis=1)
-    shifts = np.concatenate([np.zeros((3, 3)), R], axis=1)
-    twists = np.concatenate([turns, shifts])
+    """Share (0..1) of each motion of ``MOTIONS`` about the point ``about`` (3,) [m] that the contact tells.
+
+    What is not told is a space of motions. Carried from the object's origin to the point, it is told by how much of each
+    motion lies outside it; a long lever between the two would hide a lost rotation otherwise.
+    """
+    R, length = mode.T[:3, :3], mode.length
     rows = np.asarray(mode.observable, float).reshape(-1, 6)
-    share = ((twists @ rows.T) ** 2).sum(1) / (twists**2).sum(1)
+    lost = np.linalg.svd(rows)[2][len(rows) :] if len(rows) else np.eye(6)
+    carried = np.zeros((6, 6))
+    carried[:3, :3] = carried[3:, 3:] = R
+    # a rotation about the object's origin moves the point by w x (point - origin)
+    carried[3:, :3] = -hat(np.asarray(about, float) - mode.T[:3, 3]) @ R / length
+    basis = np.linalg.qr(carried @ lost.T)[0]
+    share = 1 - (basis**2).sum(1)
     return dict(zip(MOTIONS, np.clip(share, 0, 1).tolist(), strict=True))
 
 
@@ -132,7 +137,7 @@ def facts(posterior: Posterior) -> list[str]:
         f"{known:.1f} nats are known: one part in {np.exp(min(known, 700)):,.0f} of all poses that touch is left."
         if known < 14
         else f"{known:.1f} nats are known: less than one part in a million of all poses that touch is left.",
-        f"{posterior.effective_poses:,.0f} of {len(posterior.poses):,} poses carry the probability.",
+        f"{posterior.effective_poses:,.0f} of {len(posterior.log_prob):,} poses carry the probability.",
     ]
 
 

@@ -104,7 +104,7 @@ def _histogram(below: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple
     """How far below the best the scores lie, in fine bins (b,), and the uniform measure of the poses in each (b,)."""
     width = max(float(below.max()), 1e-9) / (_BINS - 1)
     mass = np.bincount((below / np.float32(width)).astype(np.int32), weight, minlength=_BINS)
-    return (np.arange(len(mass)) + 0.5) * width, mass
+    return np.asarray((np.arange(len(mass)) + 0.5) * width, float), np.asarray(mass, float)
 
 
 def log_weights(index: Index) -> NDArray[np.float32]:

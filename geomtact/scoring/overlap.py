@@ -45,7 +45,7 @@ class PixelL1:
         mask = to_grid(mask, index.resolution.mask_shape)
         shared = overlaps(index.bits, mask)
         differing = index.area.astype(np.int32) + int(mask.sum()) - 2 * shared
-        return 1 - differing.astype(np.float32) / mask.size
+        return np.float32(1) - differing.astype(np.float32) / np.float32(mask.size)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,9 @@ class IoU:
         mask = to_grid(mask, index.resolution.mask_shape)
         shared = overlaps(index.bits, mask)
         union = index.area.astype(np.int32) + int(mask.sum()) - shared
-        return (shared / np.maximum(union, 1)).astype(np.float32)
+        ratio: NDArray[np.float32] = shared.astype(np.float32)
+        ratio /= np.maximum(union, 1)
+        return ratio
 
 
 def to_grid(mask: NDArray[np.bool_], shape: Sequence[int]) -> NDArray[np.bool_]:
