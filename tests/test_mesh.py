@@ -169,7 +169,7 @@ def test_points_nan_and_open_surfaces(tmp_path):
     refused("NaN", save(trimesh.Trimesh(vertices, nan.faces, process=False), tmp_path / "nan.stl"), "mm")
     mesh = box()
     refused(
-        r"3 of 18 edges are open.*tools/prep_mesh.py",
+        r"3 of 18 edges are open.*mesh editor",
         save(trimesh.Trimesh(mesh.vertices, mesh.faces[1:], process=False), tmp_path / "open.stl"),
         "mm",
     )

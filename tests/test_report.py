@@ -172,18 +172,18 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 
 
 def test_told_names_the_motions_by_finite_differences(rng):
-    """A motion in the sensor frame about a point is told by as much as its twist lies in the observable rows."""
+    """A motion about the contact is told by as much of it as lies outside the motions that the contact does not tell."""
     T = se3.transform(se3.random_rotations(1, rng)[0], rng.normal(size=3) * 0.02)
     about, length, step = rng.normal(size=3) * 0.01, 0.013, 1e-7
     scale = np.array([length] * 3 + [1] * 3)
-    rows = np.linalg.qr(rng.normal(size=(6, 6)))[0][:4]
+    basis = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    rows, lost = basis[:4], basis[4:]
     shares = told(FakeMode(T, observable=rows, length=length), about)
     there, back = se3.transform(np.eye(3), about), se3.transform(np.eye(3), -about)
+    carried = [scale * se3.log(back @ T @ se3.exp(step * n / scale) @ se3.inverse(T) @ there) for n in lost]
+    untold = np.linalg.qr(np.array(carried).T)[0]
     for k, name in enumerate(MOTIONS):
-        moved = there @ se3.exp(step * np.eye(6)[k]) @ back @ T
-        twist = scale * se3.log(se3.inverse(T) @ moved)
-        expected = ((rows @ twist) ** 2).sum() / (twist**2).sum()
-        assert shares[name] == pytest.approx(expected, abs=1e-5)
+        assert shares[name] == pytest.approx(1 - (untold[k] ** 2).sum(), abs=1e-5)
 
 
 def test_summary_in_words_and_numbers(rng):

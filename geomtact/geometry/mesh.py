@@ -275,13 +275,14 @@ def _check_closed(vertices: Array, faces: NDArray[np.int32], path: Path) -> None
     bare = int((uses % 2 == 1).sum())
     if bare:
         raise MeshError(
-            f"{path}: not watertight, {bare} of {len(uses)} edges are open; clean it with tools/prep_mesh.py"
+            f"{path}: not watertight, {bare} of {len(uses)} edges are open; "
+            "close the surface in a mesh editor and export it again"
         )
     turned = int((excess != 0).sum())
     if turned:
         raise MeshError(
             f"{path}: neighbouring faces disagree about the outside at {turned} of {len(uses)} edges; "
-            "clean it with tools/prep_mesh.py"
+            "make them agree in a mesh editor and export it again"
         )
     join = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
     count, body_of_vertex = connected_components(join, directed=False)
@@ -297,7 +298,7 @@ def _check_closed(vertices: Array, faces: NDArray[np.int32], path: Path) -> None
     for k in np.flatnonzero(volume < 0):
         if not ((low[solid] <= low[k]) & (high[solid] >= high[k])).all(1).any():
             raise MeshError(
-                f"{path}: the surface is inside out (its faces look inwards); flip it with tools/prep_mesh.py"
+                f"{path}: the surface is inside out (its faces look inwards); flip its faces in a mesh editor and export it again"
             )
     size = np.linalg.norm(high - low, axis=1).max()
     if volume.sum() < 1e-6 * size**3:
