@@ -74,8 +74,9 @@ def open_index(
     import filelock
 
     folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
-    key = key or _key(mesh, sensor, approach, max_poses)
-    index = _read(folder / key, mesh, sensor, approach)
+    index = _read(folder / key, mesh, sensor, approach) if key else None
+    key = _key(mesh, sensor, approach, max_poses)
+    index = index or _read(folder / key, mesh, sensor, approach)
     if index is not None:
         return index
     try:
@@ -179,6 +180,8 @@ def _read(folder: Path, mesh: Mesh, sensor: Sensor, approach: Approach | None) -
     """The cached index, or None where it is absent or damaged (it is then built anew)."""
     try:
         meta = json.loads((folder / "meta.json").read_text("utf-8"))
+        if meta["format"] != FORMAT:
+            return None
         # the masks, most of the bytes, stay on disk until they are asked for; a touch reads the rest every time
         arrays = {
             a: np.load(folder / f"{a}.npy", mmap_mode="r" if a == "bits" else None, allow_pickle=False)

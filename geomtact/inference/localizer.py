@@ -40,11 +40,13 @@ class Localizer:
     ----------
     index : every touch of the object on the sensor, simulated beforehand
     scorer : the calibrated score that compares a contact with them
+    max_poses, cache_dir : as given to :meth:`prepare`
     """
 
     index: Index
     scorer: FittedScorer
     max_poses: int = 1_200_000
+    cache_dir: str | Path | None = None
 
     @classmethod
     def prepare(
@@ -81,7 +83,7 @@ class Localizer:
         part = load_mesh(mesh, unit, sensor=sensor)
         index = open_index(part, sensor, approach, max_poses, cache_dir, progress)
         folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
-        return cls(index, fitted_scorer(scorer, index, folder / index.key, progress), max_poses)
+        return cls(index, fitted_scorer(scorer, index, folder / index.key, progress), max_poses, cache_dir)
 
     def localize(
         self,
@@ -113,7 +115,7 @@ class Localizer:
             raise UsageError(f"no effort named {effort!r}{nearest_name(effort, EFFORTS)}")
         timing: dict[str, float] = {}
         frame, T_frame_sensor, image = _frame(image, T_world_sensor)
-        settings = self._settings(kind, effort, seed)
+        settings = self._settings(effort, seed)
         with _timed(timing, "read"):
             observation = read_observation(image, self.sensor, kind, background)
         mask, warnings = observation.contact.mask, list(observation.warnings)
@@ -130,7 +132,7 @@ class Localizer:
         with _timed(timing, "score"):
             log_likelihood, best = self.scorer.log_likelihood(self.index, mask)
         with _timed(timing, "posterior"):
-            log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame)
+            log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame, self.cache_dir)
             log_prob, evidence = posterior_log_prob(log_likelihood, log_prior, self.scorer.calibration.floor)
             cells = np.flatnonzero(np.isfinite(log_prob))
         if best < self.scorer.calibration.usual:
@@ -164,9 +166,8 @@ class Localizer:
     def _refinery(self) -> Refinery:
         return Refinery(self.space)
 
-    def _settings(self, kind: str, effort: str, seed: int) -> dict[str, Any]:
+    def _settings(self, effort: str, seed: int) -> dict[str, Any]:
         return {
-            "kind": kind,
             "effort": effort,
             "seed": seed,
             "scorer": self.scorer.scorer.name,

@@ -20,7 +20,7 @@ from geomtact.se3 import Array, check_transforms, inverse
 from geomtact.sensing.sensor import Sensor
 
 _SEEDS = 400  # of the most probable cells, from which modes are grown
-_SPARE = 4  # modes grown beyond those asked for
+_LEAST, _SPARE = 8, 4  # modes grown at least, and beyond those asked for
 _POINTS = 128  # of the surface, for distances between modes
 
 
@@ -245,12 +245,12 @@ class Posterior:
         top = np.argpartition(-p, min(_SEEDS, len(p) - 1))[:_SEEDS]
         top = top[p[top] > 0]
         moved = self._rows_of(np.array(list(self.refined), np.int64))
-        seeds = np.array(list(dict.fromkeys([*_sorted(moved, p), *_sorted(top, p)])))
+        seeds = _sorted(np.union1d(moved, top), p)
         distance, radius = PoseDistance(self.mesh, _POINTS), mode_radius(self.mesh)
         members: list[tuple[int, NDArray[np.int64]]] = []
         covered: set[int] = set()
         for row, T in zip(seeds, self._sensor_poses(seeds), strict=True):
-            if len(members) == k + _SPARE:
+            if len(members) == max(k, _LEAST) + _SPARE:
                 break
             if int(row) not in covered:
                 inside = self._within(T, distance, radius, moved)
@@ -306,5 +306,5 @@ def _share_out(members: list[tuple[int, NDArray[np.int64]]], p: Array) -> list[t
 
 def _share(T: Array, seed: int) -> float:
     """A number in [0, 1) that depends on T and the seed alone."""
-    digest = hashlib.blake2b(np.round(T, 12).tobytes() + seed.to_bytes(8, "little", signed=True), digest_size=8)
+    digest = hashlib.blake2b((np.round(T, 12) + 0.0).tobytes() + seed.to_bytes(8, "little", signed=True), digest_size=8)
     return int.from_bytes(digest.digest(), "little") / 2**64

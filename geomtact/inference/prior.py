@@ -18,7 +18,9 @@ from geomtact.se3 import Array, check_transforms, inverse
 _CHUNK = 1 << 16
 
 
-def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) -> NDArray[np.float32]:
+def prior_log_mass(
+    index: Index, prior: Any, T_frame_sensor: Array, frame: str, cache_dir: str | Path | None = None
+) -> NDArray[np.float32]:
     """Log mass (N,) of every cell under ``prior``, not normalised; the uniform's without one.
 
     Parameters
@@ -36,7 +38,7 @@ def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) 
     if prior is None:
         return uniform
     if isinstance(prior, str | Path):
-        prior = Posterior.load(prior)
+        prior = Posterior.load(prior, cache_dir)
     if isinstance(prior, Posterior):
         density = _of_posterior(index, prior, T_frame_sensor, frame)
     elif callable(prior):
@@ -48,8 +50,10 @@ def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) 
             "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)) or a "
             f"function of poses, got {type(prior).__name__}"
         )
-    if np.isnan(density).any():
-        raise InputError("prior: the log density is NaN at some poses; return -inf where a pose is ruled out")
+    if not (density < np.inf).all():
+        raise InputError(
+            "prior: the log density is NaN or infinite at some poses; return -inf where a pose is ruled out"
+        )
     out = (uniform + density).astype(np.float32)
     if not np.isfinite(out).any():
         raise InputError(

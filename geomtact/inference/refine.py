@@ -61,7 +61,6 @@ class Refinery:
         refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index)]
         poses = np.stack([*candidates, *(r.T for r in refinements)])
         merit = self.agreement(contact, poses.reshape(-1, 4, 4)).reshape(poses.shape[:2])
-        merit[:, ~np.isfinite(merit[0])] = -np.inf
         out = {}
         for i, cell in enumerate(cells):
             best = int(merit[:, i].argmax())

@@ -49,6 +49,7 @@ def result(
                     "quat_xyzw": quat_xyzw(mode.T),
                     "covariance": mode.covariance,
                     "observable": mode.observable,
+                    "length": mode.length,
                 }
                 for mode in modes
             ],
