@@ -130,12 +130,12 @@ class Localizer:
         if not mask.any():
             return Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, warnings=warnings, **common)
         with _timed(timing, "score"):
-            log_likelihood, best = self.scorer.log_likelihood(self.index, mask)
+            score = self.scorer.score(self.index, mask)
         with _timed(timing, "posterior"):
             log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame, self.cache_dir)
-            log_prob, evidence = posterior_log_prob(log_likelihood, log_prior, self.scorer.calibration.floor)
+            log_prob, evidence = posterior_log_prob(score, log_prior, self.scorer.calibration)
             cells = np.flatnonzero(np.isfinite(log_prob))
-        if best < self.scorer.calibration.usual:
+        if score.max() < self.scorer.calibration.usual:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
         posterior = Posterior(self.index, cells, log_prob[cells], log_evidence=evidence, warnings=warnings, **common)
         with _timed(timing, "refine"):

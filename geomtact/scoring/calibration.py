@@ -114,19 +114,20 @@ def log_weights(index: Index) -> NDArray[np.float32]:
 
 
 def posterior_log_prob(
-    log_likelihood: NDArray[np.float32], log_prior: NDArray[np.float32], floor: float
+    score: NDArray[np.float32], log_prior: NDArray[np.float32], calibration: Calibration
 ) -> tuple[Array, float]:
-    """Log probability (N,) of every cell, and the log evidence: the likelihood's mean under the prior.
+    """Log probability (N,) of every cell, and the log evidence: the mean of exp(score) under the prior.
 
-    ``log_prior`` (N,) is the log mass of every cell, not normalised; ``floor`` the prior's share of the posterior.
+    ``log_prior`` (N,) is the log mass of every cell, not normalised. The evidence takes the score as it is: divided by
+    one object's temperature it could not be compared with another object's.
     """
     prior = log_prior - _log_sum_exp(log_prior)
-    joint = log_likelihood.ravel() + prior
-    evidence = _log_sum_exp(joint)
+    joint = score.ravel() * np.float32(1 / calibration.temperature) + prior
+    floor, total = calibration.floor, _log_sum_exp(joint)
     # written out, because numpy's logaddexp takes five times as long as exp and log
-    probability = (1 - floor) * np.exp(joint - evidence, dtype=float) + floor * np.exp(prior)
+    probability = (1 - floor) * np.exp(joint - total, dtype=float) + floor * np.exp(prior)
     with np.errstate(divide="ignore"):
-        return np.log(probability), float(evidence)
+        return np.log(probability), _log_sum_exp(score.ravel() + prior)
 
 
 def _log_sum_exp(x: NDArray[np.float32]) -> float:

@@ -32,10 +32,9 @@ class FittedScorer:
     scorer: Scorer
     calibration: Calibration
 
-    def log_likelihood(self, index: Index, mask: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
-        """Log likelihood (P, n) up to a constant, and the score of the best pose."""
-        score = self.scorer.score(index, mask)
-        return score / np.float32(self.calibration.temperature), float(score.max())
+    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Similarity (P, n) of ``mask`` (h, w) to every pose."""
+        return self.scorer.score(index, mask)
 
 
 def fitted_scorer(
