@@ -113,15 +113,21 @@ def test_weights_are_a_distribution_and_the_arrays_small(localizer):
     assert index.shift.shape == (n, 2) and index.rotation.shape == (n,)
     assert len(index) == n * len(index.resolution.penetrations)
     assert (np.diff(index.rotation) >= 0).all()
-    ids = index.of_rotations(np.array([0, 3 % len(index.rotations)]))
-    assert set(index.rotation[ids % n]) <= {0, 3 % len(index.rotations)}
 
 
-def test_points_are_those_of_the_poses(localizer, rng):
+def test_poses_around_a_place_are_found_as_by_brute_force(localizer, rng):
     index = localizer.index
-    ids, point = some_poses(index, 50, rng), localizer.mesh.vertices[7]
-    expected = index.poses(ids) @ np.append(point, 1)
-    assert np.abs(index.points(ids, point) - expected[:, :3]).max() < 1e-6
+    every = index.poses()
+    for i in some_poses(index, 10, rng):
+        rotations = np.unique(np.append(rng.choice(len(index.rotations), 5), index.rotation[i % index.places]))
+        point, reach = localizer.mesh.vertices[7], rng.uniform(1e-3, 8e-3)
+        where = (every[i] @ np.append(point, 1))[:3]
+        ids = index.around(rotations, point, where, reach)
+        offset = np.abs(every[:, :3, :3] @ point + every[:, :3, 3] - where).max(1)
+        asked = np.isin(index.rotation[np.arange(len(index)) % index.places], rotations)
+        clear = np.abs(offset - reach) > 1e-6  # heights are kept in single precision
+        assert i in ids and len(np.unique(ids)) == len(ids)
+        assert (np.isin(np.arange(len(index)), ids) == (asked & (offset <= reach)))[clear].all()
 
 
 def test_the_covariance_of_a_cell_is_that_of_draws_from_it(plug, rng):
@@ -441,6 +447,8 @@ def test_a_killed_build_leaves_no_entry_and_no_lock(tmp_path):
             break
         time.sleep(0.1)
     assert flag.exists()
+    clear_cache(tmp_path / "cache")
+    assert list((tmp_path / "cache").glob("building-*")), "what a running process builds is left alone"
     p.kill()
     p.join(20)
     assert not cache_entries(tmp_path / "cache")
@@ -458,8 +466,13 @@ def test_the_cache_is_listed_bounded_and_cleared(tmp_path):
     assert {e.poses for e in entries} == {len(first), len(second)}
     assert all(e.object == "ball" and e.sensor == "tiny" and e.size_bytes > 1000 for e in entries)
     newest = entries[0].key
+    (tmp_path / ("0" * 32)).mkdir()
+    assert [e.object for e in cache_entries(tmp_path) if not e.poses] == ["damaged"]
     removed = bound_cache(entries[0].size_bytes, tmp_path)
-    assert [e.key for e in cache_entries(tmp_path)] == [newest] and len(removed) == 1
+    assert newest in {e.key for e in cache_entries(tmp_path)} and not {first.key, second.key} <= {
+        e.key for e in cache_entries(tmp_path)
+    }
+    assert removed
     clear_cache(tmp_path)
     assert cache_entries(tmp_path) == [] and not list(tmp_path.iterdir())
 

@@ -26,6 +26,9 @@ class Index:
 
     Attributes
     ----------
+    mesh, sensor, approach : what it was built for; the mesh with its symmetry
+    resolution : of the grid
+    key : content hash of all that, its name in the cache
     rotation : (n,) rotation of each place
     shift : (n, 2) object's centre along x and y, sensor frame [m]: a point of the cell at which it touches
     height : (P, n) the centre's z at each penetration [m]
@@ -93,24 +96,37 @@ class Index:
         centre = np.concatenate([self.shift[place], self.height[level, place, None]], 1)
         return transform(R, centre - R @ self.mesh.centre)
 
-    def of_rotations(self, rotations: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Pose ids (m,) of all places and penetrations of some rotations."""
-        first = self._first_place
-        place = np.concatenate([np.arange(first[r], first[r + 1]) for r in rotations] or [np.zeros(0, np.int64)])
-        return (np.arange(len(self.height))[:, None] * self.places + place).ravel().astype(np.int64)
+    def around(
+        self, rotations: NDArray[np.int64], point: ArrayLike, where: ArrayLike, reach: float
+    ) -> NDArray[np.int64]:
+        """Pose ids (m,) of some rotations, at which ``point`` (3,) of the object lies within ``reach`` [m] of ``where``
+        (3,) in the sensor frame along each axis."""
+        centre = np.asarray(where, float) - self.rotations[rotations] @ (np.asarray(point, float) - self.mesh.centre)
+        step = self.resolution.step
+        # a place may lie up to half a step off the middle of its lattice cell
+        k = np.arange(-int(np.ceil(reach / step + 0.5)), int(np.ceil(reach / step + 0.5)) + 1)
+        x, y = self._lattice(centre)
+        ny, nx = self.table.shape[1:]
+        x, y = (x[:, None] + k)[:, None, :], (y[:, None] + k)[:, :, None]
+        on_lattice = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
+        place = self.table[np.asarray(rotations)[:, None, None], np.clip(y, 0, ny - 1), np.clip(x, 0, nx - 1)]
+        owner = np.broadcast_to(np.arange(len(centre))[:, None, None], place.shape)
+        # cells that do not touch name their neighbours' places, which stand for themselves already
+        place, first = np.unique(place[on_lattice], return_index=True)
+        owner = owner[on_lattice][first]
+        near = (np.abs(self.shift[place] - centre[owner, :2]) <= reach).all(1)
+        near &= self.rotation[place] == np.asarray(rotations)[owner]
+        place, owner = place[near], owner[near]
+        level, row = np.nonzero(np.abs(self.height[:, place] - centre[owner, 2]) <= reach)
+        return (level * self.places + place[row]).astype(np.int64)
 
-    @cached_property
-    def _first_place(self) -> NDArray[np.int64]:
-        return np.searchsorted(self.rotation, np.arange(len(self.rotations) + 1))
-
-    def points(self, ids: ArrayLike, point: ArrayLike) -> NDArray[np.float32]:
-        """Where a point (3,) of the object lies in the sensor frame at poses ``ids`` (m,): (m, 3) [m]."""
-        level, place = np.divmod(np.asarray(ids), self.places)
-        turned = (self.rotations @ (np.asarray(point, float) - self.mesh.centre)).astype(np.float32)
-        out = turned[self.rotation[place]]
-        out[:, :2] += self.shift[place]
-        out[:, 2] += self.height[level, place]
-        return out
+    def _lattice(self, centre: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Column and row (n,) of the lattice cell that holds the object's centre (n, 2 or 3); maybe off the lattice."""
+        ny, nx = self.table.shape[1:]
+        step = self.resolution.step
+        x = np.rint(-centre[:, 0] / step).astype(np.int64) + nx // 2
+        y = np.rint(-centre[:, 1] / step).astype(np.int64) + ny // 2
+        return x, y
 
     def cell_covariance(self, T: ArrayLike) -> Array:
         """Spread (6, 6) of the poses in the cell around ``T`` (4, 4): covariance of xi in T exp(xi^), radians and metres."""
@@ -135,10 +151,8 @@ class Index:
         rotation = self._first_turn[k] + j
         centre = T[:, :2, :3] @ self.mesh.centre + T[:, :2, 3]
         ny, nx = self.table.shape[1:]
-        step = self.resolution.step
-        ix = np.clip(np.rint(-centre[:, 0] / step).astype(np.int64) + nx // 2, 0, nx - 1)
-        iy = np.clip(np.rint(-centre[:, 1] / step).astype(np.int64) + ny // 2, 0, ny - 1)
-        place = self.table[rotation, iy, ix].astype(np.int64)
+        x, y = self._lattice(centre)
+        place = self.table[rotation, np.clip(y, 0, ny - 1), np.clip(x, 0, nx - 1)].astype(np.int64)
         bins = len(self.resolution.penetrations)
         depth = np.asarray(penetration, float) / self.sensor.max_penetration
         level = np.clip((depth * bins).astype(np.int64), 0, bins - 1)

@@ -28,6 +28,7 @@ from geomtact.sensing.sensor import Sensor
 
 FORMAT = 2  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
+_KEY_LENGTH = 32  # hexadecimal digits of an entry's name
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,10 @@ def open_index(
 
     Raises
     ------
+    MeshError
+        No pose of the object touches the sensor as the approach and the housing allow.
+    UsageError
+        The approach or ``max_poses`` make no sense.
     CacheError
         The cache folder cannot be written, or the disk is full.
     """
@@ -100,18 +105,19 @@ def open_index(
 
 
 def cache_entries(cache_dir: str | Path | None = None) -> list[CacheEntry]:
-    """All cached indexes, last used first; entries that another version wrote are listed too."""
+    """All cached indexes, last used first; those that another version wrote, or that are damaged, are listed too."""
     folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
     entries = []
-    for meta_file in folder.glob("*/meta.json"):
-        with contextlib.suppress(OSError, ValueError, KeyError):
-            meta = json.loads(meta_file.read_text("utf-8"))
-            size = sum(f.stat().st_size for f in meta_file.parent.iterdir())
-            used = meta_file.stat().st_mtime
-            name = meta_file.parent.name
-            entries.append(
-                CacheEntry(name, meta["object"], meta["sensor"], meta["poses"], size, used, meta_file.parent)
-            )
+    for path in folder.glob("[0-9a-f]" * _KEY_LENGTH):
+        with contextlib.suppress(OSError):
+            files = [f.stat() for f in path.iterdir()]
+            size, used = sum(f.st_size for f in files), max((f.st_mtime for f in files), default=0.0)
+            try:
+                meta = json.loads((path / "meta.json").read_text("utf-8"))
+                what = meta["object"], meta["sensor"], meta["poses"]
+            except (OSError, ValueError, KeyError):
+                what = "damaged", "?", 0
+            entries.append(CacheEntry(path.name, *what, size, used, path))
     return sorted(entries, key=lambda e: -e.last_used)
 
 
@@ -127,11 +133,19 @@ def bound_cache(limit_bytes: int, cache_dir: str | Path | None = None, keep: str
 
 
 def clear_cache(cache_dir: str | Path | None = None) -> list[CacheEntry]:
-    """Remove every cached index and what interrupted runs left behind; returns what was removed."""
+    """Remove every cached index and what interrupted runs left behind; returns what was removed.
+
+    What a running process builds at the moment is left alone.
+    """
+    import filelock
+
     folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
     removed = bound_cache(0, folder)
-    for left in [*folder.glob("building-*"), *folder.glob("*.lock")]:
-        shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+    for path in folder.glob("*.lock"):
+        with contextlib.suppress(filelock.Timeout, OSError), filelock.FileLock(path, timeout=0):
+            path.unlink(missing_ok=True)
+            for left in folder.glob(f"building-{path.stem}-*"):
+                shutil.rmtree(left, ignore_errors=True)
     return removed
 
 
@@ -143,7 +157,7 @@ def _key(mesh: Mesh, sensor: Sensor, approach: Approach | None, max_poses: int) 
         None if s is None else (s.kind, s.elements.round(9).tolist(), None if s.axis is None else s.axis.tolist())
     )
     text = json.dumps([FORMAT, mesh.sha256, symmetry, sensor.sha256, approach_text, max_poses])
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+    return hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
 
 
 def _write(folder: Path, index: Index) -> None:
@@ -164,7 +178,7 @@ def _write(folder: Path, index: Index) -> None:
         },
         "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
     }
-    building = Path(tempfile.mkdtemp(prefix="building-", dir=folder))
+    building = Path(tempfile.mkdtemp(prefix=f"building-{index.key}-", dir=folder))
     try:
         for name in Index.ARRAYS:
             np.save(building / f"{name}.npy", getattr(index, name), allow_pickle=False)

@@ -87,10 +87,13 @@ class PoseDistance:
     def _distances(self, T: ArrayLike, others: ArrayLike, over: str) -> Array:
         T, others = np.asarray(T, float), np.asarray(others, float).reshape(-1, 4, 4)
         out = np.zeros(len(others))
-        here = apply(T, self.points)
+        points = np.ascontiguousarray(self.points.T)
+        here = T[:3, :3] @ points + T[:3, 3:]
         for i in range(0, len(others), _BATCH):
-            there = apply(self.aligned(T, others[i : i + _BATCH]), self.points)
-            d = np.linalg.norm(there - here, axis=-1)
+            there = self.aligned(T, others[i : i + _BATCH])
+            d = there[:, :3, :3] @ points
+            d += there[:, :3, 3:] - here
+            d = np.sqrt(np.einsum("mik,mik->mk", d, d))
             out[i : i + _BATCH] = d.mean(1) if over == "mean" else d.max(1)
         return out
 

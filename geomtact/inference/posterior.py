@@ -36,7 +36,7 @@ class Mode:
     covariance : (6, 6) of xi = (rx, ry, rz, tx, ty, tz) in T exp(xi^), radians and metres
     observable : (r, 6) orthonormal rows: directions of xi, rotations scaled by ``length``, that the contact tells
     length : metres by which rotations are scaled before directions are compared
-    refined : whether registration moved T off the grid
+    refined : whether T was moved off the grid, because the contact simulated there agrees better with the observed one
     """
 
     T: Array
@@ -71,6 +71,7 @@ class Posterior:
     T_frame_sensor : (4, 4)
     contact : whether the image shows any contact
     log_evidence : log of the mean likelihood under the prior, comparable between objects on one sensor
+    seed : of the random choices made where credible levels tie
     refined : what registration found, by pose id
     observations, settings, timing_ms, warnings : how it came about
     """
@@ -118,13 +119,13 @@ class Posterior:
     @cached_property
     def entropy_nats(self) -> float:
         """Minus the mean log density under the posterior itself: 0 for the uniform, lower the more is known."""
-        p = np.exp(self.log_prob)
+        p = self._probability
         return -float(p @ np.where(p > 0, self._log_density, 0.0)) if self.contact else 0.0
 
     @property
     def effective_poses(self) -> float:
         """How many equally likely cells would be as uncertain: exp of the discrete entropy."""
-        p = np.exp(self.log_prob)
+        p = self._probability
         return float(np.exp(-(p @ np.where(p > 0, self.log_prob, 0.0)))) if len(p) else 0.0
 
     def modes(self, k: int = 5) -> list[Mode]:
@@ -141,7 +142,8 @@ class Posterior:
     def log_density(self, T: ArrayLike) -> Any:
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
 
-        -inf outside the contact pose space, finite inside; without contact, -inf where T would touch and 0 elsewhere.
+        -inf outside the contact pose space; inside it finite, unless the prior ruled T out. Without contact, -inf where T
+        would touch and 0 elsewhere.
         """
         T = check_transforms(T)
         inside = inverse(self.T_frame_sensor) @ T.reshape(-1, 4, 4)
@@ -205,6 +207,10 @@ class Posterior:
         return load(path, cache_dir)
 
     @cached_property
+    def _probability(self) -> Array:
+        return np.exp(self.log_prob)
+
+    @cached_property
     def _log_density(self) -> Array:
         """Log density (N,) of the cells relative to the uniform distribution."""
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -216,7 +222,7 @@ class Posterior:
         """Distinct log densities, highest first, and the mass at or above each."""
         if not len(self.cells):
             return np.zeros(1), np.ones(1)
-        density, mass = self._log_density, np.exp(self.log_prob)
+        density, mass = self._log_density, self._probability
         order = np.argsort(-density, kind="stable")
         order = order[mass[order] > 0]
         density, mass = density[order], mass[order]
@@ -232,7 +238,7 @@ class Posterior:
         return T
 
     def _draw_cells(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        total = np.cumsum(np.exp(self.log_prob))
+        total = np.cumsum(self._probability)
         row = np.searchsorted(total, rng.random(n) * total[-1])
         return self.cells[np.minimum(row, len(total) - 1)]
 
@@ -241,8 +247,8 @@ class Posterior:
 
         A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most.
         """
-        p = np.exp(self.log_prob)
-        top = np.argpartition(-p, min(_SEEDS, len(p) - 1))[:_SEEDS]
+        p = self._probability
+        top = np.argpartition(p, -min(_SEEDS, len(p)))[-_SEEDS:]
         top = top[p[top] > 0]
         moved = self._rows_of(np.array(list(self.refined), np.int64))
         seeds = _sorted(np.union1d(moved, top), p)
@@ -260,12 +266,10 @@ class Posterior:
 
     def _within(self, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]) -> NDArray[np.int64]:
         """Rows whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""
-        # a rotation whose root mean square exceeds three radii has no mean within one
+        # the mean over a surface is seldom less than a third of the root mean square: farther rotations are left out
         turned = distance.turned(T[:3, :3], self.index.rotations) <= 3 * radius
-        near = self.index.of_rotations(np.flatnonzero(turned))
         here = T[:3, :3] @ distance.anchor + T[:3, 3]
-        there = self.index.points(near, distance.anchor)
-        near = near[(np.abs(there - here.astype(np.float32)) <= radius + distance.slack).all(1)]
+        near = self.index.around(np.flatnonzero(turned), distance.anchor, here, radius + distance.slack)
         rows = np.union1d(self._rows_of(near), moved)
         return rows[distance.within(T, self._sensor_poses(rows), radius)]
 

@@ -42,7 +42,7 @@ def prior_log_mass(
     if isinstance(prior, Posterior):
         density = _of_posterior(index, prior, T_frame_sensor, frame)
     elif callable(prior):
-        density = _by_chunks(index, lambda T: np.asarray(prior(T_frame_sensor @ T), float))
+        density = _by_chunks(index, lambda T: _checked(prior(T_frame_sensor @ T), len(T)))
     elif isinstance(prior, tuple | list) and len(prior) == 2:
         return _of_poses(index, prior[0], prior[1], T_frame_sensor)
     else:
@@ -82,8 +82,10 @@ def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: 
 def _of_poses(index: Index, poses: Any, log_masses: Any, T_frame_sensor: Array) -> NDArray[np.float32]:
     T = check_transforms(poses, "prior poses").reshape(-1, 4, 4)
     mass = np.asarray(log_masses, float)
-    if mass.shape != (len(T),) or np.isnan(mass).any():
-        raise InputError(f"prior: expected one log weight a pose, ({len(T)},) and not NaN, got shape {mass.shape}")
+    if mass.shape != (len(T),) or not (mass < np.inf).all():
+        raise InputError(
+            f"prior: expected one log weight a pose, ({len(T)},), neither NaN nor +inf, got shape {mass.shape}"
+        )
     inside = inverse(T_frame_sensor) @ T
     depth = ContactSpace(index.mesh, index.sensor, index.approach).penetration(inside)
     ok = np.isfinite(depth) & np.isfinite(mass)
@@ -96,6 +98,15 @@ def _of_poses(index: Index, poses: Any, log_masses: Any, T_frame_sensor: Array) 
     cell = index.lookup(inside[ok], depth[ok])
     np.logaddexp.at(out, cell, mass[ok])
     return out.astype(np.float32)
+
+
+def _checked(density: Any, n: int) -> Array:
+    out = np.asarray(density, float)
+    if out.shape != (n,):
+        raise InputError(
+            f"prior: the function was given {n} poses and returned shape {out.shape}; return one log density a pose, ({n},)"
+        )
+    return out
 
 
 def _by_chunks(index: Index, density: Any) -> Array:

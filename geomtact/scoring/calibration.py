@@ -124,10 +124,14 @@ def posterior_log_prob(
     prior = log_prior - _log_sum_exp(log_prior)
     joint = score.ravel() * np.float32(1 / calibration.temperature) + prior
     floor, total = calibration.floor, _log_sum_exp(joint)
-    # written out, because numpy's logaddexp takes five times as long as exp and log
-    probability = (1 - floor) * np.exp(joint - total, dtype=float) + floor * np.exp(prior)
+    # written out, and in single precision, because numpy's logaddexp takes many times as long; the floor keeps every
+    # probability far above the smallest that single precision knows
+    joint -= np.float32(total - np.log1p(-floor))
+    probability = np.exp(joint, out=joint)
+    probability += np.exp(prior + np.float32(np.log(floor)))
     with np.errstate(divide="ignore"):
-        return np.log(probability), _log_sum_exp(score.ravel() + prior)
+        log_prob = np.log(probability, out=probability)
+    return log_prob.astype(float), _log_sum_exp(score.ravel() + prior)
 
 
 def _log_sum_exp(x: NDArray[np.float32]) -> float:

@@ -58,7 +58,7 @@ def fitted_scorer(
     touches = simulate_touches(index, _FIT + _JUDGE, seed=20_200_531, progress=progress)
     if len(touches.ids) < 40:
         raise MeshError(
-            f"{index.mesh.name}: hardly any pose presses the sensor {index.sensor.name!r} with at least 1 mm2; "
+            f"{index.mesh.name}: hardly any pose makes a contact that the sensor {index.sensor.name!r} can resolve; "
             "check the object's unit and the approach"
         )
     n = len(touches.ids) * _FIT // (_FIT + _JUDGE)

@@ -1,0 +1,374 @@
+"""Laws of localization: priors multiply, frames and files make no difference, and probabilities come true."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.stats import binom
+
+from geomtact import InputError, Localizer, PoseError, Sensor, UsageError
+from geomtact.evaluation.touches import random_touches
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.rotations import approach_of
+from geomtact.inference.posterior import Posterior
+from geomtact.scoring.calibration import log_weights
+from geomtact.se3 import exp, transform
+
+MM = 1e-3
+T_WORLD = exp([0.3, -1.2, 0.5, 0.4, -0.1, 0.7])
+
+
+def pressed(localizer, T):
+    return localizer.simulate(T).mask
+
+
+# --- what comes out
+
+
+def test_a_press_at_a_known_pose_is_more_probable_than_chance(localizer, a_touch):
+    T, mask = a_touch(localizer)
+    posterior = localizer.localize(mask)
+    assert posterior.entropy_nats < -0.3
+    if localizer.index.resolution.step < 5 * MM:  # on coarser grids a single touch may be misjudged
+        assert posterior.log_density(T) > 1
+        assert posterior.credible_level(T) < 0.95
+
+
+def test_the_nut_on_its_flat_is_found_by_its_hole(flat_nut, uniform_poses):
+    """With the face known, x, y and depth of a nut pressed over the window are told by one mask."""
+    T, _ = uniform_poses(flat_nut)
+    area = np.array([pressed(flat_nut, pose).sum() for pose in T[:80]])
+    error = []
+    for pose in T[:80][np.argsort(-area)[:6]]:
+        mode = flat_nut.localize(pressed(flat_nut, pose)).modes(1)[0]
+        error.append(np.linalg.norm((mode.T - pose)[:2, 3]))
+    assert np.median(error) < 0.5 * MM
+
+
+def test_the_contact_that_the_best_mode_predicts_is_the_one_seen(curved, flat_nut, ball, uniform_poses):
+    for localizer in (curved, flat_nut, ball):
+        T, _ = uniform_poses(localizer)
+        iou = []
+        for pose in T[:7]:
+            seen = pressed(localizer, pose)
+            best = pressed(localizer, localizer.localize(seen).modes(1)[0].T)
+            iou.append((seen & best).sum() / (seen | best).sum())
+        assert np.median(iou) > 0.75
+
+
+def test_the_same_seed_gives_the_same_result(localizer, a_touch):
+    T, mask = a_touch(localizer)
+    one, other = (localizer.localize(mask, seed=3) for _ in range(2))
+    assert (one.log_prob == other.log_prob).all() and (one.cells == other.cells).all()
+    assert one.credible_level(T) == other.credible_level(T)
+    for a, b in zip(one.modes(), other.modes(), strict=True):
+        assert np.abs(a.T - b.T).max() < 1e-12  # sums of products may be taken in another order
+        assert a.probability == pytest.approx(b.probability, abs=1e-12)
+    third = localizer.localize(mask, seed=4)
+    assert (third.log_prob == one.log_prob).all() and third.credible_level(T) != one.credible_level(T)
+
+
+def test_efforts_differ_in_what_is_refined_only(curved, a_touch):
+    T, mask = a_touch(curved)
+    fast, balanced, exact = (curved.localize(mask, effort=e) for e in ("fast", "balanced", "exact"))
+    assert (fast.log_prob == exact.log_prob).all()
+    assert len(fast.refined) == 0 < len(balanced.refined) <= 5 <= len(exact.refined) <= 25
+    assert fast.log_density(T) == balanced.log_density(T) == exact.log_density(T)
+    agreement = [curved._refinery.agreement(mask, p.modes(1)[0].T[None])[0] for p in (fast, balanced)]
+    assert agreement[1] >= agreement[0] - 1e-9, "a refinement that does not raise the agreement is dropped"
+    with pytest.raises(UsageError, match="no effort named 'quick'"):
+        curved.localize(mask, effort="quick")
+
+
+def test_settings_and_times_say_how_it_came_about(plug, a_touch):
+    posterior = plug.localize(a_touch(plug)[1], seed=9)
+    assert posterior.settings["seed"] == posterior.seed == 9
+    assert posterior.settings["poses"] == len(plug.index) and posterior.settings["kind"] == "mask"
+    assert set(posterior.timing_ms) == {"read", "score", "posterior", "refine"}
+    assert posterior.observation.contact.mask.any() and posterior.warnings == []
+
+
+def test_a_contact_unlike_any_touch_is_warned_of(ball):
+    """A ball never makes a frame along the border of the window."""
+    mask = np.zeros(ball.sensor.image_size_px[::-1], bool)
+    mask[:12], mask[-12:], mask[:, :12], mask[:, -12:] = True, True, True, True
+    assert any("unlike any touch" in w for w in ball.localize(mask).warnings)
+
+
+def test_simulate_is_the_exact_cast(plug, a_touch):
+    T, mask = a_touch(plug)
+    contact = plug.simulate(T.tolist())
+    assert (contact.mask == mask).all() and contact.mask.shape == plug.sensor.image_size_px[::-1]
+    assert contact.height.max() == pytest.approx(plug.space.penetration(T)[0], abs=0.05 * MM)
+    with pytest.raises(PoseError):
+        plug.simulate(np.eye(3))
+    with pytest.raises(UsageError, match="expected one pose"):
+        plug.simulate(np.stack([T, T]))
+
+
+# --- evidence
+
+
+def test_the_evidence_prefers_the_part_that_was_pressed(make_localizer, ball, flat_nut, curved_sensor, uniform_poses):
+    T, _ = uniform_poses(flat_nut)
+    area = [pressed(flat_nut, pose).sum() for pose in T[:80]]
+    nut_mask = pressed(flat_nut, T[int(np.argmax(area))])
+    ball_mask = pressed(ball, transform(np.eye(3), [1 * MM, 1 * MM, 5 * MM]))
+    assert flat_nut.localize(nut_mask).log_evidence > ball.localize(nut_mask).log_evidence + 3
+    assert ball.localize(ball_mask).log_evidence > flat_nut.localize(ball_mask).log_evidence + 3
+
+
+# --- priors
+
+
+def test_a_constant_prior_is_none(localizer, a_touch):
+    mask = a_touch(localizer)[1]
+    none = localizer.localize(mask, effort="fast")
+    for c in (0.0, 7.0):
+        constant = localizer.localize(mask, effort="fast", prior=lambda T, c=c: np.full(len(T), c))
+        assert (constant.cells == none.cells).all()
+        assert constant.log_prob == pytest.approx(none.log_prob, abs=1e-4)
+        assert constant.log_evidence == pytest.approx(none.log_evidence, abs=1e-4)
+
+
+def test_a_prior_multiplies_the_likelihood(plug, a_touch, rng):
+    """For any log density f, the posterior is the likelihood times f, and a share of f itself."""
+    mask = a_touch(plug)[1]
+    f = 4 * rng.normal(size=len(plug.index))
+    f[rng.random(len(f)) < 0.2] = -np.inf
+    chunks = iter(np.split(f, range(1 << 16, len(f), 1 << 16)))
+    posterior = plug.localize(mask, effort="fast", prior=lambda T: next(chunks))
+    log_likelihood = plug.scorer.score(plug.index, mask) / plug.scorer.calibration.temperature
+    prior = np.exp(log_weights(plug.index).astype(float) + f)
+    prior /= prior.sum()
+    joint = np.exp(log_likelihood.ravel().astype(float) - log_likelihood.max()) * prior
+    floor = plug.scorer.calibration.floor
+    expected = (1 - floor) * joint / joint.sum() + floor * prior
+    got = np.zeros(len(plug.index))
+    got[posterior.cells] = np.exp(posterior.log_prob)
+    assert np.abs(got - expected).max() < 1e-4 * expected.max()
+    assert (got[prior == 0] == 0).all() and (got[prior > 0] > 0).all()
+
+
+def test_a_posterior_as_prior_is_used_as_it_is(localizer, a_touch):
+    """The same image again: the likelihood counts twice."""
+    mask = a_touch(localizer)[1]
+    once = localizer.localize(mask, effort="fast")
+    twice = localizer.localize(mask, effort="fast", prior=once)
+    log_likelihood = localizer.scorer.score(localizer.index, mask) / localizer.scorer.calibration.temperature
+    p = np.exp(once.log_prob)
+    joint = p * np.exp((log_likelihood - log_likelihood.max()).ravel().astype(float)[once.cells])
+    floor = localizer.scorer.calibration.floor
+    expected = (1 - floor) * joint / joint.sum() + floor * p
+    assert (twice.cells == once.cells).all()
+    assert np.exp(twice.log_prob) == pytest.approx(expected / expected.sum(), rel=1e-3, abs=1e-12)
+    assert twice.entropy_nats < once.entropy_nats
+
+
+def test_a_saved_posterior_is_as_good_a_prior(ball, a_touch, tmp_path, monkeypatch, cache_dir):
+    monkeypatch.setenv("GEOMTACT_CACHE", str(cache_dir))
+    mask = a_touch(ball)[1]
+    once = ball.localize(mask, effort="fast")
+    once.save(tmp_path / "once.npz")
+    from_memory, from_disk = (ball.localize(mask, effort="fast", prior=p) for p in (once, str(tmp_path / "once.npz")))
+    assert from_disk.log_prob == pytest.approx(from_memory.log_prob, abs=1e-3)
+
+
+def test_weighted_poses_as_prior_gather_the_mass(localizer, a_touch, uniform_poses):
+    T_true, mask = a_touch(localizer)
+    others = uniform_poses(localizer)[0][:9]
+    poses = np.concatenate([T_true[None], others])
+    log_weights_ = np.log(np.r_[0.5, np.full(9, 0.5 / 9)])
+    posterior = localizer.localize(mask, prior=(poses, log_weights_), effort="fast")
+    assert len(posterior.cells) <= 10
+    assert posterior.log_density(T_true) > localizer.localize(mask, effort="fast").log_density(T_true)
+    radius = mode_radius(localizer.mesh)
+    distance = PoseDistance(localizer.mesh, 128)
+    own = localizer.index.poses(posterior.cells)
+    assert len(own) == len(posterior.poses)
+    # the weights are masses: doubling all of them changes nothing
+    again = localizer.localize(mask, prior=(poses, log_weights_ + 1), effort="fast")
+    assert again.log_prob == pytest.approx(posterior.log_prob, abs=1e-5)
+    best = posterior.modes(1)[0]
+    assert distance.mean(best.T, own).min() <= radius
+
+
+def test_poses_that_do_not_touch_carry_no_prior(ball, a_touch):
+    T, mask = a_touch(ball)
+    away = T + np.array([[0] * 4, [0] * 4, [0, 0, 0, 1.0], [0] * 4])
+    posterior = ball.localize(mask, prior=(np.stack([T, away]), [0.0, 50.0]), effort="fast")
+    assert len(posterior.cells) == 1 and np.isfinite(posterior.log_density(T))
+    with pytest.raises(InputError, match="none of its poses touches the sensor"):
+        ball.localize(mask, prior=(away[None], [0.0]))
+
+
+def test_a_prior_in_the_world_frame_says_the_same(plug, a_touch):
+    T_true, mask = a_touch(plug)
+    here = plug.localize(mask, prior=lambda T: -1e4 * ((T - T_true)[:, :3, 3] ** 2).sum(1), effort="fast")
+    there = plug.localize(
+        mask,
+        T_world_sensor=T_WORLD,
+        prior=lambda T: -1e4 * ((np.linalg.inv(T_WORLD) @ T - T_true)[:, :3, 3] ** 2).sum(1),
+        effort="fast",
+    )
+    assert there.log_prob == pytest.approx(here.log_prob, abs=1e-3)
+    pair = (np.stack([T_WORLD @ T_true]), [0.0])
+    only = plug.localize(mask, T_world_sensor=T_WORLD, prior=pair, effort="fast")
+    assert np.isfinite(only.log_density(T_WORLD @ T_true)) and len(only.cells) == 1
+
+
+def test_a_posterior_of_another_touch_in_the_world_is_a_prior(make_localizer):
+    """Two sensors' poses, one ball: the first touch tells the second where the ball is."""
+    ball = make_localizer("ball", "gelsight-mini", max_poses=4000, touches=(40, 20))
+    ball_in_world = transform(np.eye(3), [0.2, 0.1, 0.3])
+    first = ball_in_world @ np.linalg.inv(transform(np.eye(3), [2 * MM, 1 * MM, 5 * MM]))
+    second = ball_in_world @ np.linalg.inv(transform(np.eye(3), [-3 * MM, 2 * MM, 5.3 * MM]))
+    mask_1, mask_2 = (pressed(ball, np.linalg.inv(T) @ ball_in_world) for T in (first, second))
+    prior = ball.localize(mask_1, T_world_sensor=first, effort="fast")
+    alone = ball.localize(mask_2, T_world_sensor=second, effort="fast")
+    both = ball.localize(mask_2, T_world_sensor=second, prior=prior, effort="fast")
+    assert both.frame == "world"
+    assert both.log_density(ball_in_world) > alone.log_density(ball_in_world)
+    assert both.entropy_nats < alone.entropy_nats - 0.2
+
+
+@pytest.mark.parametrize(
+    ("prior", "error", "message"),
+    [
+        (3, UsageError, "expected a Posterior, the path of a saved one, a pair"),
+        ((np.eye(4)[None], [0.0, 0.0]), InputError, r"expected one log weight a pose, \(1,\)"),
+        ((np.eye(4)[None], [np.nan]), InputError, "expected one log weight a pose"),
+        ((np.eye(3)[None], [0.0]), PoseError, "expected rigid transforms"),
+        ((np.eye(4)[None], [np.inf]), InputError, "expected one log weight a pose"),
+        (lambda T: np.full(len(T), np.nan), InputError, "NaN or infinite at some poses"),
+        (lambda T: 0.0, InputError, r"returned shape \(\); return one log density a pose"),
+        (lambda T: np.full(len(T), -np.inf), InputError, "rules out every pose"),
+    ],
+    ids=["number", "two weights", "NaN weight", "3x3", "infinite weight", "NaN density", "no array", "nothing"],
+)
+def test_a_prior_that_makes_no_sense_is_refused(ball, a_touch, prior, error, message):
+    with pytest.raises(error, match=message) as caught:
+        ball.localize(a_touch(ball)[1], prior=prior)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_prior_of_another_object_or_frame_is_refused(ball, flat_nut, a_touch):
+    mask = a_touch(ball)[1]
+    other = flat_nut.localize(a_touch(flat_nut)[1], effort="fast")
+    with pytest.raises(InputError, match="it is for the object 'hex_nut', not for 'ball'"):
+        ball.localize(mask, prior=other)
+    world = ball.localize(mask, T_world_sensor=T_WORLD, effort="fast")
+    with pytest.raises(InputError, match="its frame is 'world' but this posterior's is 'sensor'"):
+        ball.localize(mask, prior=world)
+    nothing = ball.localize(np.zeros_like(mask))
+    with pytest.raises(InputError, match="does not touch the sensor"):
+        ball.localize(mask, prior=nothing)
+
+
+# --- approach
+
+
+def test_off_the_approach_the_density_is_minus_infinity(cone, flat_nut, uniform_poses, a_touch):
+    for localizer in (cone, flat_nut):
+        posterior = localizer.localize(a_touch(localizer)[1], effort="fast")
+        T, depth = uniform_poses(localizer)
+        T, depth = T[:40], depth[:40]
+        tilted = T @ exp([0.9, 0.4, 0, 0, 0, 0])
+        free = localizer.space.__class__(localizer.mesh, localizer.sensor)
+        tilted, ok = free.settle(tilted, depth)
+        ok[ok] = np.isfinite(free.penetration(tilted[ok]))
+        off = ok & ~localizer.space._allowed(tilted)
+        assert off.sum() >= 3
+        assert (posterior.log_density(tilted[off]) == -np.inf).all()
+        assert np.isfinite(posterior.log_density(T)).all()
+    on_face = approach_of(T[:, :3, :3]) @ [0, 0, 1]
+    assert np.abs(on_face - 1).max() < 1e-12
+
+
+def test_an_exact_face_holds_to_a_millionth_of_a_radian(flat_nut, uniform_poses, a_touch):
+    posterior = flat_nut.localize(a_touch(flat_nut)[1], effort="fast")
+    T, depth = uniform_poses(flat_nut)
+    middle = (depth > 0.2 * MM) & (depth < 1.8 * MM)
+    for tilt, inside in ((5e-7, True), (5e-6, False)):
+        finite = np.isfinite(posterior.log_density(T[middle][:20] @ exp([tilt, 0, 0, 0, 0, 0])))
+        assert (finite == inside).all()
+
+
+# --- the same part
+
+
+def test_millimetre_stl_and_metre_glb_give_one_posterior(make_localizer, tmp_path):
+    """Neither the file's format nor its unit matters, as far as its numbers are the same."""
+    part = trimesh.creation.box((12, 8, 6)).subdivide()
+    part.vertices = np.round(part.vertices * 64) / 64  # exact in single precision, in millimetres
+    part.export(tmp_path / "part.stl")
+    metres = part.copy()
+    metres.vertices = metres.vertices / 1000
+    metres.export(tmp_path / "part.glb")
+    sensor = Sensor("small", (64, 48), (0.3 * MM, 0.3 * MM), 0.0, 2 * MM)
+    options = {"max_poses": 4000, "touches": (40, 20)}
+    a = make_localizer(tmp_path / "part.stl", sensor, unit="mm", **options)
+    b = make_localizer(tmp_path / "part.glb", sensor, **options)
+    assert a.mesh.symmetry.kind == b.mesh.symmetry.kind == "discrete"
+    T = transform(exp([0.4, 0.3, 0.2, 0, 0, 0])[:3, :3], [1 * MM, 2 * MM, 5 * MM])
+    T = a.space.settle(T, 0.8 * MM)[0][0]
+    mask = a.simulate(T).mask
+    assert mask.any() and (b.simulate(T).mask == mask).mean() > 0.999
+    pa, pb = a.localize(mask), b.localize(mask)
+    assert pb.log_density(T) == pytest.approx(pa.log_density(T), abs=0.02)
+    assert pb.entropy_nats == pytest.approx(pa.entropy_nats, abs=0.02)
+    first, other = pa.modes(1)[0], pb.modes(1)[0]
+    assert other.probability == pytest.approx(first.probability, abs=0.01)
+    assert PoseDistance(a.mesh).mean(first.T, other.T[None])[0] < 0.05 * MM
+
+
+def test_the_order_of_vertices_and_faces_does_not_matter(make_localizer, rng):
+    from dataclasses import replace
+
+    mesh = load_mesh("hex_nut")
+    order = rng.permutation(len(mesh.vertices))
+    where = np.argsort(order)
+    shuffled = replace(mesh, vertices=mesh.vertices[order], faces=where[mesh.faces][rng.permutation(len(mesh.faces))])
+    sensor = Sensor("small", (64, 48), (0.3 * MM, 0.3 * MM), 0.0, 2 * MM)
+    a, b = (make_localizer(m, sensor, max_poses=4000, touches=(40, 20)) for m in (mesh, shuffled))
+    assert a.index.key != b.index.key
+    T = a.space.sample(3, np.random.default_rng(0), (0.5 * MM, 1 * MM))[0]
+    for pose in T:
+        pa, pb = (localizer.localize(a.simulate(pose).mask, effort="fast") for localizer in (a, b))
+        assert pb.log_density(pose) == pytest.approx(pa.log_density(pose), abs=0.05)
+
+
+# --- is it true?
+
+
+def test_probabilities_come_true(plug):
+    """Over fresh touches the truth gains information, and the credible regions hold it as often as they say."""
+    touches = random_touches(plug, 100, seed=77)
+    gain, level = [], []
+    for touch in touches:
+        posterior = plug.localize(touch.mask, effort="fast")
+        gain.append(posterior.log_density(touch.T_sensor_object))
+        level.append(posterior.credible_level(touch.T_sensor_object))
+    assert np.isfinite(gain).all() and np.mean(gain) > 0
+    for nominal in (0.5, 0.9):
+        low, high = binom.ppf([0.0005, 0.9995], 100, nominal) / 100
+        share = np.mean(np.array(level) <= nominal)
+        assert low - 0.1 <= share <= high + 0.1, (nominal, share)
+
+
+def test_one_image_at_a_time(plug, a_touch):
+    mask = a_touch(plug)[1]
+    with pytest.raises(UsageError, match="expected one image, got 2"):
+        plug.localize([mask, mask])
+    with pytest.raises(UsageError, match="expected one pose for one image"):
+        plug.localize(mask, T_world_sensor=np.stack([T_WORLD, T_WORLD]))
+    with pytest.raises(PoseError, match="T_world_sensor"):
+        plug.localize(mask, T_world_sensor=np.full((4, 4), np.nan))
+
+
+def test_prepare_reads_what_it_wrote(ball, cache_dir, monkeypatch):
+    monkeypatch.setattr("geomtact.scoring.fitted.simulate_touches", lambda *_, **__: pytest.fail("fitted again"))
+    monkeypatch.setattr("geomtact.contact_space.store.build", lambda *_, **__: pytest.fail("built again"))
+    again = Localizer.prepare("ball", sensor="gelsight-mini", max_poses=20_000, cache_dir=cache_dir)
+    assert again.index.key == ball.index.key and again.scorer.calibration == ball.scorer.calibration
+    assert isinstance(again.localize(np.zeros((240, 320), bool)), Posterior)

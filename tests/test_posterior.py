@@ -1,0 +1,380 @@
+"""Laws of the posterior: a normalised density over the contact pose space, the same in every frame and on disk."""
+
+import json
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
+
+from geomtact.contact_space.draw import draw_within
+from geomtact.errors import InputError, PoseError, UsageError
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.inference.posterior import Posterior
+from geomtact.se3 import exp, transform
+
+T_WORLD = exp([0.3, -1.2, 0.5, 0.4, -0.1, 0.7])
+MM = 1e-3
+
+
+@pytest.fixture(scope="module")
+def posteriors(a_touch):
+    """The posterior of one touch of a localizer, without refinement."""
+    found: dict[str, Posterior] = {}
+
+    def of(localizer) -> Posterior:
+        key = localizer.index.key
+        if key not in found:
+            found[key] = localizer.localize(a_touch(localizer)[1], effort="fast")
+        return found[key]
+
+    return of
+
+
+@pytest.fixture(scope="module")
+def samples(posteriors):
+    """Draws (300, 4, 4) from that posterior."""
+    drawn = {}
+
+    def of(localizer):
+        key = localizer.index.key
+        if key not in drawn:
+            drawn[key] = posteriors(localizer).sample(300, np.random.default_rng(3))
+        return drawn[key]
+
+    return of
+
+
+def test_probabilities_are_a_distribution(localizer, posteriors):
+    posterior = posteriors(localizer)
+    assert np.exp(posterior.log_prob).sum() == pytest.approx(1, abs=1e-5)
+    assert posterior.poses.shape == (len(posterior.log_prob), 4, 4)
+    assert posterior.contact and posterior.frame == "sensor"
+    assert (np.diff(posterior.cells) > 0).all()
+    p = np.exp(posterior.log_prob)
+    assert posterior.effective_poses == pytest.approx(np.exp(-(p * np.log(p)).sum()), rel=1e-4)
+    assert 1 <= posterior.effective_poses <= len(p)
+
+
+def test_entropy_is_minus_the_mean_log_density(localizer, posteriors, samples):
+    """By its definition as a sum over cells, and over poses drawn from the posterior."""
+    posterior = posteriors(localizer)
+    w = np.asarray(localizer.index.weight, float).ravel()[posterior.cells]
+    p = np.exp(posterior.log_prob)
+    assert posterior.entropy_nats == pytest.approx(-(p * (posterior.log_prob - np.log(w))).sum(), abs=1e-5)
+    assert posterior.entropy_nats < 0
+    density = posterior.log_density(samples(localizer))
+    inside = np.isfinite(density)
+    assert inside.mean() > 0.97, "all but the cells that no draw could be found in"
+    error = density[inside].std() / np.sqrt(inside.sum())
+    assert -density[inside].mean() == pytest.approx(posterior.entropy_nats, abs=4 * error + 0.05)
+
+
+def test_the_density_integrates_to_one(localizer, posteriors, uniform_poses):
+    """Its mean over poses drawn uniformly, without the index, is 1 within its standard error and the grid's coarseness."""
+    posterior = posteriors(localizer)
+    # flattened, so that two hundred poses can tell: a mixture with the uniform of the posterior's square root
+    p = np.exp(0.25 * posterior.log_prob + 0.75 * np.log(np.asarray(localizer.index.weight).ravel()[posterior.cells]))
+    flat = replace(posterior, log_prob=np.log(p / p.sum()))
+    density = np.exp(flat.log_density(uniform_poses(localizer)[0]))
+    error = density.std() / np.sqrt(len(density))
+    assert density.mean() == pytest.approx(1, abs=4 * error + 0.06)
+
+
+def test_the_uniform_scores_0_everywhere(localizer, posteriors, uniform_poses):
+    index = localizer.index
+    w = np.asarray(index.weight, float).ravel()
+    cells = np.flatnonzero(w)
+    uniform = replace(posteriors(localizer), cells=cells, log_prob=np.log(w[cells] / w.sum()))
+    assert np.abs(uniform.log_density(uniform_poses(localizer)[0])).max() < 1e-5
+    assert uniform.entropy_nats == pytest.approx(0, abs=1e-5)
+
+
+def test_log_density_is_finite_exactly_on_the_contact_pose_space(localizer, posteriors, uniform_poses, rng):
+    posterior = posteriors(localizer)
+    T, _ = uniform_poses(localizer)
+    assert np.isfinite(posterior.log_density(T)).all()
+    moved = T.copy()  # by so much that some of them no longer touch, or press too deep
+    moved[:, 2, 3] += rng.uniform(-2 * MM, 2 * MM, len(T))
+    pressed = localizer.space.caster.penetration(localizer.sensor, moved)
+    touching = (pressed >= 0) & (pressed <= localizer.sensor.max_penetration)
+    if localizer.sensor.housing_depth is not None:
+        lowest = localizer.space.caster.lowest_outside(localizer.sensor, moved)
+        touching &= lowest >= -localizer.sensor.housing_depth
+    assert 0.05 < touching.mean() < 0.95
+    clear = np.minimum(np.abs(pressed), np.abs(pressed - localizer.sensor.max_penetration)) > 1e-6
+    assert (np.isfinite(posterior.log_density(moved)) == touching)[clear].all()
+    away = T.copy()
+    away[:, 2, 3] += 1
+    assert (posterior.log_density(away) == -np.inf).all()
+    assert isinstance(posterior.log_density(T[0]), float)
+    assert posterior.log_density(T[:6].reshape(2, 3, 4, 4)).shape == (2, 3)
+    assert (posterior.log_density(T[:6].reshape(2, 3, 4, 4)).ravel() == posterior.log_density(T[:6])).all()
+
+
+def test_density_and_level_do_not_change_under_the_objects_symmetry(localizer, posteriors, samples, rng):
+    posterior, symmetry = posteriors(localizer), localizer.mesh.symmetry
+    T = samples(localizer)[:100]
+    S = symmetry.sampled(36)[rng.integers(len(symmetry.sampled(36)), size=100)]
+    image = T @ S
+    allowed = localizer.space._allowed(image)
+    # a continuous symmetry is one of the ideal body, of which the mesh is a polyhedron: a pose may change its depth
+    here, there = posterior.log_density(T)[allowed], posterior.log_density(image)[allowed]
+    assert len(here) > 5
+    assert (np.abs(here - there) < 1e-9).mean() > 0.95
+    assert (posterior.log_density(image)[~allowed] == -np.inf).all()
+
+
+def test_the_density_of_a_cell_is_its_mass_over_its_measure(localizer, posteriors, rng):
+    posterior, index = posteriors(localizer), localizer.index
+    rows = rng.choice(len(posterior.cells), 40)
+    rows[:10] = np.argsort(-posterior.log_prob)[:10]
+    T, _, found = draw_within(index, localizer.space, posterior.cells[rows], rng)
+    w = np.asarray(index.weight, float).ravel()[posterior.cells[rows]]
+    expected = posterior.log_prob[rows] - np.log(w)
+    agree = np.abs(posterior.log_density(T[found]) - expected[found]) < 1e-5
+    assert agree.mean() > 0.95
+    ids = np.setdiff1d(np.arange(len(index)), posterior.cells)[:5]
+    assert (posterior.cell_log_density(ids) == -np.inf).all()
+
+
+# --- credible levels
+
+
+def test_levels_of_draws_are_uniform(localizer, posteriors, samples):
+    posterior = posteriors(localizer)
+    T = samples(localizer)
+    level = posterior.credible_level(T)
+    assert ((level >= 0) & (level <= 1)).all()
+    inside = np.isfinite(posterior.log_density(T))
+    assert kstest(level[inside], "uniform").pvalue > 1e-3
+
+
+def test_levels_are_repeatable_and_depend_on_the_seed(plug, posteriors, samples):
+    posterior, T = posteriors(plug), samples(plug)[:20]
+    level = posterior.credible_level(T)
+    assert (level == posterior.credible_level(T)).all()
+    assert (level == replace(posterior).credible_level(T)).all()
+    assert (level == [posterior.credible_level(pose) for pose in T]).all()
+    assert (level != replace(posterior, seed=1).credible_level(T)).all()
+
+
+def test_the_level_is_the_mass_of_what_is_denser(localizer, posteriors, samples):
+    posterior = posteriors(localizer)
+    w = np.asarray(localizer.index.weight, float).ravel()[posterior.cells]
+    p = np.exp(posterior.log_prob)
+    T = samples(localizer)[:40]
+    for rho, level in zip(posterior.log_density(T), posterior.credible_level(T), strict=True):
+        if np.isfinite(rho):
+            density = np.log(p / w)
+            assert p[density > rho + 1e-6].sum() - 1e-5 <= level <= p[density > rho - 1e-6].sum() + 1e-5
+
+
+def test_off_the_space_the_level_is_1(plug, posteriors):
+    assert posteriors(plug).credible_level(transform(np.eye(3), [0, 0, 1])) == 1
+
+
+# --- modes
+
+
+def modes_by_brute_force(posterior, modes):
+    """The mass within reach of each mode, each pose counted for the most probable mode only."""
+    distance, radius = PoseDistance(posterior.mesh, 128), mode_radius(posterior.mesh)
+    left, out = np.exp(posterior.log_prob), []
+    poses = posterior.poses
+    for mode in modes:
+        near = distance.mean(mode.T, poses) <= radius
+        out.append(left[near].sum())
+        left[near] = 0
+    return out
+
+
+@pytest.mark.parametrize("effort", ["fast", "balanced"])
+def test_a_mode_holds_the_mass_within_its_radius(localizer, a_touch, effort):
+    posterior = localizer.localize(a_touch(localizer)[1], effort=effort)
+    modes = posterior.modes(5)
+    assert modes and all(m.probability > 0 for m in modes)
+    probability = [m.probability for m in modes]
+    assert probability == sorted(probability, reverse=True) and sum(probability) <= 1 + 1e-6
+    assert probability == pytest.approx(modes_by_brute_force(posterior, modes), abs=1e-6)
+    distance, radius = PoseDistance(posterior.mesh, 128), mode_radius(posterior.mesh)
+    for i, mode in enumerate(modes):
+        assert mode.covariance.shape == (6, 6) and mode.observable.shape[1:] == (6,)
+        assert np.abs(mode.covariance - mode.covariance.T).max() < 1e-9
+        assert np.linalg.eigvalsh(mode.covariance).min() > -1e-12
+        rows = mode.observable
+        assert np.abs(rows @ rows.T - np.eye(len(rows))).max(initial=0) < 1e-6
+        if effort == "fast":
+            others = np.stack([m.T for m in modes[:i]]) if i else np.zeros((0, 4, 4))
+            assert (distance.mean(mode.T, others) > radius).all()
+    assert len(posterior.modes(2)) <= 2 and posterior.modes(0) == []
+    assert [m.probability for m in posterior.modes(2)] == probability[:2]
+
+
+def test_modes_of_a_ball_are_positions(ball, posteriors, a_touch):
+    """All rotations of a ball are one pose."""
+    posterior = posteriors(ball)
+    T, _ = a_touch(ball)
+    modes = posterior.modes(5)
+    centres = np.array([m.T[:3, 3] for m in modes])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1) + np.eye(len(modes))
+    assert apart.min() > mode_radius(ball.mesh)
+    turned = T @ transform(Rotation.random(random_state=0).as_matrix(), np.zeros(3))
+    assert posterior.log_density(T) == pytest.approx(posterior.log_density(turned), abs=1e-9)
+    assert modes[0].probability > 0.3
+    assert np.linalg.norm(modes[0].T[:2, 3] - T[:2, 3]) < 0.4 * MM
+
+
+def test_modes_are_allowed_poses(localizer, posteriors):
+    posterior = posteriors(localizer)
+    T = np.stack([m.T for m in posterior.modes(5)])
+    assert localizer.space._allowed(T).all()
+    assert np.isfinite(localizer.space.caster.penetration(localizer.sensor, T)).all()
+
+
+# --- samples
+
+
+def test_samples_follow_the_probabilities_of_the_cells(localizer, posteriors, samples):
+    """Also those of cells on the border of the space: grouped by share, draws come as often as the masses say."""
+    posterior, index = posteriors(localizer), localizer.index
+    T = samples(localizer)
+    depth = localizer.space.penetration(T)
+    inside = np.isfinite(depth)
+    cell = index.lookup(T[inside], depth[inside])
+    p = np.exp(posterior.log_prob)
+    order = np.argsort(-p)
+    groups = defaultdict(float)
+    group_of = np.zeros(len(index), int)
+    group_of[posterior.cells[order]] = np.minimum((np.cumsum(p[order]) * 5).astype(int), 4)
+    for g, mass in zip(group_of[posterior.cells], p, strict=True):
+        groups[g] += mass
+    n = inside.sum()
+    for g, mass in groups.items():
+        got = (group_of[cell] == g).sum()
+        assert abs(got - n * mass) < 5 * np.sqrt(n * mass) + 0.03 * n
+
+
+def test_samples_are_spread_over_the_objects_symmetry(ball, flat_nut, samples):
+    R = samples(ball)[:, :3, :3]
+    assert np.linalg.norm(R.mean(0)) < 0.3, "a ball has every rotation"
+    turn = np.arctan2(*np.moveaxis(samples(flat_nut)[:, [1, 0], 0], -1, 0))
+    sixths = np.bincount(((turn % (2 * np.pi)) // (np.pi / 3)).astype(int), minlength=6)
+    assert sixths.min() > 300 / 6 / 2, "a nut has six turns"
+
+
+def test_samples_are_the_same_for_the_same_seed(plug, posteriors):
+    one, other = (posteriors(plug).sample(10, np.random.default_rng(4)) for _ in range(2))
+    assert one.shape == (10, 4, 4) and (one == other).all()
+
+
+# --- frames
+
+
+def test_the_world_frame_moves_everything_and_changes_nothing(plug, a_touch, samples):
+    T, mask = a_touch(plug)
+    here = plug.localize(mask)
+    there = plug.localize(mask, T_world_sensor=T_WORLD)
+    in_list = plug.localize([mask], T_world_sensor=[T_WORLD])
+    assert (here.frame, there.frame, in_list.frame) == ("sensor", "world", "world")
+    draws = np.concatenate([T[None], samples(plug)[:30]])
+    assert np.array_equal(there.log_density(T_WORLD @ draws), here.log_density(draws))
+    assert np.array_equal(in_list.log_density(T_WORLD @ draws), here.log_density(draws))
+    assert np.abs(there.poses - T_WORLD @ here.poses).max() < 1e-12
+    assert there.entropy_nats == here.entropy_nats and (there.log_prob == here.log_prob).all()
+    for a, b in zip(here.modes(), there.modes(), strict=True):
+        assert np.abs(b.T - T_WORLD @ a.T).max() < 1e-12
+        assert b.probability == a.probability
+        # the twist is in the object's frame
+        assert b.covariance == pytest.approx(a.covariance, rel=1e-9, abs=1e-15)
+    sample = there.sample(5, np.random.default_rng(0))
+    assert np.abs(sample - T_WORLD @ here.sample(5, np.random.default_rng(0))).max() < 1e-12
+
+
+def test_what_is_no_pose_is_refused(plug, posteriors):
+    for bad in (np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 1, 1, 1])):
+        for method in (posteriors(plug).log_density, posteriors(plug).credible_level):
+            with pytest.raises(PoseError):
+                method(bad)
+
+
+# --- no contact
+
+
+def test_an_image_without_contact_says_so(plug, uniform_poses, rng):
+    posterior = plug.localize(np.zeros(plug.sensor.image_size_px[::-1], bool))
+    T, _ = uniform_poses(plug)
+    assert posterior.contact is False
+    assert posterior.modes() == [] and posterior.poses.shape == (0, 4, 4) and posterior.log_prob.shape == (0,)
+    assert (posterior.log_density(T) == -np.inf).all()
+    away = T.copy()
+    away[:, 2, 3] += 1
+    assert (posterior.log_density(away) == 0).all()
+    assert posterior.entropy_nats == 0
+    assert posterior.effective_poses == 0
+    assert posterior.credible_level(T[0]) == 1
+    with pytest.raises(UsageError, match="no contact"):
+        posterior.sample(3, rng)
+
+
+# --- on disk
+
+
+@pytest.mark.parametrize("name", ["plug", "ball", "flat_nut", "cone"])
+def test_a_posterior_survives_the_disk(name, request, a_touch, samples, cache_dir, tmp_path):
+    localizer = request.getfixturevalue(name)
+    T, mask = a_touch(localizer)
+    posterior = localizer.localize(mask, T_world_sensor=T_WORLD, seed=11)
+    posterior.save(tmp_path / "posterior.npz")
+    again = Posterior.load(tmp_path / "posterior.npz", cache_dir)
+    assert again.frame == "world" and again.seed == 11 and again.contact
+    assert again.index.key == posterior.index.key
+    assert again.mesh.sha256 == posterior.mesh.sha256 and again.sensor == posterior.sensor
+    draws = T_WORLD @ np.concatenate([T[None], samples(localizer)[:50]])
+    assert again.log_density(draws) == pytest.approx(posterior.log_density(draws), abs=1e-5)
+    assert again.entropy_nats == pytest.approx(posterior.entropy_nats, abs=1e-4)
+    assert again.log_evidence == posterior.log_evidence
+    assert again.settings == json.loads(json.dumps(posterior.settings))
+    assert again.credible_level(draws) == pytest.approx(posterior.credible_level(draws), abs=5e-3)  # ties, in float32
+    for a, b in zip(posterior.modes(), again.modes(), strict=True):
+        assert np.abs(a.T - b.T).max() < 1e-9 and b.probability == pytest.approx(a.probability, abs=1e-5)
+        assert np.array_equal(a.covariance, b.covariance) and np.array_equal(a.observable, b.observable)
+    assert [p.name for p in tmp_path.iterdir()] == ["posterior.npz"]
+
+
+def test_the_file_holds_what_is_promised_and_no_pickles(plug, posteriors, tmp_path):
+    posterior = posteriors(plug)
+    posterior.save(tmp_path / "p.npz")
+    with np.load(tmp_path / "p.npz", allow_pickle=False) as file:
+        data = {k: file[k] for k in file.files}
+    assert {"poses", "log_prob", "frame", "object_sha256", "sensor_toml", "seed"} <= set(data)
+    assert data["poses"].shape == (len(data["log_prob"]), 4, 4)
+    assert np.exp(data["log_prob"]).sum() == pytest.approx(1, abs=1e-5)
+    assert str(data["frame"]) == "sensor" and str(data["object_sha256"]) == plug.mesh.sha256
+
+
+def test_no_contact_survives_the_disk(plug, tmp_path, cache_dir):
+    plug.localize(np.zeros(plug.sensor.image_size_px[::-1], bool)).save(tmp_path / "p.npz")
+    again = Posterior.load(tmp_path / "p.npz", cache_dir)
+    assert again.contact is False and again.modes() == [] and again.poses.shape == (0, 4, 4)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 truncated"])
+def test_what_is_no_posterior_is_refused(tmp_path, content):
+    path = tmp_path / "p.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="not a posterior that geomtact saved") as error:
+        Posterior.load(path)
+    assert "\n" not in str(error.value)
+    with pytest.raises(InputError):
+        Posterior.load(tmp_path / "nowhere.npz")
+
+
+def test_a_truncated_posterior_is_refused(plug, posteriors, tmp_path):
+    posteriors(plug).save(tmp_path / "p.npz")
+    whole = (tmp_path / "p.npz").read_bytes()
+    (tmp_path / "p.npz").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="not a posterior that geomtact saved"):
+        Posterior.load(tmp_path / "p.npz")

@@ -1,0 +1,320 @@
+"""Laws of the scores: brute force agrees, a contact is most like itself, and a score is trusted as far as it tells."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_t
+
+from geomtact.contact_space.index import pack
+from geomtact.errors import UsageError
+from geomtact.scoring.calibration import (
+    FLOORS,
+    TEMPERATURES,
+    Calibration,
+    calibrate,
+    log_weights,
+    posterior_log_prob,
+    simulate_touches,
+)
+from geomtact.scoring.fitted import SCORERS, FittedScorer, fitted_scorer
+from geomtact.scoring.moments import Moments
+from geomtact.scoring.overlap import OVERLAPS, IoU, PixelL1, overlaps, to_grid
+from geomtact.sensing.moments import moments, without_specks
+from geomtact.sensing.sensor import Sensor
+
+SENSOR = Sensor("plain", (320, 240), (6e-5, 6e-5), 0.0, 2e-3)
+SHAPE = (48, 64)
+
+
+def random_masks(n, rng, shape=SHAPE):
+    """Blobs of many sizes, nothing and everything among them."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    centre = rng.uniform(0, shape, (n, 2))
+    radius = rng.uniform(0, 25, n)
+    masks = (y - centre[:, 0, None, None]) ** 2 + (x - centre[:, 1, None, None]) ** 2 < radius[:, None, None] ** 2
+    masks[:1], masks[1:2] = False, True
+    return masks
+
+
+def packed(masks, levels=2):
+    """Bits (levels, words, n), as an index holds them."""
+    n = len(masks) // levels
+    return pack(masks[: n * levels].reshape(levels, n, -1)).swapaxes(1, 2).copy()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_overlaps_are_what_counting_pixels_gives(rng, threads):
+    masks, seen = random_masks(40, rng), random_masks(5, rng)[4]
+    expected = (masks & seen).sum((1, 2)).reshape(2, 20)
+    assert (overlaps(packed(masks), seen, threads) == expected).all()
+
+
+def test_overlaps_of_many_poses_are_each_their_own(rng):
+    """More poses than are compared in one step."""
+    masks = random_masks(64, rng)
+    many = np.tile(packed(masks, 1), (1, 1, 1100))
+    expected = np.tile((masks & masks[7]).sum((1, 2)), 1100)
+    assert (overlaps(many, masks[7])[0] == expected).all()
+
+
+def by_brute_force(scorer, stored, seen):
+    both, either = (stored & seen).sum((1, 2)), (stored | seen).sum((1, 2))
+    if isinstance(scorer, IoU):
+        return both / np.maximum(either, 1)
+    return 1 - (either - both) / seen.size
+
+
+@pytest.mark.parametrize("scorer", [IoU(), PixelL1()], ids=lambda s: s.name)
+def test_scores_are_what_counting_pixels_gives(scorer, localizer, rng):
+    index = localizer.index
+    ids = rng.choice(len(index), 300, replace=False)
+    stored = index.masks(ids)
+    for seen in index.masks(ids[:3]):
+        score = scorer.score(index, seen)
+        assert score.shape == index.height.shape and score.dtype == np.float32
+        assert score.ravel()[ids] == pytest.approx(by_brute_force(scorer, stored, seen), abs=1e-6)
+
+
+@pytest.mark.parametrize("scorer", [IoU(), PixelL1()], ids=lambda s: s.name)
+def test_a_stored_contact_is_most_like_itself(scorer, localizer, rng):
+    index = localizer.index
+    for i in rng.choice(len(index), 10):
+        score = scorer.score(index, index.masks([i])[0]).ravel()
+        assert score[i] == 1 and score.max() == 1 and score.min() >= 0
+
+
+def test_an_image_is_brought_onto_the_grid_by_area(rng):
+    small = random_masks(8, rng)[5]
+    assert (to_grid(np.kron(small, np.ones((5, 5), bool)), SHAPE) == small).all()
+    assert to_grid(np.ones((240, 320), bool), SHAPE).all()
+    assert not to_grid(np.zeros((240, 320), bool), SHAPE).any()
+    y, x = np.mgrid[:240, :320]
+    disk = (x - 150) ** 2 + (y - 100) ** 2 < 60**2
+    assert to_grid(disk, SHAPE).mean() == pytest.approx(disk.mean(), rel=0.02)
+
+
+# --- moments
+
+
+def ellipse(x=0.0, y=0.0, a=4.0, b=2.0, angle=0.0, shape=(240, 320)):
+    """An ellipse of half axes a, b [mm], its long axis ``angle`` [rad] from +x, centred at x, y [mm]."""
+    X, Y = np.meshgrid(*(1e3 * c for c in SENSOR.pixel_centres(shape)))
+    X, Y = X - x, Y - y
+    u, v = X * np.cos(angle) + Y * np.sin(angle), -X * np.sin(angle) + Y * np.cos(angle)
+    return (u / a) ** 2 + (v / b) ** 2 < 1
+
+
+def of(*masks):
+    return moments(np.stack(masks), SENSOR).astype(float)
+
+
+def test_a_shift_moves_the_centroid_only():
+    here, there = of(ellipse(), ellipse(x=2.4, y=-1.2))
+    half_diagonal = 1e3 * np.hypot(*SENSOR.half_window)
+    assert there[:2] - here[:2] == pytest.approx([2.4 / half_diagonal, -1.2 / half_diagonal], abs=1e-4)
+    assert there[2:] == pytest.approx(here[2:], abs=2e-3)
+
+
+def test_a_quarter_turn_reverses_the_stretch():
+    for angle in (0.0, 0.3, 1.1):
+        here, there = of(ellipse(angle=angle), ellipse(angle=angle + np.pi / 2))
+        assert there[4:] == pytest.approx(-here[4:], abs=5e-3)
+        assert there[:4] == pytest.approx(here[:4], abs=5e-3)
+
+
+def test_stretch_points_along_the_long_axis_at_twice_its_angle():
+    """An ellipse of axes a : b is stretched by log(a/b); a half turn leaves it as it is."""
+    for angle in np.linspace(0, np.pi, 7):
+        got = of(ellipse(angle=angle))[0, 4:]
+        assert got == pytest.approx(np.log(2) * np.array([np.cos(2 * angle), np.sin(2 * angle)]), abs=0.01)
+
+
+def test_scaling_adds_to_the_log_area_and_the_log_size():
+    small, large = of(ellipse(a=2, b=1), ellipse(a=4, b=2))
+    assert large[2] - small[2] == pytest.approx(np.log(4), abs=0.01)
+    assert large[3] - small[3] == pytest.approx(np.log(2), abs=0.01)
+    assert large[4:] == pytest.approx(small[4:], abs=0.01)
+    assert np.exp(small[2]) == pytest.approx(np.pi * 2 * 1e-6 / np.hypot(*SENSOR.half_window) ** 2, rel=0.01)
+
+
+def test_moments_do_not_depend_on_the_grid():
+    assert of(ellipse(1, 1))[0] == pytest.approx(
+        moments(ellipse(1, 1, shape=SHAPE)[None], SENSOR)[0].astype(float), abs=0.02
+    )
+
+
+def test_moments_of_anything_are_finite():
+    one_pixel = np.zeros(SHAPE, bool)
+    one_pixel[3, 5] = True
+    line = np.zeros(SHAPE, bool)
+    line[3] = True
+    for mask in (np.zeros(SHAPE, bool), np.ones(SHAPE, bool), one_pixel, line):
+        assert np.isfinite(moments(mask[None], SENSOR)).all()
+
+
+def test_dust_is_dropped_beside_a_large_contact_and_kept_alone():
+    large, speck = ellipse(), ellipse(7, 5, 0.15, 0.15)
+    assert (without_specks(large | speck, SENSOR) == large).all()
+    assert (without_specks(speck, SENSOR) == speck).all()
+    two = ellipse(-4, 0, 2, 2) | ellipse(4, 0, 2, 2)
+    assert (without_specks(two, SENSOR) == two).all()
+    nothing = np.zeros((240, 320), bool)
+    assert (without_specks(nothing, SENSOR) == nothing).all()
+
+
+def some_moments(localizer, freedom=5.0):
+    bias = np.array([0.01, -0.02, 0.1, 0.03, 0.0, 0.05])
+    A = np.random.default_rng(4).normal(size=(6, 6)) * 0.2
+    return Moments(bias, A @ A.T + 0.05 * np.eye(6), freedom)
+
+
+@pytest.mark.parametrize("freedom", [3.0, 5.0, 30.0])
+def test_the_likelihood_is_student_t(ball, rng, freedom):
+    scorer, index = some_moments(ball, freedom), ball.index
+    mask = index.masks([len(index) // 3])[0]
+    seen = moments(without_specks(mask, index.sensor)[None], index.sensor)[0]
+    ids = rng.choice(len(index), 500)
+    expected = multivariate_t(scorer.bias, scorer.covariance, df=freedom).logpdf(seen - index.moments[:, ids].T)
+    assert scorer.score(index, mask).ravel()[ids] == pytest.approx(expected, rel=1e-4, abs=2e-3)
+
+
+def test_fitting_recovers_the_t_distribution_that_was_drawn_from(ball, monkeypatch):
+    """Against its stored moments each touch is off by a draw from a known t distribution."""
+    rng = np.random.default_rng(3)
+    truth = some_moments(ball)
+    n = 6000
+    off = multivariate_t(truth.bias, truth.covariance, df=5, seed=rng).rvs(n)
+    stored = rng.normal(size=(6, n))
+    index = SimpleNamespace(moments=stored)
+    seen = iter((stored + off.T).T)
+    monkeypatch.setattr("geomtact.scoring.moments._seen", lambda index, mask: next(seen))
+    fitted = Moments.fit(index, [None] * n, np.arange(n))
+    spread = np.sqrt(np.diag(truth.covariance))
+    assert np.abs((fitted.bias - truth.bias) / spread).max() < 0.08
+    assert fitted.covariance == pytest.approx(truth.covariance, abs=0.08 * np.outer(spread, spread).max())
+
+
+def test_the_scores_rank_the_true_pose_high(plug, pin, curved):
+    """On touches drawn with noise, the true cell is above nine in ten others, by area or by moments."""
+    for localizer in (plug, pin, curved):
+        index = localizer.index
+        touches = simulate_touches(index, 24, seed=8)
+        for name in ("moments", "iou"):  # the thesis's own, l1, fails, as the thesis says
+            scorer = localizer.scorer.scorer if name == "moments" else OVERLAPS[name]
+            w = np.asarray(index.weight).ravel()
+            above = []
+            for mask, true in zip(touches.masks, touches.ids, strict=True):
+                score = scorer.score(index, mask).ravel()
+                above.append(w[score > score[true]].sum())
+            assert np.median(above) < 0.15, (name, index.mesh.name)
+
+
+# --- what a score is worth
+
+
+class Useless:
+    name = "useless"
+
+    def score(self, index, mask):
+        return np.random.default_rng(int(mask.sum())).random(index.height.shape, np.float32)
+
+
+class Oracle:
+    """Knows the true cell: its id is written into the mask."""
+
+    name = "oracle"
+
+    def __init__(self, ids):
+        self.ids = iter(ids)
+
+    def score(self, index, mask):
+        out = np.zeros(index.height.size, np.float32)
+        out[next(self.ids)] = 1
+        return out.reshape(index.height.shape)
+
+
+def test_a_useless_score_is_not_trusted(ball):
+    index = ball.index
+    touches = simulate_touches(index, 40, seed=5)
+    useless, iou = (calibrate(s, index, touches) for s in (Useless(), IoU()))
+    assert useless.floor == FLOORS[-1] or useless.temperature == TEMPERATURES[-1]
+    assert abs(useless.gain) < 0.1
+    assert iou.gain > 1 and iou.floor < useless.floor
+    oracle = calibrate(Oracle(touches.ids), index, touches)
+    w = np.asarray(index.weight).ravel()[touches.ids]
+    assert oracle.floor == FLOORS[0]
+    assert oracle.gain == pytest.approx(-np.log(w).mean(), abs=0.01)
+
+
+def test_the_calibration_is_the_one_that_gains_most(ball):
+    """The gain of every temperature and floor, worked out from the posterior that localize would give."""
+    index = ball.index
+    touches = simulate_touches(index, 12, seed=6)
+    found = calibrate(IoU(), index, touches)
+    log_w = log_weights(index)
+    gain = {}
+    for t in (TEMPERATURES[0], found.temperature, TEMPERATURES[-1]):
+        for floor in (FLOORS[0], found.floor, FLOORS[-1]):
+            each = []
+            for mask, true in zip(touches.masks, touches.ids, strict=True):
+                trust = Calibration(t, floor, 0.0, 0.0)
+                log_prob, _ = posterior_log_prob(IoU().score(index, mask), log_w, trust)
+                each.append(log_prob[true] - log_w[true])
+            gain[t, floor] = np.mean(each)
+    assert max(gain.values()) == pytest.approx(gain[found.temperature, found.floor])
+    assert found.gain == pytest.approx(gain[found.temperature, found.floor], abs=0.01)
+
+
+def test_the_posterior_is_bayes_rule_with_a_share_of_the_prior(rng):
+    score = rng.normal(size=(2, 500)).astype(np.float32) * 5
+    log_prior = np.log(rng.random(1000)).astype(np.float32)
+    log_prior[:50] = -np.inf
+    for floor in (0.001, 0.01, 0.5):
+        log_prob, evidence = posterior_log_prob(score, log_prior, Calibration(3.0, floor, 0.0, 0.0))
+        prior = np.exp(log_prior.astype(float)) / np.exp(log_prior.astype(float)).sum()
+        joint = np.exp(score.ravel().astype(float) / 3) * prior
+        assert np.exp(log_prob) == pytest.approx((1 - floor) * joint / joint.sum() + floor * prior, rel=1e-4)
+        assert np.exp(log_prob).sum() == pytest.approx(1, abs=1e-5)
+        mean_score = np.exp(score.ravel().astype(float)) @ prior
+        assert evidence == pytest.approx(np.log(mean_score), abs=1e-4), "the temperature is not in it"
+        assert (log_prob[:50] == -np.inf).all()
+
+
+def test_simulated_touches_are_of_the_cells_they_say(plug):
+    touches = simulate_touches(plug.index, 20, seed=7)
+    again = simulate_touches(plug.index, 20, seed=7)
+    assert (touches.ids == again.ids).all()
+    assert all((a == b).all() for a, b in zip(touches.masks, again.masks, strict=True))
+    assert len(touches.masks) == 20 and all(m.any() for m in touches.masks)
+    w = np.asarray(plug.index.weight).ravel()
+    assert (w[touches.ids] > 0).all()
+
+
+def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
+    monkeypatch.setattr("geomtact.scoring.fitted._FIT", 40)
+    monkeypatch.setattr("geomtact.scoring.fitted._JUDGE", 20)
+    for name in SCORERS:
+        first = fitted_scorer(name, ball.index, tmp_path)
+        assert isinstance(first, FittedScorer) and first.scorer.name == name
+    assert {p.name for p in tmp_path.iterdir()} == {f"{name}.json" for name in SCORERS}
+    monkeypatch.setattr("geomtact.scoring.fitted.simulate_touches", lambda *_, **__: pytest.fail("fitted again"))
+    mask = ball.index.masks([5])[0]
+    again = fitted_scorer("moments", ball.index, tmp_path)
+    assert again.calibration == fitted_scorer("moments", ball.index, tmp_path).calibration
+    assert np.isfinite(again.score(ball.index, mask)).all()
+
+
+@pytest.mark.parametrize("damage", ["", "{}", "not json", json.dumps({"format": 999})])
+def test_a_damaged_fit_is_made_anew(ball, tmp_path, monkeypatch, damage):
+    monkeypatch.setattr("geomtact.scoring.fitted._FIT", 30)
+    monkeypatch.setattr("geomtact.scoring.fitted._JUDGE", 20)
+    (tmp_path / "iou.json").write_text(damage)
+    assert fitted_scorer("iou", ball.index, tmp_path).scorer.name == "iou"
+    assert json.loads((tmp_path / "iou.json").read_text())["name"] == "iou"
+
+
+def test_an_unknown_score_names_the_nearest(ball):
+    with pytest.raises(UsageError, match="no score named 'moment'; did you mean 'moments'"):
+        fitted_scorer("moment", ball.index)
