@@ -317,9 +317,14 @@ def _check_scale(mesh: Mesh, sensor: _SensorLike) -> None:
     largest = 100 * 2 * float(np.hypot(*sensor.half_window))
     if not smallest <= mesh.diameter <= largest:
         raise MeshError(
-            f"{mesh.path or mesh.name}: {1e3 * mesh.diameter:.3g} mm across as read in {mesh.unit}, but sensor "
+            f"{mesh.path or mesh.name}: {_figure(1e3 * mesh.diameter)} mm across as read in {mesh.unit}, but sensor "
             f"{sensor.name} suits {1e3 * smallest:.2g} to {1e3 * largest:.0f} mm; the unit is likely wrong"
         )
+
+
+def _figure(x: float) -> str:
+    """``x`` with three digits, written without an exponent."""
+    return f"{x:,.0f}" if x >= 100 else f"{x:.3g}"
 
 
 def _largest_distance(points: Array) -> float:
