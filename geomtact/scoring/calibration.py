@@ -21,8 +21,9 @@ from geomtact.contact_space.touch import CALIBRATION_NOISE, draw_noise, felt_mas
 from geomtact.scoring.protocol import Scorer
 from geomtact.se3 import Array
 
-TEMPERATURES = np.geomspace(0.02, 5.0, 80)
+TEMPERATURES = np.geomspace(0.01, 30.0, 120)  # in units of the spread of the scores, whatever their scale
 _BINS = 1 << 14
+_SPREAD_TOUCHES = 10  # that the spread of the scores is taken from
 FLOORS = np.geomspace(1e-3, 0.5, 16)
 _SHAPE = {True: (72, 96), False: (96, 72)}  # of the simulated touches, for wide and for tall windows
 _LEAST_CONTACT = 1e-6  # m^2
@@ -84,20 +85,22 @@ def simulate_touches(index: Index, n: int, seed: int, progress: Callable[[float,
 def calibrate(scorer: Scorer, index: Index, touches: Touches) -> Calibration:
     """The temperature and floor under which the true poses of ``touches`` are most probable."""
     weight = np.asarray(index.weight).ravel()
-    ratio = np.zeros((len(TEMPERATURES), len(touches.ids)))
+    spread = float(np.median([scorer.score(index, mask).std() for mask in touches.masks[:_SPREAD_TOUCHES]]))
+    temperatures = TEMPERATURES * max(spread, 1e-9)
+    ratio = np.zeros((len(temperatures), len(touches.ids)))
     best_score = np.zeros(len(touches.ids))
     for i, (mask, true) in enumerate(zip(touches.masks, touches.ids, strict=True)):
         score = scorer.score(index, mask).ravel()
         best_score[i] = score.max()
         below, mass = _histogram(best_score[i] - score, weight)
         # the likelihood at the true pose over its mean, for all temperatures from one pass over the scores
-        evidence = np.log(np.exp(-below / TEMPERATURES[:, None]) @ mass)
-        ratio[:, i] = (score[true] - best_score[i]) / TEMPERATURES - evidence
+        evidence = np.log(np.exp(-below / temperatures[:, None]) @ mass)
+        ratio[:, i] = (score[true] - best_score[i]) / temperatures - evidence
     # the density at the truth is a mixture of the scored and the uniform one
     mixed = np.log((1 - FLOORS[:, None, None]) * np.exp(np.minimum(ratio, 500)) + FLOORS[:, None, None]).mean(2)
     best_floor, best = np.unravel_index(mixed.argmax(), mixed.shape)
     usual = float(np.quantile(best_score, 0.02))
-    return Calibration(float(TEMPERATURES[best]), float(FLOORS[best_floor]), float(mixed.max()), usual)
+    return Calibration(float(temperatures[best]), float(FLOORS[best_floor]), float(mixed.max()), usual)
 
 
 def _histogram(below: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[Array, Array]:

@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import tempfile
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -19,9 +18,11 @@ from geomtact.scoring.calibration import Calibration, Touches, calibrate, simula
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.overlap import OVERLAPS
 from geomtact.scoring.protocol import Scorer
+from geomtact.scoring.vectors import Descriptor, Progress, VectorScorer, describe_index
 
-FORMAT = 2
-SCORERS = (*OVERLAPS, "moments")
+FORMAT = 3
+DESCRIPTORS: dict[str, Descriptor] = {}
+SCORERS = (*OVERLAPS, *DESCRIPTORS, "moments")
 _FIT, _JUDGE = 300, 200  # touches the moments are learned from, and touches the temperature is chosen on
 
 
@@ -38,7 +39,7 @@ class FittedScorer:
 
 
 def fitted_scorer(
-    name: str, index: Index, folder: Path | None = None, progress: Callable[[float, str], None] | None = None
+    name: str, index: Index, folder: Path | None = None, progress: Progress | None = None
 ) -> FittedScorer:
     """The scorer ``name`` calibrated for ``index``; read from ``folder`` where it was fitted before.
 
@@ -54,7 +55,7 @@ def fitted_scorer(
     path = None if folder is None else folder / f"{name}.json"
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            return _from_json(json.loads(path.read_text("utf-8")))
+            return _from_json(json.loads(path.read_text("utf-8")), index, folder, progress)
     touches = simulate_touches(index, _FIT + _JUDGE, seed=20_200_531, progress=progress)
     if len(touches.ids) < 40:
         raise MeshError(
@@ -62,7 +63,10 @@ def fitted_scorer(
             "check the object's unit and the approach"
         )
     n = len(touches.ids) * _FIT // (_FIT + _JUDGE)
-    scorer: Scorer = Moments.fit(index, touches.masks[:n], touches.ids[:n]) if name == "moments" else OVERLAPS[name]
+    if name == "moments":
+        scorer: Scorer = Moments.fit(index, touches.masks[:n], touches.ids[:n])
+    else:
+        scorer = _unfitted(name, index, folder, progress)
     fitted = FittedScorer(scorer, calibrate(scorer, index, Touches(touches.masks[n:], touches.ids[n:])))
     if path is not None:
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
@@ -73,6 +77,15 @@ def fitted_scorer(
     return fitted
 
 
+def _unfitted(name: str, index: Index, folder: Path | None, progress: Progress | None) -> Scorer:
+    """A scorer that learns nothing from touches."""
+    if name in OVERLAPS:
+        return OVERLAPS[name]
+    descriptor = DESCRIPTORS[name]
+    path = None if folder is None else folder / f"{name}.npy"
+    return VectorScorer(descriptor, describe_index(index, descriptor, path, progress))
+
+
 def _to_json(fitted: FittedScorer) -> dict:
     out = {"format": FORMAT, "name": fitted.scorer.name, "calibration": asdict(fitted.calibration)}
     if isinstance(fitted.scorer, Moments):
@@ -81,11 +94,11 @@ def _to_json(fitted: FittedScorer) -> dict:
     return out
 
 
-def _from_json(data: dict) -> FittedScorer:
+def _from_json(data: dict, index: Index, folder: Path | None, progress: Progress | None) -> FittedScorer:
     if data["format"] != FORMAT:
         raise ValueError("another format")
     calibration = Calibration(**data["calibration"])
     if data["name"] != "moments":
-        return FittedScorer(OVERLAPS[data["name"]], calibration)
+        return FittedScorer(_unfitted(data["name"], index, folder, progress), calibration)
     m = data["moments"]
     return FittedScorer(Moments(np.array(m["bias"]), np.array(m["covariance"]), m["freedom"]), calibration)
