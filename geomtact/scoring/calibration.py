@@ -106,8 +106,10 @@ def calibrate(scorer: Scorer, index: Index, touches: Touches) -> Calibration:
 def _histogram(below: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[Array, Array]:
     """How far below the best the scores lie, in fine bins (b,), and the uniform measure of the poses in each (b,)."""
     width = max(float(below.max()), 1e-9) / (_BINS - 1)
-    mass = np.bincount((below / np.float32(width)).astype(np.int32), weight, minlength=_BINS)
-    return np.asarray((np.arange(len(mass)) + 0.5) * width, float), np.asarray(mass, float)
+    bin_of = (below / np.float32(width)).astype(np.int32)
+    mass = np.bincount(bin_of, weight, minlength=_BINS)
+    middle = np.bincount(bin_of, weight * below, minlength=_BINS) / np.maximum(mass, 1e-300)
+    return np.asarray(middle, float), np.asarray(mass, float)
 
 
 def log_weights(index: Index) -> NDArray[np.float32]:
