@@ -38,10 +38,13 @@ class CacheError(InputError):
     """The cache folder cannot be read or written."""
 
 
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``"; did you mean 'x'?"`` for the known name nearest to ``name``, ``""`` if none is near."""
+    close = difflib.get_close_matches(name, sorted(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
 def nearest_name(name: str, known: Iterable[str]) -> str:
-    """``"; did you mean 'x'?"`` for the known name nearest to ``name``, else the list of known names."""
+    """:func:`did_you_mean`, and the list of known names."""
     known = sorted(known)
-    close = difflib.get_close_matches(name, known, n=1)
-    if close:
-        return f"; did you mean {close[0]!r}? (known: {', '.join(known)})"
-    return f" (known: {', '.join(known)})"
+    return f"{did_you_mean(name, known)} (known: {', '.join(known)})"

@@ -50,7 +50,7 @@ def touched(tmp_path_factory):
 
 
 def test_help_and_lists(geomtact):
-    commands = {"localize", "prepare", "simulate", "sensors", "objects", "cache", "evaluate"}
+    commands = {"localize", "prepare", "train", "simulate", "sensors", "objects", "cache", "evaluate"}
     assert {c.name or c.callback.__name__ for c in app.registered_commands} == commands
     assert all(name in geomtact("--help").stdout for name in commands)
     assert geomtact("--version").stdout.startswith("geomtact ")
@@ -87,6 +87,44 @@ def test_bad_input_exits_3_with_one_line(geomtact, tmp_path):
     assert "'gelslim'" in geomtact("prepare", "pin", "--sensor", "gelslem", status=3).stderr
     (tmp_path / "geomtact.toml").write_text('objekt = "pin"')
     assert "'object'" in geomtact("prepare", status=3).stderr
+
+
+def test_wrong_names_and_paths_are_told_before_any_work(geomtact, touched, tmp_path):
+    image = touched / "ball_1.png"
+    (tmp_path / "part.stl").touch()
+    assert (
+        "--effort: no effort named 'fsat'; did you mean 'fast'?"
+        in geomtact("localize", image, "--effort", "fsat", status=2).stderr
+    )
+    assert "'mask'" in geomtact("localize", image, "--kind", "maks", status=2).stderr
+    assert "is a file; give a folder" in geomtact("localize", image, "--out", "part.stl", status=2).stderr
+    assert "is a file; give a folder" in geomtact("simulate", "ball", "--out", "part.stl", status=2).stderr
+    assert "no.npz: no such file" in geomtact("localize", image, "--prior", "no.npz", status=3).stderr
+    assert "no.toml: no such file" in geomtact("localize", image, "--sensor", "no.toml", status=3).stderr
+    (tmp_path / "geomtact.toml").write_text('effort = "quick"')
+    told = geomtact("localize", image, status=3).stderr
+    assert "geomtact.toml: no effort named 'quick'" in told
+    assert "(known: balanced, exact, fast)" in told
+
+
+def test_an_image_is_no_prior(tmp_path, touched):
+    from geomtact import Posterior
+
+    with pytest.raises(InputError, match="ball_1.png: not a posterior that geomtact saved") as error:
+        Posterior.load(touched / "ball_1.png")
+    assert "pickle" not in str(error.value)
+
+
+def test_progress_without_a_terminal_is_a_line_each_tenth(capsys):
+    from geomtact.cli.shell import progress_bar
+
+    with progress_bar("preparing pin") as progress:
+        for k in range(1001):
+            progress(k / 1000, "simulating touches")
+        progress(0.5, "fitting")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "preparing pin: simulating touches, 0 %"
+    assert lines[10:] == ["preparing pin: simulating touches, 100 %", "preparing pin: fitting, 50 %"]
 
 
 def test_system_errors_are_one_line_too(geomtact, tmp_path):

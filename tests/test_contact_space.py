@@ -507,3 +507,11 @@ def test_rotations_of_samples_are_uniform_over_the_cones(cone, rng):
         edges[[0, -1]] = -1.1, 1.1
         count = np.histogram(a[:, i], edges)[0]
         assert chi_square(count, np.full(10, 800.0), 0.03) > 1e-4
+
+
+def test_a_face_leaves_no_tilt(flat_nut):
+    """On an exact face the only rotation left is the turn about the sensor's axis."""
+    T = flat_nut.index.poses([0])[0]
+    rotation = flat_nut.index.cell_covariance(T)[:3, :3]
+    turn = flat_nut.index.angle_step**2 / 12
+    assert T[:3, :3] @ rotation @ T[:3, :3].T == pytest.approx(np.diag([0, 0, turn]), abs=1e-9)

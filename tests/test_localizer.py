@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from geomtact import InputError, Localizer, PoseError, Sensor, UsageError
@@ -277,7 +278,7 @@ def test_off_the_approach_the_density_is_minus_infinity(cone, flat_nut, uniform_
         free = localizer.space.__class__(localizer.mesh, localizer.sensor)
         tilted, ok = free.settle(tilted, depth)
         ok[ok] = np.isfinite(free.penetration(tilted[ok]))
-        off = ok & ~localizer.space._allowed(tilted)
+        off = ok & ~localizer.space.approaches(tilted)
         assert off.sum() >= 3
         assert (posterior.log_density(tilted[off]) == -np.inf).all()
         assert np.isfinite(posterior.log_density(T)).all()
@@ -372,3 +373,58 @@ def test_prepare_reads_what_it_wrote(ball, cache_dir, monkeypatch):
     again = Localizer.prepare("ball", sensor="gelsight-mini", max_poses=20_000, cache_dir=cache_dir)
     assert again.index.key == ball.index.key and again.scorer.calibration == ball.scorer.calibration
     assert isinstance(again.localize(np.zeros((240, 320), bool)), Posterior)
+
+
+def test_a_prior_about_any_symmetric_image_says_the_same(flat_nut, curved, a_touch):
+    """Twelve turns of a nut are one pose: a camera that reports any of them knows as much."""
+    for localizer in (flat_nut, curved):
+        T_true, mask = a_touch(localizer)
+        seen = []
+        for S in localizer.mesh.symmetry.elements:
+            about = T_true @ S
+            if not localizer.space.approaches(about[None])[0]:
+                continue
+
+            def near(T, about=about):
+                angle = Rotation.from_matrix(np.swapaxes(T[:, :3, :3], 1, 2) @ about[:3, :3]).magnitude()
+                return -0.5 * (angle / 0.4) ** 2 - 0.5 * (((T - about)[:, :3, 3] / (4 * MM)) ** 2).sum(1)
+
+            posterior = localizer.localize(mask, prior=near, effort="fast")
+            seen.append((posterior.log_density(T_true), posterior.log_evidence, posterior.entropy_nats))
+        assert len(seen) >= 6
+        assert np.ptp(np.array(seen), axis=0).max() < 1e-3
+
+
+def test_a_constant_in_the_prior_means_nothing_and_a_small_density_is_not_none(plug, a_touch, uniform_poses):
+    T_true, mask = a_touch(plug)
+
+    def sharp(T):
+        return -0.5 * (((T - T_true)[:, :3, 3] / (0.3 * MM)) ** 2).sum(1)
+
+    posteriors = [plug.localize(mask, prior=lambda T, c=c: sharp(T) + c, effort="fast") for c in (0.0, 1e8)]
+    assert posteriors[1].log_prob == pytest.approx(posteriors[0].log_prob, rel=1e-5, abs=1e-3)
+    T = uniform_poses(plug)[0]
+    assert sharp(plug.index.poses()).min() < -1000
+    assert np.isfinite(posteriors[0].log_density(T)).all()
+    assert np.exp(posteriors[0].log_prob).sum() == pytest.approx(1, abs=1e-5)
+
+
+def test_no_contact_restricts_the_prior_to_poses_that_do_not_touch(plug, uniform_poses):
+    T = uniform_poses(plug)[0][:20]
+    nothing = np.zeros(plug.sensor.image_size_px[::-1], bool)
+    away, deep = T.copy(), T.copy()
+    away[:, 2, 3] += 0.3
+    deep[:, 2, 3] -= 3 * MM  # deeper than the sensor allows, but touching all the same
+
+    def prior(T):
+        return -T[:, 2, 3]
+
+    for posterior, expected in (
+        (plug.localize(nothing), np.zeros(20)),
+        (plug.localize(nothing, prior=prior), prior(away)),
+        (plug.localize(nothing, prior=(away[:1], [-1.0])), np.r_[-1.0, np.full(19, -np.inf)]),
+    ):
+        assert (posterior.log_density(T) == -np.inf).all() and (posterior.log_density(deep) == -np.inf).all()
+        assert posterior.log_density(away)[:1] == pytest.approx(expected[:1])
+    with pytest.raises(UsageError, match="expected a Posterior"):
+        plug.localize(nothing, prior=3)

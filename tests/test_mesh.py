@@ -130,7 +130,9 @@ def test_unit_is_never_guessed(tmp_path):
     stl = save(box(), tmp_path / "a.stl")
     refused("mm, cm, m, inch", stl)
     refused("unknown unit 'km'", stl, "km")
-    refused("metres by definition", save(box(), tmp_path / "a.glb"), "mm")
+    refused("metres by definition.*re-export it in metres, or save it as STL", save(box(), tmp_path / "a.glb"), "mm")
+    refused("unit is likely wrong; .*re-export it in metres", tmp_path / "a.glb", sensor=Sensor.load("gelslim"))
+    assert load_mesh(stl, "MM").sha256 == load_mesh(stl, "mm").sha256
     refused("catalogue says mm", "pin", "m")
     assert load_mesh(catalogue()["pin"].file).sha256 == load_mesh("pin").sha256
 
@@ -138,7 +140,9 @@ def test_unit_is_never_guessed(tmp_path):
 def test_unknown_names_and_files(tmp_path):
     refused("did you mean 'elbow_pipe'", "elbow-pipe")
     refused("no part named 'zzz'", "zzz")
-    refused("no such file", tmp_path / "nothing.stl", "mm")
+    refused("no such file; give", tmp_path / "nothing.stl", "mm")
+    save(box(), tmp_path / "part.stl")
+    refused(r"prat.stl: no such file; did you mean 'part.stl'\?$", tmp_path / "prat.stl")
     (tmp_path / "a.step").write_text("ISO-10303-21;")
     refused("not a mesh format", tmp_path / "a.step", "mm")
 
@@ -193,6 +197,22 @@ def test_a_unit_1000_times_wrong_is_refused_and_the_right_one_is_not(tmp_path, s
         refused("unit is likely wrong", save(metres, tmp_path / "small.ply"), "mm", sensor=sensor)
     with pytest.raises(MeshError, match="unit is likely wrong"):
         load_mesh(Mesh(1e3 * mesh.vertices, mesh.faces, "big", "m"), sensor=sensor)
+
+
+@pytest.mark.parametrize(
+    ("scale", "size"),
+    [
+        (1e-3, "0.0616 mm across"),
+        (1e-6, "less than 0.001 mm across"),
+        (1e7, r"616,441,\d{3} mm across"),
+        (1e30, "more than 1,000,000,000"),
+    ],
+)
+def test_sizes_are_told_in_millimetres_without_exponents(tmp_path, scale, size):
+    with pytest.raises(MeshError, match=size) as caught:
+        load_mesh(save(box(offset=(0, 0, 0)).apply_scale(scale), tmp_path / "a.ply"), "mm")
+    assert "expected 0.1 mm to 1,000,000 mm" in str(caught.value)
+    assert "e-" not in str(caught.value).removeprefix(str(tmp_path))
 
 
 def _copy(path, folder):

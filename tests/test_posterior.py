@@ -119,7 +119,7 @@ def test_density_and_level_do_not_change_under_the_objects_symmetry(localizer, p
     T = samples(localizer)[:100]
     S = symmetry.sampled(36)[rng.integers(len(symmetry.sampled(36)), size=100)]
     image = T @ S
-    allowed = localizer.space._allowed(image)
+    allowed = localizer.space.approaches(image)
     # a continuous symmetry is one of the ideal body, of which the mesh is a polyhedron: a pose may change its depth
     here, there = posterior.log_density(T)[allowed], posterior.log_density(image)[allowed]
     assert len(here) > 5
@@ -230,7 +230,7 @@ def test_modes_of_a_ball_are_positions(ball, posteriors, a_touch):
 def test_modes_are_allowed_poses(localizer, posteriors):
     posterior = posteriors(localizer)
     T = np.stack([m.T for m in posterior.modes(5)])
-    assert localizer.space._allowed(T).all()
+    assert localizer.space.approaches(T).all()
     assert np.isfinite(localizer.space.caster.penetration(localizer.sensor, T)).all()
 
 

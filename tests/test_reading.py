@@ -118,6 +118,20 @@ def test_other_grey_is_a_reading_with_a_warning(background, rng):
     assert np.hypot(*(np.argwhere(seen.contact.mask).mean(0) - [100, 120])) < 20
 
 
+@pytest.mark.parametrize("quality", [50, 95])
+def test_a_mask_kept_as_jpeg_is_suspected_and_read_back(tmp_path, quality, background):
+    """Compression leaves a rim of small numbers, which must not count as contact."""
+    path = tmp_path / "mask.jpg"
+    assert cv2.imwrite(str(path), MASK * np.uint8(255), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert (read_image(path) > 0).sum() > 1.05 * MASK.sum()
+    seen = read_observation(path, MINI)
+    assert seen.kind == "reading" and "for a mask give --kind mask (and PNG" in seen.warnings[0]
+    seen = read_observation(path, MINI, kind="mask")
+    assert np.array_equal(seen.contact.mask, MASK) and "JPEG smears a mask" in seen.warnings[0]
+    seen = read_observation(write(tmp_path / "reading.jpg", background[..., 1]), MINI)
+    assert "grey image with many values" in seen.warnings[0]
+
+
 def test_a_kind_that_is_given_wins():
     levels = np.where(MASK, 100, 0).astype(np.uint8) + disk(200, 90, 10).astype(np.uint8)
     seen = read_observation(levels, MINI, kind="mask")
@@ -152,7 +166,7 @@ def test_no_contact_is_a_result_and_all_contact_a_warning():
         assert not seen.contact.mask.any() and seen.warnings == []
     for array in (np.ones(SHAPE, bool), np.full(SHAPE, 255, np.uint8), np.full(SHAPE, 3e-4)):
         seen = read_observation(array, MINI)
-        assert seen.contact.mask.all() and "every pixel is in contact" in seen.warnings[0]
+        assert seen.contact.mask.all() and "so its outline is not seen" in seen.warnings[0]
 
 
 def test_a_background_for_a_mask_is_said_to_be_unused(background):
@@ -165,7 +179,7 @@ def test_a_background_for_a_mask_is_said_to_be_unused(background):
 @pytest.mark.parametrize(
     ("array", "message"),
     [
-        (MASK.T, "expected 320 x 240 px for sensor gelsight-mini (width x height), got 240 x 320 px; the image is transp"),
+        (MASK.T, "(width x height), got 240 x 320 px; the image is transposed: transpose it (array.T)"),
         (MASK[:, :300], "expected 320 x 240 px for sensor gelsight-mini (width x height), got 300 x 240 px; name the sen"),
         (MASK[::2, ::2], "got 160 x 120 px; the shape agrees: resize the image"),
         (np.zeros((0, 320)), "expected (H, W) or (H, W, 3), got an array of shape (0, 320)"),
@@ -196,9 +210,14 @@ def test_eight_bit_heights_have_no_unit():
         read_observation(np.arange(240 * 320, dtype=np.uint8).reshape(SHAPE), MINI, kind="height")
 
 
-def test_a_background_of_another_size_is_refused(background):
-    with pytest.raises(ImageError, match=r"background: expected 320 x 240 px .* transposed"):
+def test_a_background_of_another_size_is_refused(background, tmp_path):
+    with pytest.raises(
+        ImageError, match=r"background: expected 320 x 240 px .* transpose it \(array.swapaxes\(0, 1\)\)"
+    ):
         read_observation(background, MINI, background=background.swapaxes(0, 1))
+    path = write(tmp_path / "untouched.png", background[:200])
+    with pytest.raises(ImageError, match=re.escape(f"background {path}: expected 320 x 240 px")):
+        read_observation(background, MINI, background=path)
     with pytest.raises(ImageError, match="background: expected the size of the image, 320 x 240 px, got 320 x 200 px"):
         contact_mask(background, background[:200])
     with pytest.raises(ImageError, match="expected 240 x 320 px for sensor digit, got 320 x 240 px"):

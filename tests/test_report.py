@@ -17,7 +17,7 @@ from geomtact.geometry.mesh import load_mesh
 from geomtact.report.files import write_whole
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
 from geomtact.report.result import plain, result, to_text
-from geomtact.report.summary import MOTIONS, contact_centre, facts, summarise, told
+from geomtact.report.summary import MOTIONS, caution, contact_centre, facts, percent, summaries_of, summarise, told
 from geomtact.report.write import write_all
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
@@ -31,6 +31,14 @@ class FakeMode:
     observable: np.ndarray = field(default_factory=lambda: np.eye(6)[[0, 1, 3, 4, 5]])
     length: float = 0.01
     refined: bool = True
+
+
+@dataclass
+class FakeIndex:
+    resolution: SimpleNamespace
+
+    def __len__(self):
+        return 4000
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +73,7 @@ def touch():
         timing_ms={"score": 12.0},
         warnings=["a <b>bold</b> warning"],
         seed=7,
-        index=SimpleNamespace(resolution=SimpleNamespace(step=5e-4, level=3, penetrations=(0.5e-3, 1.5e-3))),
+        index=FakeIndex(SimpleNamespace(step=5e-4, level=3, penetrations=(0.5e-3, 1.5e-3))),
         T_frame_sensor=np.eye(4),
         save=lambda path: np.savez(path, poses=poses),
     )
@@ -197,11 +205,11 @@ def test_summary_in_words_and_numbers(rng):
     moved = (T @ se3.exp(xi))[:, :3] @ np.append(centre, 1)
     assert summary.centre_sd_mm == pytest.approx(1e3 * np.sqrt(np.linalg.eigvalsh(np.cov(moved.T))[-1]), rel=0.03)
     flat = FakeMode(np.eye(4), observable=np.eye(6)[[0, 1, 5]])
-    assert summarise(flat, centre).told_in_words() == "all but turn about z, shift along x, shift along y"
+    assert summarise(flat, centre).told_in_words() == "fixed: tilt x, tilt y, shift z; not: turn z, shift x, shift y"
     half = FakeMode(np.eye(4), observable=np.array([[0, 0, 0, 1, 1, 0]]) / np.sqrt(2))
-    assert summarise(half, centre).told_in_words().endswith("shift along x (in part), shift along y (in part)")
+    assert summarise(half, centre).told_in_words() == "partly: shift x, shift y; not: tilt x, tilt y, turn z, shift z"
     assert summarise(FakeMode(T, observable=np.zeros((0, 6))), centre).told_in_words() == "unknown"
-    assert summarise(FakeMode(T, observable=np.eye(6)), centre).told_in_words() == "all six motions"
+    assert summarise(FakeMode(T, observable=np.eye(6)), centre).told_in_words() == "fixed: all six motions"
     assert "unknown" in summarise(FakeMode(T, covariance=np.full((6, 6), np.nan)), centre).cells(1)
 
 
@@ -267,12 +275,50 @@ def test_facts_are_sentences(touch):
     posterior, _, _ = touch
     lines = facts(posterior)
     assert lines[0].startswith("4.2 nats are known: one part in 67 ")
-    assert "1,234 of 3,000" in lines[1] or "1,235 of 3,000" in lines[1]
+    assert re.match("1,23[45] of the grid's 4,000 poses", lines[1])
+
+
+def test_a_mode_that_holds_little_is_not_believed(touch, tmp_path):
+    posterior, modes, simulate = touch
+    assert [percent(p) for p in (0.62, 0.0012, 0.0004, 0.0)] == ["62.0 %", "0.1 %", "< 0.1 %", "< 0.1 %"]
+    assert caution(summaries_of(posterior, modes)) == caution([]) == []
+    weak = [FakeMode(modes[0].T, 0.0003)]
+    warned = ["The part is probably not at mode 1, which holds < 0.1 %."]
+    assert caution(summaries_of(posterior, weak)) == warned
+    write_all(tmp_path, posterior, weak, simulate, timing_ms={"prepare": 1.23456})
+    html = (tmp_path / "report.html").read_text("utf-8")
+    assert "mode 1, which holds &lt; 0.1 %" in html
+    assert "within the mode" in html
+    assert re.search(r"^prepare: 1\.2$", html, re.MULTILINE)
+
+
+def test_angles_are_drawn_within_their_range():
+    from matplotlib.figure import Figure
+
+    from geomtact.report.figure import _marginals
+
+    turns = np.linspace(-180, 180, 500)
+    samples = Samples("turn", turns, np.full(500, 1 / 500), 0.0, 7.0, -180.0, 180.0)
+    figure = Figure()
+    _marginals(figure.subfigures(), [samples])
+    assert figure.axes[0].get_xlim() == (-180, 180)
+
+
+def test_what_people_print_is_one_line(ball, a_touch):
+    touched = ball.localize(a_touch(ball)[1])
+    nothing = ball.localize(np.zeros_like(a_touch(ball)[1]))
+    for shown in (ball, ball.index, ball.mesh, touched, nothing, touched.modes(1)[0]):
+        assert "\n" not in repr(shown)
+        assert len(repr(shown)) < 120
+        assert repr(shown) == str(shown)
+    for shown in (ball, touched):
+        assert all(word in repr(shown) for word in ("ball", "gelsight-mini", f"{len(ball.index):,} poses"))
+    assert f"{-touched.entropy_nats:.1f} nats" in repr(touched)
+    assert "no contact" in repr(nothing)
 
 
 def test_pictures_open(touch):
     from geomtact.report.figure import draw
-    from geomtact.report.summary import summaries_of
 
     posterior, modes, simulate = touch
     picture = draw(posterior, modes[:2], summaries_of(posterior, modes[:2]), simulate)

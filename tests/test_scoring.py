@@ -294,10 +294,13 @@ def test_simulated_touches_are_of_the_cells_they_say(plug):
 def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
     monkeypatch.setattr("geomtact.scoring.fitted._FIT", 40)
     monkeypatch.setattr("geomtact.scoring.fitted._JUDGE", 20)
-    for name in SCORERS:
+    names = ("l1", "iou", "moments", "fourier")  # one of each kind
+    assert set(names) <= set(SCORERS)
+    for name in names:
         first = fitted_scorer(name, ball.index, tmp_path)
         assert isinstance(first, FittedScorer) and first.scorer.name == name
-    assert {p.name for p in tmp_path.iterdir()} == {f"{name}.json" for name in SCORERS}
+    assert {p.name for p in tmp_path.glob("*.json")} == {f"{name}.json" for name in names}
+    assert [p.name.split("-")[0] for p in tmp_path.glob("*.npy")] == ["fourier"]
     monkeypatch.setattr("geomtact.scoring.fitted.simulate_touches", lambda *_, **__: pytest.fail("fitted again"))
     mask = ball.index.masks([5])[0]
     again = fitted_scorer("moments", ball.index, tmp_path)

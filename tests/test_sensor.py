@@ -77,7 +77,7 @@ def test_what_is_added_wrongly_is_named(change, message):
         ("[320, 240]", "[320]", "image_size_px must be two numbers"),
         ("[320, 240]", "[320.5, 240]", "image_size_px must be whole numbers"),
         ("[320, 240]", "[4, 240]", "image_size_px must be at least 8"),
-        ("[0.06, 0.05]", "[0.06, 0]", "pixel_pitch_mm must be positive"),
+        ("[0.06, 0.05]", "[0.06, 0]", "pixel_pitch_mm must be positive, got [0.06, 0.0]"),
         ("[0.06, 0.05]", "['a', 'b']", "pixel_pitch_mm must be two numbers"),
     ],
 )
@@ -90,8 +90,15 @@ def test_what_is_impossible_is_refused(old, new, message):
 def test_an_unknown_name_and_a_missing_file_say_what_to_do():
     with pytest.raises(SensorError, match="did you mean 'gelsight-mini'"):
         Sensor.load("gelsigt-mini")
-    with pytest.raises(SensorError, match="cannot be read"):
+    with pytest.raises(SensorError, match="nowhere.toml: no such file"):
         Sensor.load("nowhere.toml")
+
+
+def test_an_impossible_value_names_its_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(PLAIN.replace("camera_distance_mm = 20", "camera_distance_mm = -1"))
+    with pytest.raises(SensorError, match=re.escape(f"{path}: sensor 'plain': camera_distance_mm must be >= 0")):
+        Sensor.load(path)
 
 
 def test_project_undoes_lift_for_every_optics():

@@ -21,6 +21,7 @@ STAGES = [
     ["scoring"],
     ["registration"],
     ["inference"],
+    ["training"],
     ["evaluation", "report"],
     ["cli"],
 ]

@@ -2,8 +2,9 @@
 
     python tools/make_docs_figures.py [NAME ...]
 
-Without names all are drawn into docs/images: frames, approach, one_map, first_result. The last one localizes the bundled
-sample touch of the pin, so it shows what ``sh tools/quickstart.sh`` finds.
+Without names all are drawn into docs/images: frames, approach, one_map, first_result, augmentations. ``first_result``
+localizes the bundled sample touch of the pin, so it shows what ``sh tools/quickstart.sh`` finds; ``augmentations`` needs the
+extra ``train``.
 """
 
 from __future__ import annotations
@@ -227,6 +228,44 @@ def first_result() -> Figure:
     return figure
 
 
+def augmentations() -> Figure:
+    """Five touches of a procedural part: stored, rigid, elastic, and each noise that training adds to them."""
+    import torch
+
+    from geomtact.training.augment import AUGMENTATIONS
+    from geomtact.training.parts import random_part
+    from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, make_scene
+
+    scene = make_scene(random_part(11, 0.06), Sensor.load("gelslim"), 600_000, np.random.default_rng(5))
+
+    def unpacked(words: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+        return np.unpackbits(words.view(np.uint8), axis=1).reshape(-1, *shape)
+
+    elastic = unpacked(scene.elastic, TOUCH_SHAPE)
+    # middling contacts, as different as five of them can be
+    some = np.argsort(elastic.sum((1, 2)))[(np.linspace(0.5, 0.97, 5) * len(elastic)).astype(int)]
+    masks = torch.from_numpy(elastic[some]).float()[:, None]
+    columns = [
+        ("stored, of the cell", unpacked(scene.stored[scene.true[some]], KEY_SHAPE)),
+        ("touch, rigid", unpacked(scene.rigid[some], TOUCH_SHAPE)),
+        ("touch, elastic", elastic[some]),
+    ]
+    for i, a in enumerate(AUGMENTATIONS):
+        # several draws, of which the one that changes most is shown: some noises come in few touches only
+        drawn = [a.apply(masks, scene.pixel, torch.Generator().manual_seed(100 * i + k)) for k in range(12)]
+        changed = torch.stack([(d != masks).flatten(1).sum(1) for d in drawn])
+        best = changed.argmax(0)
+        columns.append((a.name, torch.stack([drawn[k][j, 0] for j, k in enumerate(best.tolist())]).numpy()))
+    figure = Figure(figsize=(12, 5.2), layout="constrained")
+    axes = figure.subplots(5, len(columns))
+    for c, (title, images) in enumerate(columns):
+        for r in range(5):
+            axes[r, c].imshow(images[r], cmap="gray", vmin=0, vmax=1, interpolation="nearest", extent=(0, 4, 3, 0))
+            axes[r, c].set(xticks=[], yticks=[])
+        axes[0, c].set_title(title, fontsize=9)
+    return figure
+
+
 def _in_window(axes: Axes, sensor: Sensor, picture: Array, title: str) -> None:
     x, y = 1e3 * sensor.half_window
     axes.imshow(picture, extent=(-x, x, y, -y), vmin=0, vmax=1, interpolation="nearest")
@@ -250,6 +289,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "approach": approach,
     "one_map": one_map,
     "first_result": first_result,
+    "augmentations": augmentations,
 }
 
 

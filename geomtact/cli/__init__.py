@@ -10,6 +10,7 @@ from geomtact.cli.localize import localize
 from geomtact.cli.prepare import prepare
 from geomtact.cli.shell import one_line_errors
 from geomtact.cli.simulate import simulate
+from geomtact.cli.train import train
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -17,7 +18,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Localize a known part from the shape of one tactile contact: the whole distribution of its pose.",
 )
-for command in (localize, prepare, simulate, evaluate, sensors, objects, cache):
+for command in (localize, prepare, train, simulate, evaluate, sensors, objects, cache):
     app.command()(one_line_errors(command))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from geomtact.cli import study_file
 from geomtact.cli.library import CacheDir
 from geomtact.cli.localize import Effort
 from geomtact.cli.prepare import Unit
@@ -20,36 +22,99 @@ if TYPE_CHECKING:
     from geomtact.sensing.noise import Noise
 
 SCHEMA = "geomtact/study/1"
-_SAVE_EVERY = 10  # touches, so that a stopped run goes on from there
+_SCORES_ONLY = "Only for scores"
 
 
 class What(StrEnum):
     touches = "touches"
     localize = "localize"
+    scores = "scores"
+
+
+class FeltName(StrEnum):
+    elastic = "elastic"
+    rigid = "rigid"
+    both = "both"
 
 
 def evaluate(
-    what: Annotated[What, typer.Argument(help="touches: what is judged on; localize: the posteriors from it.")],
-    parts: Annotated[list[str], typer.Argument(metavar="OBJECT...", help="Parts or mesh files.")],
+    what: Annotated[
+        What,
+        typer.Argument(
+            help="touches: what is judged on; localize: the posteriors from it; scores: all scores side by side."
+        ),
+    ],
+    parts: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="OBJECT...", help="Parts or mesh files; for scores the thesis's four by default."),
+    ] = None,
     unit: Unit = None,
     sensor: Annotated[str, typer.Option(help="Name (see 'geomtact sensors') or TOML file.")] = "gelslim",
     touches: Annotated[int, typer.Option(min=1, help="How many touches of each part.")] = 200,
     noise: Annotated[NoiseName, typer.Option(help="How strongly the masks are spoilt.")] = NoiseName.moderate,
-    effort: Annotated[Effort, typer.Option(help="How much to compute.")] = Effort.balanced,
+    effort: Annotated[
+        Effort | None,
+        typer.Option(help="How much to compute; balanced by default, fast for scores.", show_default=False),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 1,
     out: Annotated[
         Path | None, typer.Option(help="JSON file for all figures; a study that it holds in part is resumed.")
+    ] = None,
+    scores: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SCORE...", help="Scores to judge; all by default.", rich_help_panel=_SCORES_ONLY),
+    ] = None,
+    felt: Annotated[
+        FeltName | None,
+        typer.Option(help="What the gel is; elastic by default.", show_default=False, rich_help_panel=_SCORES_ONLY),
+    ] = None,
+    max_poses: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="About how many poses; 1.2 million by default.",
+            show_default=False,
+            rich_help_panel=_SCORES_ONLY,
+        ),
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="PNG of gain against time per touch.", rich_help_panel=_SCORES_ONLY)
     ] = None,
     cache_dir: CacheDir = None,
 ) -> None:
     """Judge posteriors on simulated touches with known poses: gain, coverage and pose errors for each part.
 
-    Half of the touches are felt by a rigid threshold, half by an elastic gel; figures are given apart and together.
+    For localize, half of the touches are felt by a rigid threshold, half by an elastic gel, and figures are given
+    apart and together. For scores, every score is judged on the same touches, with what it costs.
     """
+    from geomtact.errors import UsageError
+
+    if what is What.scores:
+        from geomtact.cli.evaluate_scores import MAX_POSES, Options, judge_scores, sort_words
+        from geomtact.sensing.sensor import Sensor
+
+        chosen, names = sort_words(parts or [], scores or [])
+        options = Options(
+            sensor=Sensor.load(sensor),
+            touches=touches,
+            noise_name=str(noise),
+            noise=_noise(noise),
+            felt=str(felt or FeltName.elastic),
+            effort=str(effort or Effort.fast),
+            seed=seed,
+            max_poses=max_poses or MAX_POSES,
+        )
+        judge_scores(chosen, unit, names, options, out, plot, cache_dir)
+        return
+    for option, value in {"--scores": scores, "--felt": felt, "--max-poses": max_poses, "--plot": plot}.items():
+        if value:
+            raise UsageError(f"{option} goes with 'evaluate scores', not with 'evaluate {what}'; leave it out")
+    if not parts:
+        raise UsageError(f"evaluate {what}: no OBJECT given; name a part (see 'geomtact objects') or a mesh file")
     if what is What.touches:
         print_touches(parts, unit, sensor, touches, noise, seed)
     else:
-        judge(parts, unit, sensor, touches, noise, effort, seed, out, cache_dir)
+        judge(parts, unit, sensor, touches, noise, effort or Effort.balanced, seed, out, cache_dir)
 
 
 def judge(
@@ -72,7 +137,7 @@ def judge(
     from geomtact.evaluation import study
     from geomtact.inference.localizer import Localizer
 
-    content = _load(out)
+    content = study_file.load(out, SCHEMA)
     all_figures: dict[tuple[str, str], dict[str, Any]] = {}
     for part in parts:
         with progress_bar(f"preparing {part}") as progress:
@@ -84,23 +149,29 @@ def judge(
             "seed": seed,
             "elastic_solver": solver,
         }
-        outcomes = _earlier(content, localizer.mesh.name, settings)
+        name = localizer.mesh.name
+        outcomes = study_file.earlier(content["parts"].get(name), settings, study.Outcome)
+        keep = functools.partial(_keep, out, content, name, settings)
         if len(outcomes) < touches:
             todo = study.make_touches(localizer, touches, seed, _noise(noise), felt)[len(outcomes) :]
-            with progress_bar(f"localizing {localizer.mesh.name}") as progress:
-                for outcome in study.localize_touches(localizer, todo, effort, seed):
-                    outcomes.append(outcome)
-                    progress(len(outcomes) / touches, "")
-                    if out is not None and len(outcomes) % _SAVE_EVERY == 0:
-                        _save(out, content, localizer.mesh.name, settings, outcomes)
+            more = study.localize_touches(localizer, todo, effort, seed)
+            study_file.collect(outcomes, more, touches, f"localizing {name}", keep)
         random_mm = study.expected_random_add(localizer)
         figures = study.summarise(outcomes, random_mm)
-        extra = {"random_add_mm": random_mm, "figures": figures}
-        _save(out, content, localizer.mesh.name, settings, outcomes, extra)
-        all_figures |= {(localizer.mesh.name, group): values for group, values in figures.items()}
-        tell(f"{localizer.mesh.name}: done")
+        keep(outcomes, {"random_add_mm": random_mm, "figures": figures})
+        all_figures |= {(name, group): values for group, values in figures.items()}
+        tell(f"{name}: done")
     _print(all_figures)
     return content
+
+
+def _keep(
+    out: Path | None, content: dict[str, Any], part: str, settings: dict, outcomes: list, extra: dict | None = None
+) -> None:
+    from geomtact.report.result import plain
+
+    content["parts"][part] = plain({"settings": settings, **(extra or {}), "outcomes": [asdict(o) for o in outcomes]})
+    study_file.save(out, content)
 
 
 def _print(figures: dict[tuple[str, str], dict[str, Any]]) -> None:
@@ -157,47 +228,3 @@ def _noise(name: str) -> Noise:
     from geomtact.sensing import noise
 
     return {"none": noise.CLEAN, "moderate": noise.MODERATE, "heavy": noise.HEAVY}[name]
-
-
-def _load(out: Path | None) -> dict[str, Any]:
-    import json
-
-    from geomtact.errors import InputError
-
-    if out is None or not out.exists():
-        return {"schema": SCHEMA, "parts": {}}
-    try:
-        content = json.loads(out.read_text("utf-8"))
-        if content["schema"] != SCHEMA:
-            raise ValueError(content["schema"])
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f"{out}: is there, but is no study of geomtact; give another file with --out") from None
-    return content
-
-
-def _earlier(content: dict[str, Any], part: str, settings: dict[str, Any]) -> list:
-    """The outcomes of an earlier run with the very same settings."""
-    import json
-
-    from geomtact.evaluation.study import Outcome
-    from geomtact.report.result import plain
-
-    found = content["parts"].get(part)
-    if found is None or found["settings"] != json.loads(json.dumps(plain(settings))):
-        return []
-    return [Outcome(**outcome) for outcome in found["outcomes"]]
-
-
-def _save(
-    out: Path | None, content: dict[str, Any], part: str, settings: dict, outcomes: list, extra: Any = None
-) -> None:
-    from geomtact.report.files import write_whole
-    from geomtact.report.result import plain, to_text, versions
-
-    content["versions"] = versions()
-    entry = {"settings": settings, **(extra or {}), "outcomes": [asdict(o) for o in outcomes]}
-    content["parts"][part] = plain(entry)
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        text = to_text(content)
-        write_whole(out, lambda path: path.write_text(text, "utf-8"))

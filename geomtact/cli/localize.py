@@ -10,7 +10,8 @@ import typer
 
 from geomtact.cli.library import CacheDir
 from geomtact.cli.prepare import SensorName, Unit, open_localizer
-from geomtact.cli.shell import NO_CONTACT, print_table, tell
+from geomtact.cli.shell import NO_CONTACT, check_folder, print_table, tell
+from geomtact.errors import InputError, UsageError, nearest_name
 
 MODES = 5
 
@@ -35,11 +36,12 @@ def localize(
     ] = None,
     unit: Unit = None,
     sensor: SensorName = None,
-    kind: Annotated[Kind, typer.Option(help="What the image is.")] = Kind.auto,
+    kind: Annotated[str, typer.Option(metavar="|".join(Kind), help="What the image is.")] = Kind.auto.value,
     background: Annotated[Path | None, typer.Option(help="Image of the untouched sensor, for readings.")] = None,
     prior: Annotated[Path | None, typer.Option(help="posterior.npz of what is known before.")] = None,
     effort: Annotated[
-        Effort | None, typer.Option(help="How much to compute; balanced by default.", show_default=False)
+        str | None,
+        typer.Option(metavar="|".join(Effort), help="How much to compute; balanced by default.", show_default=False),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     out: Annotated[
@@ -67,17 +69,22 @@ def localize(
         "background": None if background is None else str(background),
         "effort": effort,
     }
+    check_folder(out)
+    if prior is not None and not prior.is_file():
+        raise InputError(f"--prior {prior}: no such file; give a posterior.npz")
     values, sources = resolve(given, read_metadata(image))
-    chosen = _effort(values["effort"])
+    _check_name("kind", kind, Kind)
+    chosen = values["effort"] or Effort.balanced.value
+    _check_name("effort", chosen, Effort, sources.get("effort"))
 
     began = time.perf_counter()
     if values["sensor"] is not None:
         # a bad image is told before minutes go into an index
-        read_observation(image, values["sensor"], kind.value, values["background"])
+        read_observation(image, values["sensor"], kind, values["background"])
     localizer = open_localizer(values, sources, cache_dir)
     prepared = time.perf_counter()
     posterior = localizer.localize(
-        str(image), kind=kind.value, background=values["background"], prior=prior, effort=chosen, seed=seed
+        str(image), kind=kind, background=values["background"], prior=prior, effort=chosen, seed=seed
     )
     localized = time.perf_counter()
     modes = posterior.modes(MODES)
@@ -86,7 +93,7 @@ def localize(
 
     settings = {
         "image": str(image),
-        "kind": kind.value,
+        "kind": kind,
         "prior": prior and str(prior),
         **values,
         "taken_from": sources,
@@ -112,24 +119,29 @@ def localize(
         raise typer.Exit(NO_CONTACT)
 
 
-def _effort(name: str | None) -> str:
-    """The effort by name; a ``geomtact.toml`` may hold a wrong one."""
-    from geomtact.errors import InputError, nearest_name
+def _check_name(option: str, name: str, known: type[StrEnum], file: str | None = None) -> None:
+    """Refuse an unknown name, which the command line gave or a ``geomtact.toml``.
 
-    if name is not None and name not in list(Effort):
-        raise InputError(f"no effort named {name!r}{nearest_name(name, list(Effort))}")
-    return str(name or Effort.balanced)
+    Raises
+    ------
+    UsageError, InputError
+    """
+    names = [k.value for k in known]
+    if name not in names:
+        what = f"no {option} named {name!r}{nearest_name(name, names)}"
+        raise InputError(f"{file}: {what}") if file else UsageError(f"--{option}: {what}")
 
 
 def _print(posterior, modes, out: Path | None) -> None:
-    from geomtact.report.summary import HEADINGS, facts, summaries_of, table
+    from geomtact.report.summary import HEADINGS, caution, facts, summaries_of, table
 
     typer.echo(f"{posterior.mesh.name} on {posterior.sensor.name}, {posterior.frame} frame")
     if modes:
         right = ["mode", "probability", "±"]
-        print_table(HEADINGS, table(summaries_of(posterior, modes)), right)
-        for fact in facts(posterior):
-            typer.echo(fact)
+        summaries = summaries_of(posterior, modes)
+        print_table(HEADINGS, table(summaries), right)
+        for line in (*facts(posterior), *caution(summaries)):
+            typer.echo(line)
     typer.echo(
         f"written: {out}/report.html and .png, result.json, posterior.npz" if out else "for a report, give --out DIR"
     )

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -38,6 +39,17 @@ def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+def check_folder(out: Path | None) -> None:
+    """Refuse a file where a folder is to be written, before any work is done.
+
+    Raises
+    ------
+    UsageError
+    """
+    if out is not None and out.is_file():
+        raise UsageError(f"--out {out}: is a file; give a folder")
+
+
 def tell(text: str) -> None:
     """One line to standard error."""
     typer.echo(text, err=True)
@@ -51,7 +63,8 @@ def _tell_error(text: str) -> None:
 def progress_bar(title: str) -> Iterator[Callable[[float, str], None]]:
     """A bar on standard error; yields what the library calls with the share done (0..1) and the step's name.
 
-    It shows only once the library reports, so a cached index shows none.
+    It shows only once the library reports, so a cached index shows none. Where standard error is no terminal, a line
+    tells of each step and of each tenth of it.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -60,16 +73,19 @@ def progress_bar(title: str) -> Iterator[Callable[[float, str], None]]:
     columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
     bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
     task = bar.add_task(title, total=1.0)
-    started = False
+    started, told = False, ("", -1)
 
     def report(done: float, step: str = "") -> None:
-        nonlocal started
+        nonlocal started, told
         if not started:
             started = True
             bar.start()
-            if not console.is_terminal:
-                tell(f"{title} ...")
-        bar.update(task, completed=done, description=f"{title}: {step}" if step else title)
+        description = f"{title}: {step}" if step else title
+        bar.update(task, completed=done, description=description)
+        reached = step, int(10 * done + 1e-9)
+        if not console.is_terminal and reached != told:
+            told = reached
+            tell(f"{description}, {10 * reached[1]} %")
 
     try:
         yield report

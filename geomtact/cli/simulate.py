@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.prepare import SensorName, Unit
+from geomtact.cli.shell import check_folder
 from geomtact.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def simulate(
     from geomtact.sensing import noise as noises
     from geomtact.sensing.sensor import Sensor, bundled_sensors
 
+    check_folder(out)
     values, _ = resolve({"object": object_name, "unit": unit, "sensor": sensor})
     named = require(values, "object", list(catalogue()), "a mesh file with --unit")
     sensor_named = require(values, "sensor", bundled_sensors(), "a TOML file")

@@ -104,8 +104,11 @@ def choose_resolution(
     return res.choose(mesh.radius_rms, float(area), mesh.symmetry, sensor, approach, max_poses)
 
 
-def _touches(there: HeightMap, turn: float, frame: Frame, window: Window) -> _Turn:
-    """All places of one rotation."""
+def places(
+    there: HeightMap, turn: float, frame: Frame, window: Window
+) -> tuple[NDArray[np.int64], Array, NDArray[np.float32]]:
+    """The lattice cells (n,) of one rotation in which the object touches, a window centre (n, 2) [m] that stands for
+    each, from the object's centre, and the share (P, n) of each that touches at every penetration."""
     ok = frame.blocks(allowed(there.turned(turn, frame), frame, window.sensor, window.penetrations))
     share = ok.mean(2, dtype=np.float32)
     cell = np.flatnonzero(share.any(0))
@@ -115,11 +118,16 @@ def _touches(there: HeightMap, turn: float, frame: Frame, window: Window) -> _Tu
     i, j = np.divmod(np.arange(CELL_PIXELS**2), CELL_PIXELS)
     n = inside.sum(1)
     far = (i - (inside @ i / n)[:, None]) ** 2 + (j - (inside @ j / n)[:, None]) ** 2
-    centres = frame.positions(cell, np.where(inside, far, np.inf).argmin(1))
+    return cell, frame.positions(cell, np.where(inside, far, np.inf).argmin(1)), share[:, cell]
+
+
+def _touches(there: HeightMap, turn: float, frame: Frame, window: Window) -> _Turn:
+    """All places of one rotation."""
+    cell, centres, share = places(there, turn, frame, window)
     masks, z = window.masks(there, turn, centres)
     # a sliver at the window's edge may fall between the finer pixels of the height map
     seen = z > NOTHING / 2
-    share = share[:, cell] * seen
+    share = share * seen
     z = np.where(seen, z, z.max(0))
     kept = share.any(0)
     cell, centres, masks, z, share = cell[kept], centres[kept], masks[:, kept], z[:, kept], share[:, kept]

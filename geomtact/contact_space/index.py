@@ -58,6 +58,9 @@ class Index:
     def __len__(self) -> int:
         return self.height.size
 
+    def __repr__(self) -> str:
+        return f"Index({self.mesh.name} on {self.sensor.name}, {len(self):,} poses)"
+
     @property
     def places(self) -> int:
         return self.height.shape[1]
@@ -131,11 +134,15 @@ class Index:
     def cell_covariance(self, T: ArrayLike) -> Array:
         """Spread (6, 6) of the poses in the cell around ``T`` (4, 4): covariance of xi in T exp(xi^), radians and metres."""
         R = np.asarray(T, float)[:3, :3]
+        about_z = np.outer(R[2], R[2])
         turn = self.angle_step
+        # an approach leaves no more tilt than its cones are wide
+        cones = self.directions.cones
+        tilt = turn if cones is None else min(turn, 2 * max(half for _, half in cones))
         depth = self.sensor.max_penetration / len(self.resolution.penetrations)
         step = self.resolution.step
         about_centre = np.zeros((6, 6))
-        about_centre[:3, :3] = np.eye(3) * turn**2 / 12
+        about_centre[:3, :3] = (turn**2 * about_z + tilt**2 * (np.eye(3) - about_z)) / 12
         about_centre[3:, 3:] = R.T @ np.diag([step**2, step**2, depth**2]) @ R / 12
         # a rotation about the object's centre is one about its origin and a shift
         J = np.eye(6)

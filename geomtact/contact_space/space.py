@@ -48,7 +48,7 @@ class ContactSpace:
         T = np.asarray(T, float).reshape(-1, 4, 4)
         depth = self.caster.penetration(self.sensor, T)
         inside = (depth >= -_ROUNDING) & (depth <= self.sensor.max_penetration + _ROUNDING)
-        inside &= self._allowed(T)
+        inside &= self.approaches(T)
         if self.sensor.housing_depth is not None and inside.any():
             lowest = self.caster.lowest_outside(self.sensor, T[inside])
             inside[inside] = lowest >= -self.sensor.housing_depth - _ROUNDING
@@ -126,7 +126,8 @@ class ContactSpace:
             "allow; widen the approach"
         )
 
-    def _allowed(self, T: Array) -> NDArray[np.bool_]:
+    def approaches(self, T: Array) -> NDArray[np.bool_]:
+        """Whether the approach allows poses ``T`` (n, 4, 4)."""
         if self.cones is None:
             return np.ones(len(T), bool)
         return allowed(approach_of(T[:, :3, :3]), self.cones)

@@ -8,13 +8,14 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.pose_error import coverage, mssd, random_add
 from geomtact.evaluation.touches import Touch, random_touches
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference.localizer import Localizer
+from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 
@@ -51,13 +52,15 @@ class Outcome:
     ms: float
 
 
-def make_touches(scene: Any, n: int, seed: int, noise: Noise, felt: Felt | None = None) -> list[Touch]:
-    """``n`` touches of ``scene`` (anything with a ``space``), geometric and elastic in turn.
+def make_touches(
+    scene: Any, n: int, seed: int, noise: Noise, felt: Felt | None = None, elastic: bool | None = None
+) -> list[Touch]:
+    """``n`` touches of ``scene`` (anything with a ``space``), geometric and elastic in turn unless ``elastic`` says which.
 
     ``felt`` (space, T, elastic) -> (H, W) bool replaces the elastic touches' masks: with another solver than the one
     that the posterior was calibrated with.
     """
-    touches = random_touches(scene, n, seed, noise=noise)
+    touches = random_touches(scene, n, seed, elastic, noise)
     if felt is None:
         return touches
     from geomtact.contact_space.touch import spoilt
@@ -72,6 +75,14 @@ def make_touches(scene: Any, n: int, seed: int, noise: Noise, felt: Felt | None 
 
 def localize_touches(localizer: Localizer, touches: Sequence[Touch], effort: str, seed: int) -> Iterator[Outcome]:
     """Localizes each touch and says how that went."""
+    for outcome, _ in judged(localizer, touches, effort, seed):
+        yield outcome
+
+
+def judged(
+    localizer: Localizer, touches: Sequence[Touch], effort: str, seed: int
+) -> Iterator[tuple[Outcome, Posterior]]:
+    """As :func:`localize_touches`, with the posterior that each outcome is read from."""
     distance = PoseDistance(localizer.mesh)
     for touch in touches:
         T = touch.T_sensor_object
@@ -81,7 +92,7 @@ def localize_touches(localizer: Localizer, touches: Sequence[Touch], effort: str
         modes = posterior.modes(MODES)
         poses = np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
         largest, mean = 1e3 * mssd(T, poses, localizer.mesh), 1e3 * distance.mean(T, poses)
-        yield Outcome(
+        outcome = Outcome(
             elastic=touch.elastic,
             penetration_mm=1e3 * touch.penetration,
             gain=float(posterior.log_density(T)),
@@ -94,16 +105,31 @@ def localize_touches(localizer: Localizer, touches: Sequence[Touch], effort: str
             probability=modes[0].probability if modes else 0.0,
             ms=ms,
         )
+        yield outcome, posterior
 
 
 def summarise(outcomes: Sequence[Outcome], random_add_mm: float) -> dict[str, dict[str, Any]]:
     """Figures over all touches, the geometric and the elastic ones; ``random_add_mm`` as of ``pose_error.random_add``."""
-    groups = {
+    return {name: _figures(some, random_add_mm) for name, some in groups(outcomes).items()}
+
+
+def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Any]]:
+    """Those outcomes that figures are given of together: all, the geometric and the elastic ones, where there are any."""
+    found = {
         "all": list(outcomes),
         "geometric": [o for o in outcomes if not o.elastic],
         "elastic": [o for o in outcomes if o.elastic],
     }
-    return {name: _figures(some, random_add_mm) for name, some in groups.items() if some}
+    return {name: some for name, some in found.items() if some}
+
+
+def coverage_figures(levels: ArrayLike) -> dict[str, Any]:
+    """Coverage at the nominal masses of the credible levels (n,) of true poses, and the greatest error among them."""
+    found = coverage(levels, NOMINAL)
+    return {
+        "coverage": [asdict(c) for c in found],
+        "coverage_error": max(abs(c.share - c.nominal) for c in found),
+    }
 
 
 def expected_random_add(localizer: Localizer) -> float:
@@ -136,8 +162,7 @@ def _figures(outcomes: Sequence[Outcome], random_add_mm: float) -> dict[str, Any
         "gain_mean": float(gain.mean()),
         "gain_standard_error": float(gain.std(ddof=1) / np.sqrt(n)) if n > 1 else None,
         "claimed_mean": float(column["claimed"].mean()),
-        "coverage": [asdict(c) for c in coverage(column["level"], NOMINAL)],
-        "coverage_error": max(abs(c.share - c.nominal) for c in coverage(column["level"], NOMINAL)),
+        **coverage_figures(column["level"]),
         "wrong": float((column["mssd_mm"] > WRONG_MM).mean()),
         "high_entropy": float((column["probability"] < CERTAIN).mean()),
     }

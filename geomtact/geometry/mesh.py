@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.errors import MeshError, nearest_name
+from geomtact.errors import MeshError, did_you_mean, nearest_name
 from geomtact.geometry.catalogue import catalogue
 from geomtact.geometry.symmetry import Symmetry, find_symmetry
 from geomtact.se3 import Array
@@ -20,6 +20,7 @@ from geomtact.se3 import Array
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 UNITLESS_FORMATS = (".stl", ".obj", ".ply", ".off")
 METRE_FORMATS = (".glb", ".gltf")
+_REEXPORT = "; if its numbers are {unit}, re-export it in metres, or save it as STL or PLY and give --unit {unit}"
 
 # Beyond these no tactile sensor is meant; they also keep squares and cubes of lengths far from overflow.
 _SMALLEST, _LARGEST = 1e-4, 1e3
@@ -65,6 +66,9 @@ class Mesh:
         vertices.flags.writeable = faces.flags.writeable = False
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
+
+    def __repr__(self) -> str:
+        return f"Mesh({self.name}, {len(self.faces):,} faces, read in {self.unit})"
 
     @cached_property
     def sha256(self) -> str:
@@ -143,7 +147,8 @@ def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _Se
     Parameters
     ----------
     source : name in ``meshes/catalogue.toml``, path of a file, or a Mesh (checked against the sensor only)
-    unit : "mm", "cm", "m" or "inch"; needed for formats without units, not for catalogue parts and glTF (metres)
+    unit : "mm", "cm", "m" or "inch" in upper or lower case; needed for formats without units, not for catalogue parts
+        and glTF (metres)
     sensor : if given, the part's size is checked against its window
 
     Returns
@@ -177,12 +182,16 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
     parts = catalogue()
     path = Path(text)
     name = text if text in parts else next((n for n, e in parts.items() if e.file == path.resolve()), None)
-    if unit is not None and unit not in UNITS:
-        raise MeshError(f"{text}: unknown unit {unit!r}; give one of {', '.join(UNITS)}")
+    if unit is not None:
+        given, unit = unit, str(unit).lower()
+        if unit not in UNITS:
+            raise MeshError(f"{text}: unknown unit {given!r}; give unit= (--unit) one of {', '.join(UNITS)}")
     if name is not None:
         entry = parts[name]
         if unit is not None and unit != entry.unit:
-            raise MeshError(f"{text}: the catalogue says {entry.unit}, but unit={unit!r} was given; leave the unit out")
+            raise MeshError(
+                f"{text}: the catalogue says {entry.unit}, but the unit {unit} was given; leave the unit out"
+            )
         return name, entry.file, entry.unit, entry.symmetry
     suffix = path.suffix.lower()
     formats = UNITLESS_FORMATS + METRE_FORMATS
@@ -191,13 +200,18 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
             raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(formats)}")
         raise MeshError(f"no part named {text!r}{nearest_name(text, parts)}; or give a mesh file ({' '.join(formats)})")
     if not path.is_file():
-        raise MeshError(f"{text}: no such file; give the path of a mesh, or a part: {', '.join(sorted(parts))}")
+        beside = [p.name for p in path.parent.glob("*") if p.suffix.lower() in formats]
+        hint = did_you_mean(path.name, beside) or f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
+        raise MeshError(f"{text}: no such file{hint}")
     if suffix in METRE_FORMATS:
         if unit not in (None, "m"):
-            raise MeshError(f"{text}: glTF is in metres by definition, but unit={unit!r} was given; leave the unit out")
+            raise MeshError(
+                f"{text}: glTF is in metres by definition, but the unit {unit} was given; leave the unit out"
+                f"{_REEXPORT.format(unit=unit)}"
+            )
         unit = "m"
     if unit is None:
-        raise MeshError(f"{text}: {suffix} files do not say their unit; give unit= one of {', '.join(UNITS)}")
+        raise MeshError(f"{text}: {suffix} files do not say their unit; give unit= (--unit) one of {', '.join(UNITS)}")
     return path.stem, path, unit, None
 
 
@@ -237,8 +251,8 @@ def _tidy(vertices: Array, faces: NDArray, path: Path, unit: str) -> tuple[Array
         reach = float(np.abs(used).max())
     if not _SMALLEST <= size <= _LARGEST or reach > 1e3 * size:
         raise MeshError(
-            f"{path}: {size:.3g} m across and up to {reach:.3g} m from the origin as read in {unit}, "
-            f"expected {_SMALLEST:g} to {_LARGEST:g} m near the origin; the unit is likely wrong"
+            f"{path}: {_mm(size)} across and up to {_mm(reach)} from the origin as read in {unit}, expected "
+            f"{_mm(_SMALLEST)} to {_mm(_LARGEST)} near the origin; {_wrong_unit(path)}"
         )
     vertices = vertices.astype(np.float32).astype(np.float64) + 0.0  # + 0.0 turns -0 into 0
     vertices, index = np.unique(vertices, axis=0, return_inverse=True)
@@ -317,14 +331,24 @@ def _check_scale(mesh: Mesh, sensor: _SensorLike) -> None:
     largest = 100 * 2 * float(np.hypot(*sensor.half_window))
     if not smallest <= mesh.diameter <= largest:
         raise MeshError(
-            f"{mesh.path or mesh.name}: {_figure(1e3 * mesh.diameter)} mm across as read in {mesh.unit}, but sensor "
-            f"{sensor.name} suits {1e3 * smallest:.2g} to {1e3 * largest:.0f} mm; the unit is likely wrong"
+            f"{mesh.path or mesh.name}: {_mm(mesh.diameter)} across as read in {mesh.unit}, but sensor {sensor.name} "
+            f"suits {_mm(smallest)} to {_mm(largest)}; {_wrong_unit(mesh.path)}"
         )
 
 
-def _figure(x: float) -> str:
-    """``x`` with three digits, written without an exponent."""
-    return f"{x:,.0f}" if x >= 100 else f"{x:.3g}"
+def _wrong_unit(path: Path | None) -> str:
+    metres = path is not None and path.suffix.lower() in METRE_FORMATS
+    return "the unit is likely wrong" + (_REEXPORT.format(unit="mm") if metres else "")
+
+
+def _mm(metres: float) -> str:
+    """A length in millimetres with three digits, written without an exponent."""
+    mm = 1e3 * metres
+    if mm < 1e-3:
+        return "less than 0.001 mm"
+    if mm > 1e9:
+        return "more than 1,000,000,000 mm"
+    return f"{mm:,.0f} mm" if mm >= 100 else f"{mm:.3g} mm"
 
 
 def _largest_distance(points: Array) -> float:

@@ -26,6 +26,8 @@ from geomtact.se3 import Array, hat, random_rotations, transform
 Approach = Sequence[tuple[ArrayLike, float]]
 FACE_TOLERANCE = 1e-6  # rad: how near a pose must come to an approach of half angle 0
 _FINE = 3  # levels between a pixel and the points that measure how much of it is kept
+_PER_CONE = 2048  # points that measure a cone at least
+_BATCH = 2**16  # directions proposed at once; after 16 times as many, a cell is taken for one without area
 _GENERIC = np.array([0.5402, 0.2911, 0.7896])  # of no machined part's symmetry: picks one image of each orbit
 
 
@@ -59,18 +61,25 @@ def check_approach(approach: Approach | None) -> list[tuple[Array, float]] | Non
     Raises
     ------
     UsageError
-        A direction of no length, an angle outside 0..pi, or exact faces mixed with cones.
+        Not a list of directions with angles, a direction of no length, an angle outside 0..pi, or exact faces mixed
+        with cones.
     """
     if approach is None:
         return None
+    try:
+        pairs = [(np.asarray(direction, float), float(angle)) for direction, angle in approach]
+    except (TypeError, ValueError):
+        given = " ".join(repr(approach).split())[:100]
+        raise UsageError(
+            f"approach: expected [((x, y, z), half_angle)], the angle in radians, 0 for exactly that face, got {given}"
+        ) from None
     cones = []
-    for direction, angle in approach:
-        v = np.asarray(direction, float)
+    for v, angle in pairs:
         if v.shape != (3,) or not np.isfinite(v).all() or np.linalg.norm(v) < 1e-12:
-            raise UsageError(f"approach: expected a direction of three numbers in the object frame, got {direction!r}")
-        if not 0 <= float(angle) <= np.pi:
-            raise UsageError(f"approach: the half angle is in radians, 0 to pi, got {angle!r}")
-        cones.append((v / np.linalg.norm(v), float(angle)))
+            raise UsageError(f"approach: expected a direction of three numbers in the object frame, got {v.tolist()}")
+        if not 0 <= angle <= np.pi:
+            raise UsageError(f"approach: the half angle is in radians, 0 to pi, got {angle:g}")
+        cones.append((v / np.linalg.norm(v), angle))
     if not cones:
         raise UsageError("approach: an empty list rules out every touch; leave it out to allow all")
     if len({angle == 0 for _, angle in cones}) > 1:
@@ -110,23 +119,17 @@ class Directions:
         cones = check_approach(approach)
         if symmetry.kind == "sphere" or (cones and cones[0][1] == 0):
             return cls._faces(symmetry, cones, turn_step or level_step(level))
-        nside = 2 ** max(level + _FINE, 6)
-        fine = np.stack(healpix.pix2vec(nside, np.arange(12 * nside**2), nest=True), -1)
-        fine = fine[allowed(fine, cones)]
-        if not len(fine):  # a cone thinner than the finest pixel
-            assert cones is not None
-            fine = np.stack([v for v, _ in cones])
+        fine, area = _fine_points(symmetry, cones, level)
         image = _canonical(fine, symmetry, cones)[1]
         key = _bin(image, symmetry, level)
-        n_keys = int(key.max()) + 1
-        count = np.bincount(key, minlength=n_keys)
-        mean = np.stack([np.bincount(key, image[:, i], n_keys) for i in range(3)], -1).astype(float)
-        kept = np.flatnonzero(count)
+        total = np.bincount(key, area)
+        mean = np.stack([np.bincount(key, area * image[:, i]) for i in range(3)], -1).astype(float)
+        kept = np.flatnonzero(total)
         cell = np.full(_bin_count(symmetry, level), -1)
         cell[kept] = np.arange(len(kept))
-        weights = count[kept] / count.sum()
+        weights = total[kept] / total.sum()
         if symmetry.kind == "axis":
-            vectors = _on_meridian(image, key, symmetry, cones)
+            vectors = _on_meridian(image, area, key, symmetry, cones)
             if cones is None:  # the rows of fine points may line up with the bands, whose areas are known
                 weights = -np.diff(_edges(symmetry, level))[kept]
                 weights /= weights.sum()
@@ -163,20 +166,28 @@ class Directions:
         return Rz @ facing(self.vectors)[direction], direction, turn
 
     def draw(self, cells: ArrayLike, rng: np.random.Generator) -> Array:
-        """Rotations (n, 3, 3) uniform within cells (n,), counted as :meth:`rotations` does."""
+        """Allowed rotations (n, 3, 3) uniform within cells (n,), counted as :meth:`rotations` does."""
         _, direction, turn = self.rotations()
         k = direction[np.asarray(cells)]
         psi = turn[np.asarray(cells)] + rng.uniform(-0.5, 0.5, len(k)) * self.periods[k] / self.turns[k]
         a = self._draw_directions(k, rng)
         Rz = Rotation.from_euler("z", psi[:, None]).as_matrix()
-        return Rz @ facing(self.vectors[k]) @ np.swapaxes(_smallest_rotation(self.vectors[k], a), -1, -2)
+        R = Rz @ facing(self.vectors[k]) @ np.swapaxes(_smallest_rotation(self.vectors[k], a), -1, -2)
+        if self.symmetry.kind == "axis" and self.cones is not None:  # the cell's meridian may lie beside the cones
+            R = self.any_image(transform(R, np.zeros(3)), rng)[:, :3, :3]
+        return R
 
     def _draw_directions(self, k: NDArray[np.int64], rng: np.random.Generator) -> Array:
-        """Canonical approach directions (n, 3) uniform within direction cells ``k`` (n,)."""
+        """Approach directions (n, 3) uniform over the allowed ones of direction cells ``k`` (n,), made canonical."""
         a = self.vectors[k].copy()
         if self.level is None:
             return a
         kept, level, sym = np.flatnonzero(self._cell >= 0), self.level, self.symmetry
+        if self.cones is not None:
+            for cell in np.unique(k):
+                mine = np.flatnonzero(k == cell)
+                a[mine] = self._draw_in_cones(kept[cell], a[mine], self.cones, rng)
+            return a
         todo = np.arange(len(k))
         for _ in range(200):  # until the draw falls into the cell; a cell too thin to be hit keeps its own direction
             if not len(todo):
@@ -185,36 +196,59 @@ class Directions:
             if sym.axis is not None:
                 edges = _edges(sym, level)
                 new = _at_polar(np.atleast_1d(rng.uniform(edges[cell + 1], edges[cell])), a[todo], sym.axis)
-            else:  # a disk that holds the pixel
-                middle = np.stack(healpix.pix2vec(2**level, cell, nest=True), -1)
-                widest = 1.1 * np.sqrt(4 * np.pi / (12 * 4**level))
+                fits = np.ones(len(new), bool)
+            else:
+                middle, widest = _disk(cell, level)
                 new = in_cone(middle, np.full(len(cell), widest), rng)
-                own = np.abs(_canonical(new, sym, self.cones)[1] - new).max(-1) < 1e-9
-                new[(_bin(new, sym, level) != cell) | ~own] = np.nan
-            fits = np.isfinite(new).all(-1) & allowed(new, self.cones)
+                own = np.abs(_canonical(new, sym, None)[1] - new).max(-1) < 1e-9
+                fits = (_bin(new, sym, level) == cell) & own
             a[todo[fits]] = new[fits]
             todo = todo[~fits]
         return a
+
+    def _draw_in_cones(
+        self, cell: np.int64, a: Array, cones: list[tuple[Array, float]], rng: np.random.Generator
+    ) -> Array:
+        """``a`` (n, 3), the direction of one pixel or band, replaced by such draws; kept where the cell has no area."""
+        assert self.level is not None
+        caps = _caps(cell, self.symmetry, cones, self.level)
+        n, tried, found = 0, 0, []
+        while n < len(a) and tried < 16 * _BATCH:
+            new = in_cones(caps, min(_BATCH, max(32, 8 * len(a), tried)), rng)
+            tried += len(new)
+            image = _canonical(new[allowed(new, cones)], self.symmetry, cones)[1]
+            found.append(image[_bin(image, self.symmetry, self.level) == cell])
+            n += len(found[-1])
+        new = np.concatenate(found)[: len(a)]
+        if self.symmetry.axis is not None:
+            new = _at_polar(new @ self.symmetry.axis, a[: len(new)], self.symmetry.axis)
+        return np.concatenate([new, a[len(new) :]])
 
     def any_image(self, T: ArrayLike, rng: np.random.Generator) -> Array:
         """``T`` (n, 4, 4) replaced by its images under the object's symmetry, drawn uniformly among those allowed."""
         T = np.array(T, float)
         sym, n = self.symmetry, len(T)
-        todo = np.arange(n)
-        for _ in range(200):
-            if sym.kind == "none" or not len(todo):
-                break
-            S = sym.elements[rng.integers(len(sym.elements), size=len(todo))]
+        if sym.kind == "none":
+            return T
+        if self.cones is None:
+            S = sym.elements[rng.integers(len(sym.elements), size=n)]
             if sym.axis is not None:
-                turn = Rotation.from_rotvec(rng.uniform(0, 2 * np.pi, (len(todo), 1)) * sym.axis)
+                turn = Rotation.from_rotvec(rng.uniform(0, 2 * np.pi, (n, 1)) * sym.axis)
                 S = about(turn.as_matrix(), sym.centre) @ S
             elif sym.kind == "sphere":
-                S = about(random_rotations(len(todo), rng), sym.centre)
-            new = T[todo] @ S
-            ok = allowed(approach_of(new[:, :3, :3]), self.cones)
-            T[todo[ok]] = new[ok]
-            todo = todo[~ok]
-        return T
+                S = about(random_rotations(n, rng), sym.centre)
+            return T @ S
+        if sym.kind == "sphere":
+            turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, (n, 1))).as_matrix()
+            return _about(T, sym.centre, turn @ facing(in_cones(self.cones, n, rng)))
+        images = np.einsum("gji,nj->ngi", sym.elements[:, :3, :3], approach_of(T[:, :3, :3]))
+        if sym.axis is None:
+            ok = allowed(images, self.cones)
+            return T @ sym.elements[np.argmax(ok * (1 - rng.random(ok.shape)), axis=1)]
+        element, azimuth = _into_cones(images, sym.axis, self.cones, rng)
+        angle = _azimuth(images[np.arange(n), element], sym.axis) - azimuth
+        R = Rotation.from_rotvec(angle[:, None] * sym.axis).as_matrix()
+        return T @ sym.elements[element] @ about(R, sym.centre)
 
     def canonical(self, T: ArrayLike) -> Array:
         """The image (n, 4, 4) under the object's symmetry, ``T @ S``, that the grid stores."""
@@ -296,6 +330,87 @@ def _canonical(
     return best, images[np.arange(len(a)), best]
 
 
+def _fine_points(symmetry: Symmetry, cones: list[tuple[Array, float]] | None, level: int) -> tuple[Array, Array]:
+    """Directions (n, 3) that lie evenly over the cones, and the area (n,) of each in pixels of the finest grid."""
+    nside = 2 ** max(level + _FINE, 6)
+    fine = np.stack(healpix.pix2vec(nside, np.arange(12 * nside**2), nest=True), -1)
+    if cones is None:
+        return fine, np.ones(len(fine))
+    pixels = [12 * nside**2 * np.sin(half / 2) ** 2 for _, half in cones]
+    # widest first: of a narrow cone only what sticks out of a wide one counts
+    order = np.argsort(pixels)[::-1]
+    # about an axis the rows of the finest grid may line up with the bands
+    wide = [cones[i] for i in order if pixels[i] >= _PER_CONE and symmetry.axis is None]
+    points = [fine[allowed(fine, wide)]]
+    area = [np.ones(len(points[0]))]
+    for rank, i in enumerate(order[len(wide) :], len(wide)):
+        v, half = cones[i]
+        own = _sunflower(v, half, max(_PER_CONE, int(pixels[i])))
+        size = pixels[i] / len(own)
+        own = own[~allowed(own, [cones[j] for j in order[:rank]])]
+        points.append(own)
+        area.append(np.full(len(own), size))
+    return np.concatenate(points), np.concatenate(area)
+
+
+def _sunflower(middle: Array, half_angle: float, n: int) -> Array:
+    """Directions (n, 3) that share a cone equally: equal steps of the cosine, each a golden angle further round."""
+    i = np.arange(n)
+    cosine = 1 - (i + 0.5) / n * (1 - np.cos(half_angle))
+    return _tilted(np.tile(middle, (n, 1)), cosine, np.pi * (3 - np.sqrt(5)) * i)
+
+
+def _disk(pixel: ArrayLike, level: int) -> tuple[Array, float]:
+    """Middles (..., 3) of pixels and the half angle [rad] of a disk about each that holds it."""
+    middle = np.stack(healpix.pix2vec(2**level, pixel, nest=True), -1)
+    return middle, 1.1 * np.sqrt(4 * np.pi / (12 * 4**level))
+
+
+def _caps(
+    cell: np.int64, symmetry: Symmetry, cones: list[tuple[Array, float]], level: int
+) -> list[tuple[Array, float]]:
+    """Caps that hold all allowed directions whose images fall into a pixel or band: the smaller of its disk and the cones."""
+    v, half = np.stack([v for v, _ in cones]), np.array([half for _, half in cones])
+    if symmetry.axis is not None:
+        width = np.pi / _bands(level)
+        polar = np.arccos(np.clip(v @ symmetry.axis, -1, 1))
+        ends = [polar, np.pi - polar][: len(symmetry.elements)]
+        near = np.min([np.abs(end - (cell + 0.5) * width) for end in ends], axis=0) <= half + width / 2 + FACE_TOLERANCE
+        return [cones[i] for i in np.flatnonzero(near)]
+    middle, widest = _disk(cell, level)
+    middles = symmetry.elements[:, :3, :3] @ middle
+    near = np.arccos(np.clip(middles @ v.T, -1, 1)) <= half + widest + FACE_TOLERANCE
+    thin = half < widest
+    caps = [cones[i] for i in np.flatnonzero(near.any(0) & thin)]
+    return caps + [(m, widest) for m in middles[(near & ~thin).any(1)]]
+
+
+def _into_cones(
+    images: Array, axis: Array, cones: list[tuple[Array, float]], rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Array]:
+    """Which of the images (n, G, 3) and the azimuth (n,) about ``axis`` to turn it to, uniform over what the cones allow."""
+    v, half = np.stack([v for v, _ in cones]), np.array([half for _, half in cones])
+    polar, polar_v = (np.arctan2(np.linalg.norm(np.cross(axis, a), axis=-1), a @ axis) for a in (images, v))
+    polar = polar[..., None]
+    tilt = np.abs(polar - polar_v)
+    # spherical law of haversines: how far from a cone's azimuth its border is met; a pole is met all round
+    room = np.sin((half + 1e-3 * FACE_TOLERANCE) / 2) ** 2 - np.sin(tilt / 2) ** 2
+    reach = 2 * np.arcsin(np.sqrt(np.clip(room / np.maximum(np.sin(polar) * np.sin(polar_v), 1e-30), 0, 1)))
+    chance = np.where(tilt <= half + FACE_TOLERANCE, reach + 1e-12, 0).reshape(len(images), -1).cumsum(1)
+    element, azimuth = np.zeros(len(images), np.int64), np.zeros(len(images))
+    todo = np.arange(len(images))
+    while len(todo):
+        pick = (rng.random((len(todo), 1)) * chance[todo, -1:] < chance[todo]).argmax(1)
+        g, c = np.divmod(pick, len(cones))
+        element[todo] = g
+        azimuth[todo] = _azimuth(v[c], axis) + rng.uniform(-1, 1, len(todo)) * reach[todo, g, c]
+        # an azimuth inside m cones is drawn m times too often
+        off = np.abs((azimuth[todo, None] - _azimuth(v, axis) + np.pi) % (2 * np.pi) - np.pi)
+        m = ((off <= reach[todo, g]) & (tilt[todo, g] <= half + FACE_TOLERANCE)).sum(1)
+        todo = todo[rng.random(len(todo)) * m > 1]
+    return element, azimuth
+
+
 def _bin_count(symmetry: Symmetry, level: int) -> int:
     return _bands(level) if symmetry.kind == "axis" else 12 * 4**level
 
@@ -320,7 +435,7 @@ def _edges(symmetry: Symmetry, level: int) -> Array:
 
 
 def _on_meridian(
-    image: Array, key: NDArray[np.int64], symmetry: Symmetry, cones: list[tuple[Array, float]] | None
+    image: Array, area: Array, key: NDArray[np.int64], symmetry: Symmetry, cones: list[tuple[Array, float]] | None
 ) -> Array:
     """Directions of the mean polar angle of each band ``key`` (n,), on an azimuth that the approach allows."""
     axis = _axis(symmetry)
@@ -328,7 +443,10 @@ def _on_meridian(
     halves = np.array([half for _, half in cones]) if cones else np.array([np.pi])
     out = []
     for k in np.unique(key):
-        polar = np.mean(np.arccos(np.clip(image[key == k] @ axis, -1, 1)))
+        members = np.arccos(np.clip(image[key == k] @ axis, -1, 1))
+        polar = np.average(members, weights=area[key == k])
+        if cones:  # the mean may lie in none of them
+            polar = members[np.abs(members - polar).argmin()]
         # of a band, the direction on the azimuth of a cone's own is the deepest inside it
         each = _at_polar(np.full(len(middles), np.cos(polar)), middles, axis)
         inside = halves - np.arccos(np.clip((each * middles).sum(-1), -1, 1))
@@ -386,7 +504,26 @@ def _first_of_each(same: NDArray[np.bool_]) -> list[int]:
 def in_cone(middle: Array, half_angle: Array, rng: np.random.Generator) -> Array:
     """Directions (n, 3) uniform over cones of ``half_angle`` (n,) [rad] about ``middle`` (n, 3)."""
     cosine = 1 - rng.random(len(middle)) * (1 - np.cos(half_angle))
-    turn = rng.uniform(0, 2 * np.pi, len(middle))
+    return _tilted(middle, cosine, rng.uniform(0, 2 * np.pi, len(middle)))
+
+
+def in_cones(cones: list[tuple[Array, float]], n: int, rng: np.random.Generator) -> Array:
+    """Directions (n, 3) uniform over the union of cones, or of exact faces."""
+    a = np.zeros((n, 3))
+    v, half = np.stack([v for v, _ in cones]), np.array([half for _, half in cones])
+    size = np.where(half > 0, np.sin(half / 2) ** 2, 1.0)
+    todo = np.arange(n)
+    while len(todo):
+        i = rng.choice(len(cones), len(todo), p=size / size.sum())
+        a[todo] = in_cone(v[i], half[i], rng)
+        # a direction inside m cones is drawn m times too often
+        m = sum(allowed(a[todo], [cone]).astype(int) for cone in cones)
+        todo = todo[rng.random(len(todo)) * m > 1]
+    return a
+
+
+def _tilted(middle: Array, cosine: Array, turn: Array) -> Array:
+    """Directions (n, 3) at angles of ``cosine`` (n,) from ``middle`` (n, 3), ``turn`` (n,) [rad] round it."""
     side = np.sqrt(np.maximum(0, 1 - cosine**2))
     local = np.stack([side * np.cos(turn), side * np.sin(turn), cosine], -1)
     # the third row of facing(-v) is v: the cone's axis is the local z

@@ -88,7 +88,11 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     InputError
         The file cannot be read, or is no posterior.
     """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file; give a posterior.npz")
     try:
+        if not zipfile.is_zipfile(path):  # numpy would take it for a pickle
+            raise ValueError("it is no .npz file, or not a whole one")
         with np.load(path, allow_pickle=False) as file:
             data = {name: file[name] for name in file.files}
         meta = json.loads(str(data["meta"]))

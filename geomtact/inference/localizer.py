@@ -19,7 +19,7 @@ from geomtact.errors import UsageError, nearest_name
 from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.geometry.rotations import Approach
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import prior_log_mass
+from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.scoring.calibration import posterior_log_prob
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
@@ -70,7 +70,7 @@ class Localizer:
         sensor : name of a bundled sensor, path of a TOML file, or a Sensor
         approach : [(direction (3,), half angle)]: only touches whose direction from the object towards the sensor, in
             the object frame, lies within the angle [rad] of one of these; 0 means exactly that face
-        scorer : "moments", "iou" or "l1"
+        scorer : how contacts are compared, one of ``geomtact.scoring.fitted.SCORERS``
         max_poses : about how many poses the grid may have
         cache_dir : folder of the index cache; by default ``$GEOMTACT_CACHE`` or the user's cache folder
         progress : called with the share done (0 to 1) and what is being done
@@ -128,7 +128,9 @@ class Localizer:
             "timing_ms": timing,
         }
         if not mask.any():
-            return Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, warnings=warnings, **common)
+            elsewhere = prior_log_density(prior, self.mesh, frame, self.cache_dir)
+            nothing = Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, **common)
+            return replace(nothing, elsewhere=elsewhere, warnings=warnings)
         with _timed(timing, "score"):
             score = self.scorer.score(self.index, mask)
         with _timed(timing, "posterior"):
@@ -148,6 +150,10 @@ class Localizer:
         if T.shape != (4, 4):
             raise UsageError(f"simulate: expected one pose (4, 4), got shape {T.shape}")
         return self.space.caster.contact(self.sensor, T)
+
+    def __repr__(self) -> str:
+        name = self.scorer.scorer.name
+        return f"Localizer({self.mesh.name} on {self.sensor.name}, {len(self.index):,} poses, scored by {name})"
 
     @property
     def mesh(self) -> Mesh:

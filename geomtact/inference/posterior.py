@@ -46,6 +46,10 @@ class Mode:
     length: float
     refined: bool
 
+    def __repr__(self) -> str:
+        x, y, z = 1e3 * self.T[:3, 3] + 0.0
+        return f"Mode({100 * self.probability:.2g} %, object's origin at ({x:.2f}, {y:.2f}, {z:.2f}) mm)"
+
 
 @dataclass(frozen=True)
 class Refined:
@@ -70,6 +74,7 @@ class Posterior:
     frame : "sensor" or "world"
     T_frame_sensor : (4, 4)
     contact : whether the image shows any contact
+    elsewhere : without contact, the prior's log density at poses (n, 4, 4) in ``frame``; it is not saved
     log_evidence : log of the mean likelihood under the prior, comparable between objects on one sensor
     seed : of the random choices made where credible levels tie
     refined : what registration found, by pose id
@@ -82,6 +87,7 @@ class Posterior:
     frame: str = "sensor"
     T_frame_sensor: Array = field(default_factory=lambda: np.eye(4))
     contact: bool = True
+    elsewhere: Any = None
     log_evidence: float = 0.0
     seed: int = 0
     refined: dict[int, Refined] = field(default_factory=dict)
@@ -89,6 +95,11 @@ class Posterior:
     settings: dict[str, Any] = field(default_factory=dict)
     timing_ms: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        known = f"{-self.entropy_nats:.1f} nats known" if self.contact else "no contact"
+        where = f"{self.mesh.name} on {self.sensor.name}, {self.frame} frame"
+        return f"Posterior({where}, {len(self.index):,} poses, {known})"
 
     @property
     def mesh(self) -> Mesh:
@@ -143,18 +154,19 @@ class Posterior:
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
 
         -inf outside the contact pose space; inside it finite, unless the prior ruled T out. Without contact, -inf where T
-        would touch and 0 elsewhere.
+        would touch, however deep, and elsewhere the prior's, 0 without one.
         """
         T = check_transforms(T)
         inside = inverse(self.T_frame_sensor) @ T.reshape(-1, 4, 4)
-        depth = self.space.penetration(inside)
-        touching = np.isfinite(depth)
-        if not self.contact:
-            out = np.where(touching, -np.inf, 0.0)
-        else:
-            out = np.full(len(inside), -np.inf)
+        out = np.full(len(inside), -np.inf)
+        if self.contact:
+            depth = self.space.penetration(inside)
+            touching = np.isfinite(depth)
             if touching.any():
                 out[touching] = self.cell_log_density(self.index.lookup(inside[touching], depth[touching]))
+        else:
+            free = self.space.caster.penetration(self.sensor, inside) <= 0
+            out[free] = self.elsewhere(T.reshape(-1, 4, 4)[free]) if self.elsewhere else 0.0
         return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
 
     def cell_log_density(self, ids: ArrayLike) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +12,25 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import InputError, UsageError
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.geometry.mesh import Mesh
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring.calibration import log_weights
 from geomtact.se3 import Array, check_transforms, inverse
 
+LogDensity = Callable[[Array], Array]
+
 _CHUNK = 1 << 16
+_EXPECTED = (
+    "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)) or a function of "
+    "poses, got {}"
+)
+_TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
 
 
 def prior_log_mass(
     index: Index, prior: Any, T_frame_sensor: Array, frame: str, cache_dir: str | Path | None = None
-) -> NDArray[np.float32]:
+) -> NDArray[np.floating]:
     """Log mass (N,) of every cell under ``prior``, not normalised; the uniform's without one.
 
     Parameters
@@ -42,19 +52,16 @@ def prior_log_mass(
     if isinstance(prior, Posterior):
         density = _of_posterior(index, prior, T_frame_sensor, frame)
     elif callable(prior):
-        density = _by_chunks(index, lambda T: _checked(prior(T_frame_sensor @ T), len(T)))
+        density = _over_images(index, lambda T: _checked(prior(T_frame_sensor @ T), len(T)))
     elif isinstance(prior, tuple | list) and len(prior) == 2:
         return _of_poses(index, prior[0], prior[1], T_frame_sensor)
     else:
-        raise UsageError(
-            "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)) or a "
-            f"function of poses, got {type(prior).__name__}"
-        )
+        raise UsageError(_EXPECTED.format(type(prior).__name__))
     if not (density < np.inf).all():
         raise InputError(
             "prior: the log density is NaN or infinite at some poses; return -inf where a pose is ruled out"
         )
-    out = (uniform + density).astype(np.float32)
+    out = uniform + density
     if not np.isfinite(out).any():
         raise InputError(
             "prior: it rules out every pose that touches the sensor; check its frame and its units (metres)"
@@ -62,14 +69,54 @@ def prior_log_mass(
     return out
 
 
-def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: str) -> Array:
-    if prior.mesh.sha256 != index.mesh.sha256:
-        raise InputError(f"prior: it is for the object {prior.mesh.name!r}, not for {index.mesh.name!r} as loaded here")
+def prior_log_density(prior: Any, mesh: Mesh, frame: str, cache_dir: str | Path | None = None) -> LogDensity | None:
+    """Log density, not normalised, of ``prior`` at poses (n, 4, 4) in ``frame``, touching or not; None without one.
+
+    Of a pair, each pose's mass counts for all poses within the radius of a mode.
+    """
+    if prior is None:
+        return None
+    if isinstance(prior, str | Path):
+        prior = Posterior.load(prior, cache_dir)
+    if isinstance(prior, Posterior):
+        _check_same(prior, mesh, frame)
+        return prior.log_density
+    if callable(prior):
+        return lambda T: _checked(prior(T), len(T))
+    if not (isinstance(prior, tuple | list) and len(prior) == 2):
+        raise UsageError(_EXPECTED.format(type(prior).__name__))
+    poses, mass = _pair(*prior)
+    distance, radius = PoseDistance(mesh), mode_radius(mesh)
+
+    def near(T: Array) -> Array:
+        return np.array([np.logaddexp.reduce(mass[distance.within(t, poses, radius)], initial=-np.inf) for t in T])
+
+    return near
+
+
+def _check_same(prior: Posterior, mesh: Mesh, frame: str) -> None:
+    if prior.mesh.sha256 != mesh.sha256:
+        raise InputError(f"prior: it is for the object {prior.mesh.name!r}, not for {mesh.name!r} as loaded here")
     if prior.frame != frame:
         raise InputError(
             f"prior: its frame is {prior.frame!r} but this posterior's is {frame!r}; "
             "give T_world_sensor to both touches or to neither"
         )
+
+
+def _pair(poses: Any, log_masses: Any) -> tuple[Array, Array]:
+    """Poses (n, 4, 4) and log masses (n,) of a prior that is a pair."""
+    T = check_transforms(poses, "prior poses").reshape(-1, 4, 4)
+    mass = np.asarray(log_masses, float)
+    if mass.shape != (len(T),) or not (mass < np.inf).all():
+        raise InputError(
+            f"prior: expected one log weight a pose, ({len(T)},), neither NaN nor +inf, got shape {mass.shape}"
+        )
+    return T, mass
+
+
+def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: str) -> Array:
+    _check_same(prior, index.mesh, frame)
     same_place = np.allclose(prior.T_frame_sensor, T_frame_sensor, atol=1e-9)
     if prior.index.key == index.key and same_place:
         if not prior.contact:
@@ -79,13 +126,8 @@ def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: 
     return _by_chunks(index, lambda T: prior.log_density(T_frame_sensor @ T))
 
 
-def _of_poses(index: Index, poses: Any, log_masses: Any, T_frame_sensor: Array) -> NDArray[np.float32]:
-    T = check_transforms(poses, "prior poses").reshape(-1, 4, 4)
-    mass = np.asarray(log_masses, float)
-    if mass.shape != (len(T),) or not (mass < np.inf).all():
-        raise InputError(
-            f"prior: expected one log weight a pose, ({len(T)},), neither NaN nor +inf, got shape {mass.shape}"
-        )
+def _of_poses(index: Index, poses: Any, log_masses: Any, T_frame_sensor: Array) -> Array:
+    T, mass = _pair(poses, log_masses)
     inside = inverse(T_frame_sensor) @ T
     depth = ContactSpace(index.mesh, index.sensor, index.approach).penetration(inside)
     ok = np.isfinite(depth) & np.isfinite(mass)
@@ -97,7 +139,7 @@ def _of_poses(index: Index, poses: Any, log_masses: Any, T_frame_sensor: Array) 
     out = np.full(len(index), -np.inf)
     cell = index.lookup(inside[ok], depth[ok])
     np.logaddexp.at(out, cell, mass[ok])
-    return out.astype(np.float32)
+    return out
 
 
 def _checked(density: Any, n: int) -> Array:
@@ -109,7 +151,31 @@ def _checked(density: Any, n: int) -> Array:
     return out
 
 
-def _by_chunks(index: Index, density: Any) -> Array:
+def _over_images(index: Index, density: LogDensity) -> Array:
+    """Log of the mean of exp(``density``) over the images of every cell's pose under the object's symmetry (N,).
+
+    A cell stands for all of them: what the function says of any is said of it. Images that the approach rules out do
+    not count.
+    """
+    symmetry = index.mesh.symmetry
+    assert symmetry is not None
+    images = symmetry.sampled(_TURNS if symmetry.axis is not None else _ROTATIONS)
+    space = ContactSpace(index.mesh, index.sensor, index.approach)
+
+    def mean(T: Array) -> Array:
+        total, count = np.full(len(T), -np.inf), np.zeros(len(T))
+        for S in images:
+            image = T @ S
+            ok = space.approaches(image)
+            with np.errstate(invalid="ignore"):  # NaN is told of later
+                total[ok] = np.logaddexp(total[ok], density(image[ok]))
+            count += ok
+        return total - np.log(np.maximum(count, 1))
+
+    return _by_chunks(index, density if len(images) == 1 else mean)
+
+
+def _by_chunks(index: Index, density: LogDensity) -> Array:
     """``density`` at the pose of every cell (N,)."""
     out = np.zeros(len(index))
     for start in range(0, len(index), _CHUNK):

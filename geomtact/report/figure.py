@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geomtact.report.marginals import Samples, marginals
-from geomtact.report.summary import ModeSummary, facts
-from geomtact.report.view import Viewer
+from geomtact.report.summary import ModeSummary, caution, facts, percent
+from geomtact.report.view import View, Viewer
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 OBSERVED, SIMULATED, FIRST, BARS = "#D55E00", "#56B4E9", "#000000", "#0072B2"
 DPI, WIDTH = 100, 14.0
-_BANDS = {"touch": 3.9, "modes": 6.0, "marginals": 2.9}  # heights in inches
+_BANDS = {"touch": 3.9, "modes": 2.9, "marginals": 2.9}  # heights in inches, that of the modes without the part
 _COLUMNS = 5
 
 
@@ -54,7 +54,9 @@ def draw(
 
     modes, summaries = modes[:_COLUMNS], summaries[:_COLUMNS]
     names = list(_BANDS) if modes else ["touch"]
-    heights = [_BANDS[name] for name in names]
+    views = _views(posterior, modes) if modes else []
+    part = WIDTH / _COLUMNS * max((_tallness(view) for view in views), default=0.0)
+    heights = [_BANDS[name] + (part if name == "modes" else 0.0) for name in names]
     style: Any = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False}
     with mpl.rc_context(style):
         figure = Figure(figsize=(WIDTH, sum(heights)), dpi=DPI, layout="constrained", facecolor="white")
@@ -64,7 +66,7 @@ def draw(
         )
         words = _touch(bands["touch"], posterior, summaries)
         if modes:
-            _modes(bands["modes"], posterior, modes, simulate)
+            _modes(bands["modes"], posterior, modes, views, part, simulate)
             _marginals(bands["marginals"], marginals(posterior, np.asarray(modes[0].T)))
         canvas.draw()
         words_start = int(words.get_window_extent().x0)
@@ -92,25 +94,31 @@ def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummar
     return words
 
 
-def _modes(band: SubFigure, posterior: Posterior, modes: Sequence[Mode], simulate: Callable[[Array], Contact]) -> None:
-    grid = band.subplots(2, _COLUMNS, height_ratios=[1, 1.25])
-    viewer = Viewer(posterior.mesh, posterior.sensor)
+def _modes(
+    band: SubFigure,
+    posterior: Posterior,
+    modes: Sequence[Mode],
+    views: Sequence[View],
+    part: float,
+    simulate: Callable[[Array], Contact],
+) -> None:
+    """The contact simulated at each mode, and below it the part there, which takes ``part`` inches."""
+    grid = band.subplots(2, _COLUMNS, height_ratios=[_BANDS["modes"], part])
     for column in range(_COLUMNS):
         above, below = grid[:, column]
         if column >= len(modes):
             above.axis("off")
             below.axis("off")
             continue
-        mode = modes[column]
-        T_sensor_object = inverse(posterior.T_frame_sensor) @ mode.T
-        contact = simulate(T_sensor_object)
+        mode, view = modes[column], views[column]
+        contact = simulate(inverse(posterior.T_frame_sensor) @ mode.T)
         shown = np.ones((*contact.mask.shape, 3))
         shown[contact.mask] = _rgb(SIMULATED)
-        _in_window(above, posterior, shown, f"mode {column + 1}: {100 * mode.probability:.1f} %", small=True)
+        _in_window(above, posterior, shown, f"mode {column + 1}: {percent(mode.probability)}", small=True)
         for observation in posterior.observations[:1]:
             outline(above, posterior, observation.contact, OBSERVED)
-        view = viewer.view(T_sensor_object)
         below.imshow(view.image, extent=view.extent)
+        below.set_ylim(_filled(view))
         below.axis("off")
         _draw_frame(below, posterior, view.place)
     above = grid[0, 0]
@@ -120,6 +128,8 @@ def _modes(band: SubFigure, posterior: Posterior, modes: Sequence[Mode], simulat
 
 
 def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
+    from matplotlib.ticker import MultipleLocator
+
     grid = band.subplots(1, 5)
     for axes, samples in zip(grid, all_samples, strict=False):
         mass, edges = samples.histogram()
@@ -127,8 +137,9 @@ def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
         axes.axvline(samples.mark, color=FIRST, lw=1.2, ls="--", label="mode 1")
         axes.set_xlabel(samples.label)
         axes.set_ylim(bottom=0)
-        if samples.values.min() >= 0:
-            axes.set_xlim(left=max(0.0, edges[0]))
+        axes.set_xlim(max(edges[0], samples.least), min(edges[-1], samples.most))
+        if samples.most == 180 and np.ptp(axes.get_xlim()) > 150:
+            axes.xaxis.set_major_locator(MultipleLocator(90))
         axes.ticklabel_format(useOffset=False)
     for axes in grid[len(all_samples) :]:
         axes.axis("off")
@@ -138,6 +149,26 @@ def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
         axes.axis("off")
     grid[0].set_ylabel("probability [%]")
     band.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", frameon=False)
+
+
+def _views(posterior: Posterior, modes: Sequence[Mode]) -> list[View]:
+    """The part at each mode."""
+    viewer = Viewer(posterior.mesh, posterior.sensor)
+    return [viewer.view(inverse(posterior.T_frame_sensor) @ mode.T) for mode in modes]
+
+
+def _filled(view: View) -> tuple[float, float]:
+    """Bottom and top [mm] of what a picture shows, with a little air."""
+    _, _, bottom, top = view.extent
+    height = (top - bottom) / len(view.image)
+    rows = np.flatnonzero((view.image < 1).any((1, 2)))  # the window at least is always there
+    return top - (rows[-1] + 12) * height, top - (rows[0] - 12) * height
+
+
+def _tallness(view: View) -> float:
+    """Height of what a picture shows over the picture's width."""
+    low, high = _filled(view)
+    return (high - low) / (view.extent[1] - view.extent[0])
 
 
 def outline(axes: Axes, posterior: Posterior, contact: Contact, colour: str) -> None:
@@ -175,13 +206,14 @@ def _words(posterior: Posterior, summaries: Sequence[ModeSummary]) -> list[str]:
     lines = [f"WARNING: {text}" for text in posterior.warnings]
     lines += [f"{posterior.mesh.name} on {posterior.sensor.name}", *facts(posterior), ""]
     for s in summaries[:1]:
+        lines += caution(summaries) or [f"Mode 1 holds {percent(s.probability)}."]
         lines += [
-            f"Mode 1 holds {100 * s.probability:.1f} %.",
             "Part's centre: "
             + ", ".join(f"{a} = {v:.2f}" for a, v in zip("xyz", s.centre_mm + 0.0, strict=True))
             + " mm",
-            f"(standard deviation {s.centre_sd_mm:.2f} mm, turned {s.rotation_sd_deg:.1f}°).",
-            f"What the contact tells: {s.told_in_words()}.",
+            f"Within the mode: standard deviation {s.centre_sd_mm:.2f} mm and {s.rotation_sd_deg:.1f}°.",
+            "What the contact tells about the six motions:",
+            s.told_in_words(),
         ]
     return lines
 

@@ -21,13 +21,18 @@ _TURNS = 4000  # poses that the distribution of turns is drawn from
 
 @dataclass(frozen=True)
 class Samples:
-    """Values with weights that sum to one; ``mark`` is the first mode's value, ``step`` the grid's in the same unit."""
+    """Values with weights that sum to one.
+
+    ``mark`` is the first mode's value, ``step`` the grid's in the same unit; values lie between ``least`` and ``most``.
+    """
 
     label: str
     values: Array
     weights: Array
     mark: float
     step: float
+    least: float = -np.inf
+    most: float = np.inf
 
     def histogram(self, most: int = 36) -> tuple[Array, Array]:
         """Probability in each of n <= ``most`` bins (n,), and their edges (n + 1,), over all but a thousandth of the mass.
@@ -72,7 +77,11 @@ def marginals(posterior: Posterior, T_first: Array) -> list[Samples]:
     turn, tilt = turn_and_tilt(poses[few, :3, :3], T_first[:3, :3], posterior.mesh.symmetry)
     even = np.full(len(few), 1 / len(few))
     angle = float(np.degrees(level_step(grid.level)))
-    return [*out, Samples("turn about z [°]", turn, even, 0.0, angle), Samples("tilt [°]", tilt, even, 0.0, angle)]
+    return [
+        *out,
+        Samples("turn about z [°]", turn, even, 0.0, angle, -180.0, 180.0),
+        Samples("tilt [°]", tilt, even, 0.0, angle, 0.0, 180.0),
+    ]
 
 
 def turn_and_tilt(R: Array, R_first: Array, symmetry: Symmetry | None) -> tuple[Array, Array]:

@@ -48,8 +48,9 @@ def page(
         parts += ["<h2>Where the part may be</h2>", _table(HEADINGS, rows)]
         parts += [
             f"<p>In the {escape(content['frame'])} frame: x along image columns, y along image rows downwards, z out of "
-            "the sensor towards the part. ± is the standard deviation in the least certain direction. Tilts, turns and "
-            "shifts are about the middle of the contact. The exact matrices are in result.json and below.</p>"
+            "the sensor towards the part. ± is the standard deviation in the least certain direction, within the mode. "
+            "Tilts are about x and y, turns about z, through the middle of the contact. The exact matrices are in "
+            "result.json and below.</p>"
         ]
     parts += _picture("The touch", "the image and the contact found in it", pictures.get("touch"))
     parts += _picture(
@@ -63,8 +64,13 @@ def page(
             "<p>Turn and tilt are counted from mode 1, modulo the part's own symmetry; the dashed line is mode 1.</p>"
         ]
     parts += _folded("Poses T (object to " + content["frame"] + " frame, metres)", [m["T"] for m in content["modes"]])
-    for title, key in (("Settings", "settings"), ("Timing [ms]", "timing_ms"), ("Versions", "versions")):
-        parts += _folded(title, content[key])
+    timing = {stage: f"{ms:,.1f}" for stage, ms in content["timing_ms"].items()}
+    for title, entries in (
+        ("Settings", content["settings"]),
+        ("Timing [ms]", timing),
+        ("Versions", content["versions"]),
+    ):
+        parts += _folded(title, entries)
     body = "\n".join(parts)
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{name} on {sensor}</title>\n'

@@ -17,8 +17,9 @@ from geomtact.sensing.sensor import Sensor
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Mode, Posterior
 
-# Motions of the part in the sensor frame about the contact's centre, in the order of a twist (rotations first).
-MOTIONS = ("tilt about x", "tilt about y", "turn about z", "shift along x", "shift along y", "shift along z")
+# Motions of the part in the sensor frame about and along x, y and z through the contact's centre, in the order of a
+# twist (rotations first).
+MOTIONS = ("tilt x", "tilt y", "turn z", "shift x", "shift y", "shift z")
 HEADINGS = ("mode", "probability", "centre x, y, z [mm]", "±", "rotation vector [°]", "±", "the contact tells")
 TOLD, HARDLY = 0.9, 0.1
 
@@ -48,7 +49,7 @@ class ModeSummary:
         """The mode as a row of a table under ``HEADINGS``."""
         return [
             str(number),
-            f"{100 * self.probability:.1f} %",
+            percent(self.probability),
             _list(self.centre_mm, 2),
             _sd(self.centre_sd_mm, 2),
             _list(self.rotvec_deg, 1),
@@ -57,12 +58,15 @@ class ModeSummary:
         ]
 
     def told_in_words(self) -> str:
-        """Which motions the contact tells, e.g. ``"all but turn about z, tilt about x (in part)"``."""
-        lost = [m for m, share in self.told.items() if share <= HARDLY]
-        partly = [f"{m} (in part)" for m, share in self.told.items() if HARDLY < share < TOLD]
-        if len(lost) == len(MOTIONS):
+        """Which motions the contact tells, e.g. ``"fixed: shift x, shift y, shift z; partly: tilt x; not: turn z"``."""
+        groups: dict[str, list[str]] = {"fixed": [], "partly": [], "not": []}
+        for motion, share in self.told.items():
+            groups["fixed" if share >= TOLD else "not" if share <= HARDLY else "partly"].append(motion)
+        if len(groups["not"]) == len(MOTIONS):
             return "unknown"  # every contact tells at least the depth: this mode was not refined
-        return f"all but {', '.join(lost + partly)}" if lost or partly else "all six motions"
+        if len(groups["fixed"]) == len(MOTIONS):
+            return "fixed: all six motions"
+        return "; ".join(f"{how}: {', '.join(motions)}" for how, motions in groups.items() if motions)
 
 
 def summarise(mode: Mode, centre: ArrayLike, contact_centre: ArrayLike = (0.0, 0.0, 0.0)) -> ModeSummary:
@@ -137,8 +141,20 @@ def facts(posterior: Posterior) -> list[str]:
         f"{known:.1f} nats are known: one part in {np.exp(min(known, 700)):,.0f} of all poses that touch is left."
         if known < 14
         else f"{known:.1f} nats are known: less than one part in a million of all poses that touch is left.",
-        f"{posterior.effective_poses:,.0f} of {len(posterior.log_prob):,} poses carry the probability.",
+        f"{posterior.effective_poses:,.0f} of the grid's {len(posterior.index):,} poses carry the probability.",
     ]
+
+
+def caution(modes: Sequence[ModeSummary]) -> list[str]:
+    """What to think of the first mode before its pose is believed; nothing if it holds half of the probability."""
+    if not modes or modes[0].probability >= 0.5:
+        return []
+    return [f"The part is probably not at mode 1, which holds {percent(modes[0].probability)}."]
+
+
+def percent(share: float) -> str:
+    """A share (0..1) in percent; what is small is not written as nothing."""
+    return f"{100 * share:.1f} %" if share >= 0.001 else "< 0.1 %"
 
 
 def _largest_sd(covariance: Array) -> float:

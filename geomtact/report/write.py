@@ -11,7 +11,7 @@ from geomtact.report.figure import draw
 from geomtact.report.files import write_whole
 from geomtact.report.page import page
 from geomtact.report.result import result, to_text
-from geomtact.report.summary import facts, summaries_of, table
+from geomtact.report.summary import caution, facts, summaries_of, table
 from geomtact.se3 import Array
 from geomtact.sensing.contact import Contact
 
@@ -49,7 +49,7 @@ def write_all(
     write_whole(folder / "report.png", lambda path: path.write_bytes(picture.whole))
     timing = {**(timing_ms or {}), "report": 1e3 * (time.perf_counter() - began)}
     content = result(posterior, modes, settings, timing)
-    html = page(content, table(summaries), facts(posterior), picture.bands)
+    html = page(content, table(summaries), [*facts(posterior), *caution(summaries)], picture.bands)
     write_whole(folder / "report.html", lambda path: path.write_text(html, "utf-8"))
     write_whole(folder / "result.json", lambda path: path.write_text(to_text(content), "utf-8"))
     return content

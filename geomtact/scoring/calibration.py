@@ -23,6 +23,7 @@ from geomtact.se3 import Array
 
 TEMPERATURES = np.geomspace(0.01, 30.0, 120)  # in units of the spread of the scores, whatever their scale
 _BINS = 1 << 14
+_TINY = 1e-30  # probabilities below it are added up as logarithms: single precision ends near 1e-38
 _SPREAD_TOUCHES = 10  # that the spread of the scores is taken from
 FLOORS = np.geomspace(1e-3, 0.5, 16)
 _SHAPE = {True: (72, 96), False: (96, 72)}  # of the simulated touches, for wide and for tall windows
@@ -119,26 +120,30 @@ def log_weights(index: Index) -> NDArray[np.float32]:
 
 
 def posterior_log_prob(
-    score: NDArray[np.float32], log_prior: NDArray[np.float32], calibration: Calibration
+    score: NDArray[np.float32], log_prior: NDArray[np.floating], calibration: Calibration
 ) -> tuple[Array, float]:
     """Log probability (N,) of every cell, and the log evidence: the mean of exp(score) under the prior.
 
     ``log_prior`` (N,) is the log mass of every cell, not normalised. The evidence takes the score as it is: divided by
     one object's temperature it could not be compared with another object's.
     """
-    prior = log_prior - _log_sum_exp(log_prior)
+    # normalised before it is rounded: a log density is given up to a constant, however large
+    prior = (log_prior - _log_sum_exp(log_prior)).astype(np.float32)
     joint = score.ravel() * np.float32(1 / calibration.temperature) + prior
     floor, total = calibration.floor, _log_sum_exp(joint)
-    # written out, and in single precision, because numpy's logaddexp takes many times as long; the floor keeps every
-    # probability far above the smallest that single precision knows
+    # written out, and in single precision, because numpy's logaddexp takes many times as long
     joint -= np.float32(total - np.log1p(-floor))
-    probability = np.exp(joint, out=joint)
-    probability += np.exp(prior + np.float32(np.log(floor)))
+    prior += np.float32(np.log(floor))
+    probability = np.exp(joint)
+    probability += np.exp(prior)
     with np.errstate(divide="ignore"):
-        log_prob = np.log(probability, out=probability)
-    return log_prob.astype(float), _log_sum_exp(score.ravel() + prior)
+        log_prob = np.log(probability).astype(float)
+    tiny = np.flatnonzero((probability < _TINY) & (prior > -np.inf))
+    log_prob[tiny] = np.logaddexp(joint[tiny], prior[tiny], dtype=float)
+    prior -= np.float32(np.log(floor))
+    return log_prob, _log_sum_exp(score.ravel() + prior)
 
 
-def _log_sum_exp(x: NDArray[np.float32]) -> float:
+def _log_sum_exp(x: NDArray[np.floating]) -> float:
     top = x.max()
     return float(top + np.log(np.exp(x - top).sum(dtype=np.float64)))

@@ -59,11 +59,15 @@ class VectorScorer:
 
     def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Similarity (P, n) of ``mask`` (h, w) to the mask of every pose: minus the squared distance of the vectors."""
-        small = to_grid(without_specks(mask, index.sensor), index.resolution.mask_shape)
-        seen = self.descriptor.describe(small[None], index.sensor)[0]
+        seen = self.seen(index, mask)
         out = self.stored @ (2 * seen)
         out -= self._squared
         return (out - np.float32(seen @ seen)).reshape(index.height.shape)
+
+    def seen(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Vector (d,) of the observed ``mask`` (h, w)."""
+        small = to_grid(without_specks(mask, index.sensor), index.resolution.mask_shape)
+        return self.descriptor.describe(small[None], index.sensor)[0]
 
 
 def describe_index(

@@ -77,14 +77,14 @@ def read_observation(
     else:
         contact = Contact(_reading(array, name, sensor, background, warnings))
     if contact.mask.all():
-        warnings.append(f"{name}: every pixel is in contact; the outline lies outside the window and tells nothing")
+        warnings.append(f"{name}: every pixel is in contact: the contact fills the image, so its outline is not seen")
     return Observation(contact, kind, warnings, array)
 
 
 def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any]]:
     """The name and the array (H, W) or (H, W, 3) behind a path or an array; opaque alpha is dropped."""
     if isinstance(source, str | Path):
-        name, array = str(source), read_image(source)
+        name, array = f"{role} {source}" if role == "background" else str(source), read_image(source)
     else:
         name, array = role, np.asarray(source)
     if array.dtype.kind not in "buif":
@@ -117,11 +117,15 @@ def _check_size(array: NDArray[Any], sensor: Sensor, name: str) -> None:
         return
     wanted, given = "{} x {} px".format(*sensor.image_size_px), f"{width} x {height} px"
     if (height, width) == sensor.image_size_px:
-        hint = "the image is transposed: rotate it by 90 degrees, as the camera sees it"
+        turned = "array.T" if array.ndim == 2 else "array.swapaxes(0, 1)"
+        hint = f"the image is transposed: transpose it ({turned}) or rotate it by 90 degrees, as it was taken"
     elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
         hint = "the shape agrees: resize the image, or describe this resolution in a sensor file of its own"
     else:
-        hint = "name the sensor that took it"
+        hint = (
+            "name the sensor that took it; crop or scale nothing: give the image as the camera made it, "
+            "or a sensor file of its resolution"
+        )
     raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
 
 
@@ -132,8 +136,22 @@ def _decide(array: NDArray[Any], name: str, warnings: list[str]) -> str:
         return "mask"
     if array.dtype.kind == "f" or array.dtype == np.uint16:
         return "height"
-    warnings.append(f"{name}: a grey image with many values is taken as a reading; for a mask or height give --kind")
+    if _smeared_mask(array, name):
+        warnings.append(
+            f"{name}: JPEG, taken as a reading; for a mask give --kind mask (and PNG, which keeps it exact)"
+        )
+    else:
+        warnings.append(
+            f"{name}: a grey image with many values is taken as a reading; for a mask or height give --kind"
+        )
     return "reading"
+
+
+def _smeared_mask(array: NDArray[Any], name: str) -> bool:
+    """A grey JPEG of nearly black and nearly white: what its compression makes of a mask, with rims that are not 0."""
+    if Path(name).suffix.lower() not in (".jpg", ".jpeg") or array.ndim != 2 or array.dtype != np.uint8:
+        return False
+    return bool(((array < 32) | (array > 223)).mean() > 0.95 and (array > 223).any())
 
 
 def _two_valued(array: NDArray[Any]) -> bool:
@@ -147,6 +165,9 @@ def _two_valued(array: NDArray[Any]) -> bool:
 def _mask(array: NDArray[Any], name: str, warnings: list[str]) -> NDArray[np.bool_]:
     if array.ndim == 3:
         raise ImageError(f"{name}: a mask has one channel, got a colour image; save it as grey or give --kind reading")
+    if _smeared_mask(array, name) and not _two_valued(array):
+        warnings.append(f"{name}: JPEG smears a mask, so what is brighter than half counts as contact; better give PNG")
+        return array > 127
     if array.dtype != bool and not _two_valued(array):
         warnings.append(f"{name}: the mask has more than two values; every pixel that is not 0 counts as contact")
     return array != 0

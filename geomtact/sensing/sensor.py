@@ -63,7 +63,8 @@ class Sensor:
                 raise SensorError(f"sensor {self.name!r}: {what}")
 
         need(all(n >= 8 for n in self.image_size_px), f"image_size_px must be at least 8, got {self.image_size_px}")
-        need(all(p > 0 for p in self.pixel_pitch), f"pixel_pitch_mm must be positive, got {self.pixel_pitch}")
+        pitch_mm = [round(1e3 * p, 9) for p in self.pixel_pitch]
+        need(all(p > 0 for p in self.pixel_pitch), f"pixel_pitch_mm must be positive, got {pitch_mm}")
         need(self.max_penetration > 0, "max_penetration_mm must be positive")
         need(self.camera_distance >= 0, "camera_distance_mm must be >= 0 (0 means orthographic)")
         need(
@@ -95,6 +96,8 @@ class Sensor:
         if path.suffix == ".toml" or path.is_file():
             try:
                 return cls.from_toml(path.read_text("utf-8"), str(path))
+            except FileNotFoundError:
+                raise SensorError(f"sensor file {path}: no such file; give a TOML file or a bundled sensor") from None
             except (OSError, UnicodeDecodeError) as error:
                 raise SensorError(f"sensor file {path}: cannot be read ({error}); give a TOML file") from None
         raise SensorError(f"no sensor named {text!r}{nearest_name(text, bundled_sensors())}; or give a .toml file")
@@ -128,16 +131,19 @@ class Sensor:
         housing = data.get("housing_depth_mm")
         width, height = data["image_size_px"]
         pitch_x, pitch_y = data["pixel_pitch_mm"]
-        return cls(
-            name=data["name"],
-            image_size_px=(int(width), int(height)),
-            pixel_pitch=(pitch_x / 1e3, pitch_y / 1e3),
-            camera_distance=data["camera_distance_mm"] / 1e3,
-            max_penetration=data["max_penetration_mm"] / 1e3,
-            membrane_radius=data.get("membrane_radius_mm", 0.0) / 1e3,
-            housing_depth=None if housing is None else housing / 1e3,
-            note=data.get("note", ""),
-        )
+        try:
+            return cls(
+                name=data["name"],
+                image_size_px=(int(width), int(height)),
+                pixel_pitch=(pitch_x / 1e3, pitch_y / 1e3),
+                camera_distance=data["camera_distance_mm"] / 1e3,
+                max_penetration=data["max_penetration_mm"] / 1e3,
+                membrane_radius=data.get("membrane_radius_mm", 0.0) / 1e3,
+                housing_depth=None if housing is None else housing / 1e3,
+                note=data.get("note", ""),
+            )
+        except SensorError as error:
+            raise SensorError(f"{origin}: {error}") from None
 
     def to_toml(self) -> str:
         """The TOML text that :meth:`from_toml` reads back to an equal sensor."""

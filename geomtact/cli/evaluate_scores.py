@@ -1,0 +1,254 @@
+"""``geomtact evaluate scores``: scores side by side on the same touches, what they tell and what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from geomtact.cli import study_file
+from geomtact.cli.shell import print_table, progress_bar, tell
+
+if TYPE_CHECKING:
+    from geomtact.geometry.mesh import Mesh
+    from geomtact.sensing.noise import Noise
+    from geomtact.sensing.sensor import Sensor
+
+SCHEMA = "geomtact/scores/1"
+MAX_POSES = 1_200_000
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a study's figures depend on, beside the parts and the scores: ``felt`` is one of ``scores.FELT``."""
+
+    sensor: Sensor
+    touches: int
+    noise_name: str
+    noise: Noise
+    felt: str
+    effort: str
+    seed: int
+    max_poses: int
+
+    def __str__(self) -> str:
+        return f"{self.touches} touches on {self.sensor.name}, {self.felt}, {self.noise_name} noise"
+
+    def settings(self) -> dict[str, Any]:
+        """As they stand in the file."""
+        named = {"sensor": self.sensor.name, "noise": {"name": self.noise_name, **asdict(self.noise)}}
+        return named | {key: getattr(self, key) for key in ("touches", "felt", "effort", "seed", "max_poses")}
+
+
+def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The parts and the scores that the command line names; by default the thesis's four parts, and all scores.
+
+    An option takes one word, so of ``--scores l1 iou`` the second comes among ``words``, with the parts.
+
+    Raises
+    ------
+    UsageError
+        No score of that name, or neither a score nor a part.
+    """
+    from geomtact.errors import UsageError, nearest_name
+    from geomtact.evaluation.scores import THESIS_PARTS
+    from geomtact.geometry.catalogue import catalogue
+    from geomtact.scoring.fitted import SCORERS
+
+    for name in scores:
+        if name not in SCORERS:
+            raise UsageError(f"no score named {name!r}{nearest_name(name, SCORERS)}")
+    more = [word for word in words if scores and word in SCORERS]
+    parts = [word for word in words if word not in more]
+    for word in parts:
+        if scores and word not in catalogue() and not Path(word).suffix:
+            raise UsageError(f"no score or part named {word!r}{nearest_name(word, [*SCORERS, *catalogue()])}")
+    return parts or list(THESIS_PARTS), list(dict.fromkeys([*scores, *more])) or list(SCORERS)
+
+
+def judge_scores(
+    parts: Sequence[str],
+    unit: str | None,
+    names: Sequence[str],
+    options: Options,
+    out: Path | None = None,
+    plot: Path | None = None,
+    cache_dir: Path | None = None,
+) -> dict[str, Any]:
+    """Judge the scores ``names`` on the same touches of each part, print the figures and write them to ``out``.
+
+    ``plot`` is the PNG that shows what they tell against what they cost.
+    """
+    from geomtact.errors import InputError
+    from geomtact.geometry.mesh import load_mesh
+    from geomtact.report.result import plain
+
+    content = study_file.load(out, SCHEMA)
+    settings = plain(options.settings())
+    if content.setdefault("settings", settings) != settings:
+        other = ", ".join(key for key in settings if content["settings"].get(key) != settings[key])
+        raise InputError(f"{out}: holds a study with other settings ({other}); give another file with --out")
+    content.pop("overall", None)
+    meshes = [load_mesh(part, unit, sensor=options.sensor) for part in parts]  # a wrong name is told before hours pass
+    for mesh in meshes:
+        part = _part(content, mesh, options.sensor)
+        touches: list = []  # made when first needed, and the same ones for every score
+        for name in names:
+            _judge(part, mesh, name, options, touches, lambda: study_file.save(out, content), cache_dir)
+            _compare(part, options.touches)
+        _print(f"{mesh.name}: {options}", part["scores"])
+    content["overall"] = plain(_overall(content["parts"]))
+    study_file.save(out, content)
+    tables = {name: part["scores"] for name, part in content["parts"].items()}
+    if len(tables) > 1:
+        tables["overall"] = content["overall"]
+        _print(f"mean over {', '.join(content['parts'])}", content["overall"])
+    _print_coverage(tables)
+    if plot is not None:
+        _draw(content, plot)
+    return content
+
+
+def _part(content: dict[str, Any], mesh: Mesh, sensor: Sensor) -> dict[str, Any]:
+    """What the file holds of the same part on the same sensor, or room for it."""
+    pressed = {"object_sha256": mesh.sha256, "sensor_sha256": sensor.sha256}
+    part = content["parts"].get(mesh.name)
+    if part is None or any(part[key] != value for key, value in pressed.items()):
+        part = content["parts"][mesh.name] = {**pressed, "index_s": None, "random_add_mm": None, "scores": {}}
+    return part
+
+
+def _judge(
+    part: dict[str, Any],
+    mesh: Mesh,
+    name: str,
+    options: Options,
+    touches: list,
+    save: Callable[[], None],
+    cache_dir: Path | None,
+) -> None:
+    """Judge one score on one part, from where the file ends."""
+    from geomtact.evaluation import scores, study
+    from geomtact.report.result import plain
+
+    with progress_bar(f"preparing {mesh.name}, {name}") as progress:
+        localizer, seconds = scores.prepare(mesh, options.sensor, name, options.max_poses, cache_dir, progress)
+    described = plain(study.describe(localizer))
+    found = part["scores"].get(name)
+    outcomes = study_file.earlier(found, described, scores.Scored)
+    known = {**(found["prepare_s"] if outcomes else {}), "index": part["index_s"]}
+    seconds = {step: known.get(step) if s is None else s for step, s in seconds.items()}
+    part["index_s"] = seconds["index"]
+    part["random_add_mm"] = part["random_add_mm"] or study.expected_random_add(localizer)
+
+    def keep(outcomes: list) -> None:
+        entry = {
+            "settings": described,
+            "bytes_per_pose": scores.bytes_per_pose(localizer.scorer.scorer, localizer.index),
+            "prepare_s": seconds,
+            "outcomes": [asdict(o) for o in outcomes],
+        }
+        part["scores"][name] = plain(entry)
+        save()
+
+    if len(outcomes) < options.touches and not touches:
+        elastic = scores.FELT[options.felt]
+        touches += study.make_touches(localizer, options.touches, options.seed, options.noise, elastic=elastic)
+    todo = scores.judged(localizer, touches[len(outcomes) :], options.effort, options.seed)
+    keep(study_file.collect(outcomes, todo, options.touches, f"judging {mesh.name}, {name}", keep))
+    tell(f"{mesh.name}, {name}: done")
+
+
+def _compare(part: dict[str, Any], n: int) -> None:
+    """Write the figures of those of a part's scores that have all ``n`` touches, beside their outcomes."""
+    from geomtact.evaluation import scores
+    from geomtact.report.result import plain
+
+    outcomes = {name: study_file.outcomes(entry, scores.Scored) for name, entry in part["scores"].items()}
+    done = {name: some for name, some in outcomes.items() if len(some) == n}
+    for name, some in done.items():
+        figures = scores.summarise(some, done.get("iou", []), part["random_add_mm"])
+        part["scores"][name]["figures"] = plain(figures)
+
+
+def _overall(parts: Mapping[str, Any]) -> dict[str, Any]:
+    """The figures over all parts, of those scores that have been judged on each."""
+    from geomtact.evaluation import scores
+
+    entries = [part["scores"] for part in parts.values()]
+    names = [name for name in entries[0] if all("figures" in some.get(name, {}) for some in entries)]
+    return {
+        name: scores.over_parts(
+            [some[name] for some in entries], [study_file.outcomes(some[name], scores.Scored) for some in entries]
+        )
+        for name in names
+    }
+
+
+def _draw(content: Mapping[str, Any], path: Path) -> None:
+    from geomtact.report.files import write_whole
+    from geomtact.report.score_plot import draw_scores
+
+    picture = draw_scores(content)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, lambda temporary: temporary.write_bytes(picture))
+
+
+def _print(title: str, entries: Mapping[str, Any]) -> None:
+    """A table of what each score tells and costs: bytes are those of a pose, ready is after the index, the description
+    of its contacts and the calibration."""
+    headings = ["gain [nats]", "claimed", "over iou", "MSSD [mm]", "of 10", "in 50/80/90/95 %", "worst"]
+    headings += ["score [ms]", "localize [ms]", "bytes", "ready [s]"]
+    rows = []
+    for name, entry, f in _groups(entries):
+        seconds = entry["prepare_s"].values()
+        row = [
+            _with_error(f["gain_mean"], f["gain_standard_error"]),
+            _number(f["claimed_mean"], 2),
+            _with_error(f["over_iou_mean"], f["over_iou_standard_error"], "+"),
+            _number(f["mssd_mm_median"], 1),
+            _number(f["mssd10_mm_median"], 1),
+            "/".join(f"{100 * c['share']:.0f}" for c in f["coverage"]),
+            f"{100 * f['coverage_error']:.0f}",
+            _number(f["score_ms_median"], 1),
+            _number(f["ms_median"], 1),
+            _number(entry["bytes_per_pose"], 0),
+            _number(None if None in seconds else sum(seconds), 1),
+        ]
+        rows.append([name, *row])
+    typer.echo(title)
+    print_table(["score", *headings], rows, headings)
+
+
+def _print_coverage(tables: Mapping[str, Mapping[str, Any]]) -> None:
+    """The coverage of all ``tables`` (entries by title) with its intervals."""
+    rows = []
+    for title, entries in tables.items():
+        for name, _, f in _groups(entries):
+            inside = [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in f["coverage"]]
+            rows.append([title, name, str(f["n"]), *inside])
+            masses = [f"in {100 * c['nominal']:.0f} %" for c in f["coverage"]]
+    typer.echo("Percentage of truths inside the region of each mass, with 95 % intervals")
+    print_table(["part", "score", "n", *masses], rows, ["n", *masses])
+
+
+def _groups(entries: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:
+    """Name, entry and figures of every score that is done; touches of two kinds have a row each below those of all."""
+    return [
+        (name if group == "all" else f"  {group}", entry, f)
+        for name, entry in entries.items()
+        for group, f in entry.get("figures", {}).items()
+        if group == "all" or len(entry["figures"]) > 2
+    ]
+
+
+def _with_error(value: float | None, error: float | None, sign: str = "-") -> str:
+    return _number(value, 2, sign) + ("" if None in (value, error) else f" ± {error:.2f}")
+
+
+def _number(value: float | None, digits: int, sign: str = "-") -> str:
+    """``value``, or a dash where there is none, such as the time of what was in the cache already."""
+    return "-" if value is None else f"{value:{sign}.{digits}f}"

@@ -1,0 +1,75 @@
+"""The JSON file of a study: kept up to date while the study runs, so that a stopped run goes on from there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from geomtact.cli.shell import progress_bar
+
+_SAVE_EVERY = 10  # touches
+
+
+def load(out: Path | None, schema: str) -> dict[str, Any]:
+    """What the file holds, or an empty study."""
+    import json
+
+    from geomtact.errors import InputError
+
+    if out is None or not out.exists():
+        return {"schema": schema, "parts": {}}
+    try:
+        content = json.loads(out.read_text("utf-8"))
+        if content["schema"] != schema:
+            raise ValueError(content["schema"])
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{out}: is there, but is no study of geomtact; give another file with --out") from None
+    return content
+
+
+def earlier(entry: dict[str, Any] | None, settings: dict[str, Any], kind: Callable[..., Any]) -> list:
+    """The outcomes, each a ``kind``, of an earlier run with the very same settings."""
+    import json
+
+    from geomtact.report.result import plain
+
+    if entry is None or entry["settings"] != json.loads(json.dumps(plain(settings))):
+        return []
+    return outcomes(entry, kind)
+
+
+def outcomes(entry: dict[str, Any], kind: Callable[..., Any]) -> list:
+    """The outcomes of an entry, each a ``kind``.
+
+    Null stands for what JSON has no number for: no contact was found, so the pose is infinitely wrong.
+    """
+    without = {"gain": -math.inf}
+    return [
+        kind(**{key: without.get(key, math.inf) if value is None else value for key, value in outcome.items()})
+        for outcome in entry["outcomes"]
+    ]
+
+
+def collect(done: list, more: Iterable, total: int, title: str, keep: Callable[[list], None]) -> list:
+    """The outcomes ``done`` and ``more``, ``total`` in all, under a progress bar; ``keep`` is called every few."""
+    with progress_bar(title) as progress:
+        for outcome in more:
+            done.append(outcome)
+            progress(len(done) / total, "")
+            if len(done) % _SAVE_EVERY == 0:
+                keep(done)
+    return done
+
+
+def save(out: Path | None, content: dict[str, Any]) -> None:
+    """Write ``content``, with the versions of what made it, if there is a file to write."""
+    from geomtact.report.files import write_whole
+    from geomtact.report.result import to_text, versions
+
+    content["versions"] = versions()
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        text = to_text(content)
+        write_whole(out, lambda path: path.write_text(text, "utf-8"))

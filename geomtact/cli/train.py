@@ -1,0 +1,70 @@
+"""``geomtact train``: the shared encoder from nothing, or fine-tuned for one part."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geomtact.cli.prepare import Unit
+from geomtact.cli.shell import progress_bar, tell
+from geomtact.errors import UsageError
+
+_TUNING_RATE = 3e-4  # a step of fine-tuning must not undo what many parts taught
+
+
+def train(
+    out: Annotated[Path, typer.Option(help="Weights file to write; the card and curves go beside it.")] = Path(
+        "encoder.safetensors"
+    ),
+    object_name: Annotated[
+        str | None, typer.Option("--object", metavar="OBJECT", help="Fine-tune for this part or mesh file.")
+    ] = None,
+    unit: Unit = None,
+    sensor: Annotated[str, typer.Option(help="Of the part: name or TOML file.")] = "gelslim",
+    scenes: Annotated[int | None, typer.Option(min=50, help="Scenes; 600 by default, 80 of one part.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps; 4000 by default, 600 for one part.")] = None,
+    start: Annotated[Path | None, typer.Option(help="Weights to start from: those to fine-tune.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    work: Annotated[
+        Path | None, typer.Option(help="Folder for scenes and state; by default one named after --out.")
+    ] = None,
+) -> None:
+    """Train the encoder that compares contacts. A stopped run goes on where it was.
+
+    Without --object it learns from procedural parts and serves every part. With --object and --start, an encoder is
+    fine-tuned on simulated touches of that part. Use the result as Localizer.prepare(..., scorer="FILE.safetensors").
+    """
+    if out.suffix != ".safetensors":
+        raise UsageError(f"--out {out}: expected a name that ends in .safetensors")
+    work = work or out.with_name(f"{out.stem}.training")
+    from geomtact.training import dataset
+    from geomtact.training.card import read_weights, write_encoder
+    from geomtact.training.train import Settings
+    from geomtact.training.train import train as run
+
+    settings = Settings(steps=steps or 4000, seed=seed)
+    with progress_bar("training") as progress:
+        if object_name is None:
+            n = scenes or 600
+            made = dataset.shared_scenes(work / "scenes", n, seed, progress)
+            data = {"parts": "procedural", "sensors": dataset.SENSORS, "sizes": dataset.SIZES, "poses": dataset.POSES}
+        else:
+            from dataclasses import replace
+
+            from geomtact.geometry.mesh import load_mesh
+            from geomtact.sensing.sensor import Sensor
+
+            gel = Sensor.load(sensor)
+            mesh = load_mesh(object_name, unit, sensor=gel)
+            n = scenes or 80
+            made = dataset.part_scenes(work / "scenes", mesh, gel, 1_200_000, n, seed, progress)
+            data = {"part": mesh.name, "sha256": mesh.sha256, "sensor": gel.name}
+            settings = replace(settings, steps=steps or 600, rate=_TUNING_RATE, validation=max(n // 8, 5))
+        if start is not None:
+            data["start"] = start.name
+        network, curve = run(made, settings, work, progress, start=read_weights(start) if start is not None else None)
+    write_encoder(out, network, curve, settings, made, data)
+    tell(f"{curve.validation[-1]:.2f} nats on scenes that it never saw")
+    typer.echo(f"written: {out}, {out.with_suffix('.json').name} and {out.with_suffix('.png').name}")

@@ -1,0 +1,134 @@
+"""The similarity network: one small encoder for all parts, so that a new part needs no training.
+
+Two towers that share most of their weights: one for what the sensor shows, one for what was simulated on the grid. It was
+trained so that minus the squared distance of the vectors is a log likelihood up to a constant: the cell that holds the
+touch is to get the largest posterior among all cells of its part (``training.train``). The architecture is a plain
+perceptron over the pixels and the contact's moments: a million contacts take seconds, and a touch needs no torch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from geomtact.contact_space.index import Index
+from geomtact.errors import InputError
+from geomtact.scoring.vectors import VectorScorer
+from geomtact.sensing.moments import without_specks
+from geomtact.sensing.sensor import Sensor
+
+SHAPE = (24, 32)  # of what the network sees: the whole window, lying
+MOMENTS = 6
+_PIXEL = 2 / SHAPE[1] / float(np.hypot(1, SHAPE[0] / SHAPE[1]))  # in units of the window's half diagonal
+Weights = dict[str, NDArray[np.float32]]
+
+
+class EncoderScorer(VectorScorer):
+    """Minus the squared distance between the network's vectors of the observed and of every stored contact."""
+
+    def seen(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Vector (d,) of the observed ``mask`` (h, w)."""
+        assert isinstance(self.descriptor, Tower)
+        image = _lying(without_specks(mask, index.sensor)[None].astype(np.float32))[0]
+        small = cv2.resize(image, SHAPE[::-1], interpolation=cv2.INTER_AREA)
+        return vector(self.descriptor.weights, small)
+
+
+@dataclass(frozen=True, eq=False)
+class Tower:
+    """The network's side for stored contacts, as a descriptor."""
+
+    weights: Weights
+    name: str = "encoder"
+
+    def __repr__(self) -> str:
+        digest = hashlib.sha256(b"".join(name.encode() + w.tobytes() for name, w in sorted(self.weights.items())))
+        return f"Tower({digest.hexdigest()})"
+
+    def describe(self, masks: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.float32]:
+        """Vectors (m, d) of masks (m, h, w), which are as fine as ``SHAPE`` or a whole number of times finer."""
+        from geomtact.scoring.network import run
+
+        images = _lying(masks.astype(np.float32))
+        n, h, w = images.shape
+        blocks = images.reshape(n, SHAPE[0], h // SHAPE[0], SHAPE[1], w // SHAPE[1])
+        return run(self.weights, blocks.mean((2, 4), dtype=np.float32), "stored")
+
+
+def vector(weights: Weights, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What ``network.Encoder`` makes of one touch: vector (d,) of an image (24, 32), the share of each pixel in contact."""
+    m = moment_features(image.reshape(1, -1) @ BASIS, np)[0]
+    x = np.concatenate([image.ravel(), m])
+    for layer in ("trunk.0", "trunk.2"):
+        x = _gelu(weights[f"{layer}.weight"] @ x + weights[f"{layer}.bias"])
+    x = _gelu(weights["heads.touch.0.weight"] @ np.concatenate([x, m]) + weights["heads.touch.0.bias"])
+    return np.asarray(weights["heads.touch.2.weight"] @ x + weights["heads.touch.2.bias"], np.float32)
+
+
+def moment_features(sums: Any, xp: Any) -> Any:
+    """The six moments (n, 6) of contacts as in ``sensing.moments``, brought to a spread near 1.
+
+    ``sums`` (n, 6) are the images times ``BASIS``; ``xp`` is numpy or torch.
+    """
+    area = sums[:, 0].clip(min=0.25)
+    mx, my, xx, xy, yy = (sums[:, 1:] / area[:, None]).T
+    xx = (xx - mx * mx).clip(min=0) + _PIXEL**2 / 12
+    yy = (yy - my * my).clip(min=0) + _PIXEL**2 / 12
+    xy = xy - mx * my
+    middle = (xx + yy) / 2
+    spread = xp.minimum(xp.hypot((xx - yy) / 2, xy), middle - _PIXEL**2 / 24)
+    large, small = middle + spread, middle - spread
+    stretch, angle = 0.5 * xp.log(large / small), xp.arctan2(2 * xy, xx - yy)
+    size = (0.5 * xp.log(area * _PIXEL**2) + 2, 0.25 * xp.log(large * small) + 1.2)
+    return xp.stack([3 * mx, 3 * my, *size, stretch * xp.cos(angle), stretch * xp.sin(angle)], 1)
+
+
+def _basis() -> NDArray[np.float32]:
+    y, x = (((np.arange(n) - (n - 1) / 2) * _PIXEL) for n in SHAPE)
+    X, Y = (c.ravel() for c in np.meshgrid(x, y))
+    return np.stack([np.ones_like(X), X, Y, X * X, X * Y, Y * Y], 1).astype(np.float32)
+
+
+BASIS = _basis()  # (768, 6): sums of an image's pixels times 1, x, y and their products
+
+
+@lru_cache(maxsize=4)
+def load_weights(path: Path) -> Weights:
+    """The encoder's weights from a safetensors file.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or holds the weights of another architecture.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    advice = "give a file that 'geomtact train' wrote"
+    try:
+        weights = {name: np.asarray(value, np.float32) for name, value in load_file(str(path)).items()}
+        vector(weights, np.zeros(SHAPE, np.float32))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {advice}") from None
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"{path}: not a whole safetensors file ({error}); {advice}") from None
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: the weights of another network ({error}); {advice}") from None
+    return weights
+
+
+def _lying(masks: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Masks (n, h, w) of a tall window mirrored about its diagonal, so that they lie; others as they are."""
+    return np.ascontiguousarray(np.swapaxes(masks, 1, 2)) if masks.shape[1] > masks.shape[2] else masks
+
+
+def _gelu(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(0.5 * x * (1 + erf(x / np.sqrt(2))), np.float32)

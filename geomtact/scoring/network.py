@@ -1,0 +1,55 @@
+"""The similarity network in torch: for training, and for describing a million stored contacts at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from geomtact.scoring.encoder import BASIS, MOMENTS, SHAPE, moment_features
+
+_BATCH = 8192
+
+
+class Encoder(nn.Module):
+    """Vectors of contacts."""
+
+    basis: torch.Tensor
+
+    def __init__(self, width: int = 512, dimension: int = 32):
+        super().__init__()
+        n = SHAPE[0] * SHAPE[1] + MOMENTS
+        self.trunk = nn.Sequential(nn.Linear(n, width), nn.GELU(), nn.Linear(width, width), nn.GELU())
+        self.heads = nn.ModuleDict(
+            {
+                side: nn.Sequential(nn.Linear(width + MOMENTS, width // 2), nn.GELU(), nn.Linear(width // 2, dimension))
+                for side in ("touch", "stored")
+            }
+        )
+
+        self.register_buffer("basis", torch.from_numpy(BASIS), persistent=False)
+
+    def forward(self, images: torch.Tensor, side: str) -> torch.Tensor:
+        """Vectors (n, d) of images (n, 24, 32), the share of each pixel in contact; ``side`` is "touch" or "stored"."""
+        with torch.autocast("cpu", enabled=False):  # differences of squares need single precision
+            sums = images.float().flatten(1) @ self.basis  # (n, 6)
+        m = moment_features(sums, torch)  # (n, 6)
+        x = self.trunk(torch.cat([images.flatten(1), m], 1))  # (n, width)
+        out: torch.Tensor = self.heads[side](torch.cat([x, m], 1))
+        return out
+
+
+def run(weights: dict[str, NDArray[np.float32]], images: NDArray[np.float32], side: str) -> NDArray[np.float32]:
+    """Vectors (n, d) of ``images`` (n, 24, 32) under ``weights``, in bfloat16 where the processor has it."""
+    network = with_weights(weights)
+    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
+        parts = [network(torch.from_numpy(images[i : i + _BATCH]), side).float() for i in range(0, len(images), _BATCH)]
+    return np.asarray(torch.cat(parts).numpy())
+
+
+def with_weights(weights: dict[str, NDArray[np.float32]]) -> Encoder:
+    """The network with given weights; a RuntimeError or a KeyError says that they are not its own."""
+    network = Encoder(len(weights["trunk.0.bias"]), len(weights["heads.touch.2.bias"]))
+    network.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+    return network.eval()

@@ -1,0 +1,78 @@
+"""What a trained encoder is and where it came from: weights, a model card and a picture of how it learned."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+
+from geomtact.scoring.network import Encoder
+from geomtact.training.augment import AUGMENTATIONS
+from geomtact.training.scenes import Scene
+from geomtact.training.train import Curve, Settings
+
+SCHEMA = "geomtact/encoder/1"
+
+
+def write_encoder(
+    path: Path, network: Encoder, curve: Curve, settings: Settings, scenes: Sequence[Scene], data: dict[str, Any]
+) -> None:
+    """Write ``path`` (safetensors, half precision), and beside it the card (.json) and the curves (.png).
+
+    ``data`` says where the scenes come from.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    save_file({name: value.half().contiguous() for name, value in network.state_dict().items()}, temporary)
+    os.replace(temporary, path)
+    card = {
+        "schema": SCHEMA,
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "bytes": path.stat().st_size,
+        "data": data
+        | {
+            "scenes": len(scenes),
+            "touches": sum(len(s.true) for s in scenes),
+            "stored contacts": sum(len(s.weight) for s in scenes),
+        },
+        "settings": asdict(settings),
+        "augmentations": [{"name": a.name, "range": a.range, "reason": a.reason} for a in AUGMENTATIONS],
+        "curve": asdict(curve),
+        "versions": _versions(),
+    }
+    path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", "utf-8")
+    draw_curve(curve, path.with_suffix(".png"))
+
+
+def draw_curve(curve: Curve, path: Path) -> None:
+    """A picture of the gain over the steps."""
+    from matplotlib.figure import Figure
+
+    figure = Figure((6, 3.5), layout="constrained")
+    axes = figure.add_subplot(
+        xlabel="step", ylabel="gain [nats]", title="Information gained about the cell that holds a touch"
+    )
+    axes.plot(curve.step, curve.training, color="#E69F00", label="parts that it learns from")
+    axes.plot(curve.step, curve.validation, color="#0072B2", label="parts that it never saw")
+    axes.legend(frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=120)
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import version
+
+    return {name: version(name) for name in ("geomtact", "torch", "kornia", "numpy", "manifold3d")}
+
+
+def read_weights(path: Path) -> dict[str, torch.Tensor]:
+    """The weights of an encoder file, to go on training from."""
+    from geomtact.scoring.encoder import load_weights
+
+    return {name: torch.from_numpy(value) for name, value in load_weights(path).items()}

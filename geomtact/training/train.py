@@ -1,0 +1,220 @@
+"""Trains the shared encoder: the cell that holds a touch is to get the largest posterior among all cells of its part.
+
+The loss is minus the information gained about the true cell, in nats,
+
+    loss = -( s_true - log sum_j w_j exp(s_j) ),    s_j = -|f(touch) - g(stored_j)|^2,
+
+with the stored contacts j of the same part and the uniform measure w_j of their cells: noise-contrastive estimation with
+the prior as noise (van den Oord et al. 2018). Its minimum is the true log likelihood, so what is learned is the score
+that a posterior needs, for contacts that differ by as much as a grid cell lets them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+
+from geomtact.errors import GeomtactError, InputError
+from geomtact.scoring.encoder import SHAPE
+from geomtact.scoring.network import Encoder
+from geomtact.training.augment import augmented
+from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, Scene
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run depends on, beside its scenes."""
+
+    steps: int = 4000
+    scenes_a_step: int = 3
+    touches: int = 160  # of a scene, at most
+    stored: int = 3000  # contacts of a scene that each touch is told from, at most
+    elastic: float = 0.7  # share of touches felt by an elastic gel
+    rate: float = 2e-3
+    weight_decay: float = 1e-3
+    width: int = 512
+    dimension: int = 32
+    validation: int = 40  # scenes that are never trained on
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Gain [nats] over the steps: mean over the training touches since the last entry, and over the validation's."""
+
+    step: list[int]
+    training: list[float]
+    validation: list[float]
+
+
+def train(
+    scenes: list[Scene],
+    settings: Settings,
+    folder: Path,
+    progress: Progress | None = None,
+    check_every: int = 250,
+    start: dict[str, torch.Tensor] | None = None,
+) -> tuple[Encoder, Curve]:
+    """Train on ``scenes``, all but the last ``settings.validation``; a stopped run goes on from ``folder``.
+
+    ``start`` holds weights to start from, for fine-tuning. The same settings and scenes give the same weights.
+
+    Raises
+    ------
+    InputError
+        Too few scenes.
+    GeomtactError
+        The loss is not a number any more; the last good state stays in ``folder``.
+    """
+    if len(scenes) <= settings.validation:
+        raise InputError(f"training: expected more than {settings.validation} scenes, got {len(scenes)}")
+    learned, judged = scenes[: -settings.validation], scenes[-settings.validation :]
+    torch.manual_seed(settings.seed)
+    network = Encoder(settings.width, settings.dimension)
+    if start is not None:
+        network.load_state_dict(start)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay)
+    curve = Curve([], [], [])
+    first = _resume(folder, network, optimizer, settings, curve)
+    gains: list[float] = []
+    for step in range(first, settings.steps):
+        # every step has a seed of its own, so that a resumed run draws what an uninterrupted one does
+        rng = np.random.default_rng([settings.seed, step])
+        for group in optimizer.param_groups:
+            group["lr"] = settings.rate * _schedule(step, settings.steps)
+        network.train()
+        optimizer.zero_grad()
+        for i in rng.integers(len(learned), size=settings.scenes_a_step):
+            gain = scene_gain(network, learned[i], settings, rng)
+            # one hopeless touch shall not steer the step
+            (-gain.clamp(min=-8).mean() / settings.scenes_a_step).backward()
+            gains.append(float(gain.detach().mean()))
+        if not math.isfinite(gains[-1]):
+            raise GeomtactError(
+                f"training: the loss is not a number at step {step}; the state of step {_kept(folder)} is kept in "
+                f"{folder}; go on with a smaller rate"
+            )
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        if (step + 1) % check_every == 0 or step + 1 == settings.steps:
+            curve.step.append(step + 1)
+            curve.training.append(float(np.mean(gains)))
+            curve.validation.append(validate(network, judged, settings))
+            gains = []
+            _save(folder, network, optimizer, settings, step + 1, curve)
+        if progress:
+            known = f", {curve.validation[-1]:.2f} nats on unseen parts" if curve.validation else ""
+            progress((step + 1) / settings.steps, f"training the encoder{known}")
+    return network.eval(), curve
+
+
+def validate(network: Encoder, scenes: list[Scene], settings: Settings) -> float:
+    """Mean gain [nats] on ``scenes``; the same touches and noise every time."""
+    network.eval()
+    rng = np.random.default_rng([settings.seed, 1 << 40])
+    with torch.no_grad():
+        return float(np.mean([scene_gain(network, s, settings, rng, flipped=False).mean() for s in scenes]))
+
+
+def scene_gain(
+    network: Encoder, scene: Scene, settings: Settings, rng: np.random.Generator, flipped: bool = True
+) -> torch.Tensor:
+    """Information gained (t,) [nats] about the true cells of some touches of a scene."""
+    touches, stored, true, log_w = _batch(scene, settings, rng, flipped)
+    with torch.autocast("cpu", torch.bfloat16):
+        f, g = network(touches, "touch"), network(stored, "stored")
+    f, g = f.float(), g.float()  # (t, d), (t + n, d)
+    s = 2 * f @ g.T - (f * f).sum(1)[:, None] - (g * g).sum(1)  # (t, t + n)
+    row = torch.arange(len(true))
+    evidence: torch.Tensor = torch.logsumexp(s[:, len(true) :] + log_w, 1)
+    return s[row, row] - evidence
+
+
+def _batch(
+    scene: Scene, settings: Settings, rng: np.random.Generator, flipped: bool
+) -> tuple[torch.Tensor, torch.Tensor, NDArray[np.int64], torch.Tensor]:
+    """Touches (t, 24, 32), their own stored contacts and others (t + n, 24, 32), the former's ids, the latter's log weights."""
+    some = rng.permutation(len(scene.true))[: settings.touches]
+    soft = rng.random(len(some)) < settings.elastic
+    masks = np.where(soft[:, None], scene.elastic[some], scene.rigid[some])
+    noise = torch.Generator().manual_seed(int(rng.integers(1 << 62)))
+    touches = augmented(_unpacked(masks, TOUCH_SHAPE)[:, None], scene.pixel, noise)
+    touches = F.avg_pool2d(touches, TOUCH_SHAPE[0] // SHAPE[0])[:, 0]
+    true = scene.true[some]
+    others = rng.choice(len(scene.weight), min(settings.stored, len(scene.weight)), replace=False)
+    stored = _unpacked(scene.stored[np.concatenate([true, others])], KEY_SHAPE)
+    for axis in (-1, -2):  # a mirrored part is a part
+        if flipped and rng.random() < 0.5:
+            touches, stored = touches.flip(axis), stored.flip(axis)
+    weight = scene.weight[others]
+    return touches, stored, true, torch.from_numpy(np.log(np.maximum(weight / weight.sum(), 1e-12)))
+
+
+def _unpacked(words: NDArray[np.uint64], shape: tuple[int, int]) -> torch.Tensor:
+    bits = np.unpackbits(np.ascontiguousarray(words).view(np.uint8), axis=1)
+    return torch.from_numpy(bits.reshape(-1, *shape)).float()
+
+
+def _schedule(step: int, steps: int) -> float:
+    """A short rise, then half a cosine."""
+    return min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
+
+
+def _save(
+    folder: Path, network: Encoder, optimizer: torch.optim.Optimizer, settings: Settings, step: int, curve: Curve
+) -> None:
+    """All that :func:`_resume` needs, in one file that is whole or absent."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {f"network.{k}": v.contiguous() for k, v in network.state_dict().items()}
+    for i, state in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{i}.{k}": v.clone() for k, v in state.items()}
+    meta = {"step": str(step), "settings": json.dumps(asdict(settings)), "curve": json.dumps(asdict(curve))}
+    temporary = folder / f".state.{os.getpid()}"
+    save_file(tensors, temporary, meta)
+    os.replace(temporary, folder / "state.safetensors")
+
+
+def _resume(folder: Path, network: Encoder, optimizer: torch.optim.Optimizer, settings: Settings, curve: Curve) -> int:
+    """Bring back what :func:`_save` wrote under the same settings; the step to go on with."""
+    path = folder / "state.safetensors"
+    meta = _meta(path)
+    if meta is None or json.loads(meta["settings"]) != asdict(settings):
+        return 0
+    tensors = load_file(path)
+    network.load_state_dict({k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")})
+    states: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimizer."):
+            _, i, k = name.split(".")
+            states.setdefault(int(i), {})[k] = value
+    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+    for name, values in json.loads(meta["curve"]).items():
+        getattr(curve, name).extend(values)
+    return int(meta["step"])
+
+
+def _kept(folder: Path) -> str:
+    meta = _meta(folder / "state.safetensors")
+    return meta["step"] if meta else "0"
+
+
+def _meta(path: Path) -> dict[str, str] | None:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            return dict(file.metadata())
+    except (OSError, SafetensorError):
+        return None

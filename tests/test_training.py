@@ -1,0 +1,206 @@
+"""Laws of training: parts are solid, touches belong to the cells they name, noise stays in its range, runs repeat."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+
+from geomtact.errors import GeomtactError, InputError
+from geomtact.geometry.mesh import load_mesh
+from geomtact.scoring.encoder import BASIS, SHAPE, Tower, load_weights, moment_features, vector
+from geomtact.scoring.network import Encoder, run
+from geomtact.sensing.moments import moments
+from geomtact.sensing.sensor import Sensor
+from geomtact.training import scenes as scenes_module
+from geomtact.training.augment import AUGMENTATIONS, augmented
+from geomtact.training.card import write_encoder
+from geomtact.training.dataset import part_scenes
+from geomtact.training.parts import random_part
+from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, make_scene
+from geomtact.training.train import Settings, scene_gain, train
+
+TINY = Settings(steps=6, scenes_a_step=2, touches=20, stored=200, width=32, dimension=8, validation=1)
+
+
+def unpacked(words, shape):
+    return np.unpackbits(words.view(np.uint8), axis=1).reshape(-1, *shape).astype(bool)
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenes_module, "DIRECTIONS", 6)
+        return [
+            make_scene(load_mesh(name), Sensor.load(sensor), 200_000, np.random.default_rng(1))
+            for name, sensor in (("bracket", "gelslim"), ("gear", "digit"), ("connector_plug", "gelslim"))
+        ]
+
+
+@pytest.fixture(scope="module")
+def weights():
+    torch.manual_seed(3)
+    return {name: value.numpy() for name, value in Encoder(48, 8).state_dict().items()}
+
+
+def test_a_procedural_part_is_a_solid_of_its_size_and_repeats():
+    for seed in range(12):
+        part = random_part(seed, 0.05)
+        assert load_mesh(part).sha256 == part.sha256, "it passes all checks that a user's mesh has to pass"
+        assert (random_part(seed, 0.05).vertices == part.vertices).all()
+        size = part.vertices.max(0) - part.vertices.min(0)
+        assert np.linalg.norm(size) >= 0.05 * 0.999 and part.diameter <= 0.05 * np.sqrt(3)
+
+
+def test_a_touch_lies_near_the_stored_contact_of_its_cell(scenes):
+    for scene in scenes:
+        assert scene.weight.sum() == pytest.approx(1, abs=1e-5)
+        assert (scene.weight[scene.true] > 0).all()
+        stored, rigid = unpacked(scene.stored, KEY_SHAPE), unpacked(scene.rigid, TOUCH_SHAPE)
+        sensor = Sensor("any", (64, 48), (1e-3, 1e-3), 0.0, 2e-3)
+        far = np.linalg.norm(moments(rigid, sensor)[:, None, :2] - moments(stored, sensor)[None, :, :2], axis=-1)
+        own = far[np.arange(len(far)), scene.true]
+        assert np.median(own) < 0.5 * np.median(far)
+
+
+def test_an_elastic_contact_is_part_of_the_rigid_one(scenes):
+    for scene in scenes:
+        rigid, elastic = unpacked(scene.rigid, TOUCH_SHAPE), unpacked(scene.elastic, TOUCH_SHAPE)
+        assert not (elastic & ~rigid).any() and elastic.any((1, 2)).all()
+        assert elastic.sum() < 0.95 * rigid.sum()
+
+
+def test_noise_keeps_masks_masks_and_repeats():
+    y, x = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
+    masks = ((((x - 30) / 33) ** 2 + ((y - 20) / 22) ** 2) < 1).float().expand(40, 1, 48, 64)
+    pixel = 0.7e-3
+    for augmentation in AUGMENTATIONS:
+        out, again = (augmentation.apply(masks, pixel, torch.Generator().manual_seed(1)) for _ in range(2))
+        assert torch.equal(out, again) and ((out == 0) | (out == 1)).all()
+        changed = (out != masks).flatten(1).float().mean(1)
+        assert changed.max() > 0, augmentation.name
+        assert changed.max() < 0.25, augmentation.name
+    whole = augmented(masks, pixel, torch.Generator().manual_seed(2))
+    assert (whole.sum((1, 2, 3)) > 0).all()
+    moved = moments(whole[:, 0].numpy() > 0.5, Sensor("any", (64, 48), (pixel, pixel), 0.0, 2e-3))
+    assert moved.std(0)[:2].max() < 0.1, "noise does not carry a contact across the window"
+
+
+def test_a_touch_needs_no_torch_and_gets_the_same_vector(weights, rng):
+    images = rng.random((5, *SHAPE)).astype(np.float32) > 0.7
+    images[1] = 0
+    by_torch = Encoder(48, 8)
+    by_torch.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+    with torch.no_grad():
+        expected = by_torch(torch.from_numpy(images.astype(np.float32)), "touch").numpy()
+    got = np.stack([vector(weights, image.astype(np.float32)) for image in images])
+    assert got == pytest.approx(expected, abs=1e-4)
+
+
+def test_its_moments_are_those_of_sensing(rng):
+    masks = np.zeros((4, *SHAPE), bool)
+    masks[0, 3:9, 4:20], masks[1, 10:20, 25:28], masks[2, :, :], masks[3, 5, 5] = True, True, True, True
+    sensor = Sensor("any", (64, 48), (1e-3, 1e-3), 0.0, 2e-3)
+    got = moment_features(masks.reshape(4, -1).astype(np.float32) @ BASIS, np)
+    expected = moments(masks, sensor).astype(float)
+    expected[:, :2] *= 3
+    expected[:, 2] = expected[:, 2] / 2 + 2
+    expected[:, 3] += 1.2
+    assert got == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_tall_window_is_seen_lying(weights):
+    masks = np.zeros((3, 24, 32), bool)
+    masks[:, 2:9, 5:20] = True
+    tower = Tower(weights)
+    sensor = Sensor.load("gelslim")
+    lying = tower.describe(masks, sensor)
+    assert tower.describe(np.swapaxes(masks, 1, 2), sensor) == pytest.approx(lying)
+    assert tower.describe(np.kron(masks, np.ones((1, 2, 2), bool)), sensor) == pytest.approx(lying, abs=1e-6)
+    assert run(weights, masks.astype(np.float32), "stored") == pytest.approx(lying, abs=1e-6)
+
+
+def test_training_learns_and_a_resumed_run_ends_where_a_whole_one_does(scenes, tmp_path):
+    network, curve = train(scenes, TINY, tmp_path / "whole", check_every=3)
+    calls = []
+
+    def stop(share, _):
+        calls.append(share)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(scenes, TINY, tmp_path / "resumed", stop, check_every=3)
+    resumed, again = train(scenes, TINY, tmp_path / "resumed", check_every=3)
+    assert again == curve and curve.step == [3, 6]
+    for name, value in network.state_dict().items():
+        assert torch.equal(resumed.state_dict()[name], value), name
+
+
+def test_a_network_gains_what_a_posterior_would(scenes):
+    """The loss is minus the log density at the truth: 0 for a network that tells nothing apart."""
+    network = Encoder(16, 4)
+    with torch.no_grad():
+        for head in network.heads.values():
+            head[2].weight.zero_()
+            head[2].bias.zero_()
+        gain = scene_gain(network, scenes[0], TINY, np.random.default_rng(0))
+    assert gain.numpy() == pytest.approx(0, abs=1e-4)
+
+
+def test_nan_stops_training_and_names_what_is_kept(scenes, tmp_path, monkeypatch):
+    train(scenes, TINY, tmp_path, check_every=3)
+    before = (tmp_path / "state.safetensors").read_bytes()
+    longer = Settings(**{**TINY.__dict__, "seed": 5})
+    monkeypatch.setattr(
+        "geomtact.training.train.scene_gain", lambda n, *_, **__: n.heads["touch"][2].bias.sum() * torch.nan
+    )
+    with pytest.raises(GeomtactError, match="not a number at step 0; the state of step 6 is kept"):
+        train(scenes, longer, tmp_path)
+    assert (tmp_path / "state.safetensors").read_bytes() == before
+    with pytest.raises(InputError, match="expected more than 1 scenes, got 1"):
+        train(scenes[:1], TINY, tmp_path)
+
+
+def test_scenes_are_made_once_and_repeat(tmp_path, monkeypatch):
+    mesh, sensor = load_mesh("hex_nut"), Sensor.load("gelsight-mini")
+    first = part_scenes(tmp_path, mesh, sensor, 100_000, 2, seed=4, processes=1)
+    times = {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()}
+    second = part_scenes(tmp_path, mesh, sensor, 100_000, 2, seed=4, processes=1)
+    assert {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()} == times and len(times) == 2
+    for a, b in zip(first, second, strict=True):
+        assert (a.stored == b.stored).all() and (a.true == b.true).all()
+
+
+def test_weights_are_written_read_and_refused(scenes, tmp_path):
+    network, curve = train(scenes, TINY, tmp_path / "work", check_every=6)
+    path = tmp_path / "e.safetensors"
+    write_encoder(path, network, curve, TINY, scenes, {"parts": "three"})
+    assert {p.suffix for p in tmp_path.glob("e.*")} == {".safetensors", ".json", ".png"}
+    weights = load_weights(path)
+    assert weights["trunk.0.weight"].shape == (32, 774) and weights["trunk.0.weight"].dtype == np.float32
+    for content, message in (
+        (b"", "not a whole safetensors file"),
+        (path.read_bytes()[:-9], "not a whole safetensors"),
+    ):
+        (tmp_path / "broken.safetensors").write_bytes(content)
+        with pytest.raises(InputError, match=message):
+            load_weights(tmp_path / "broken.safetensors")
+    other = load_file(path)
+    other["trunk.2.weight"] = other["trunk.2.weight"][:, :5]
+    save_file(other, tmp_path / "other.safetensors")
+    with pytest.raises(InputError, match="the weights of another network"):
+        load_weights(tmp_path / "other.safetensors")
+    with pytest.raises(InputError, match="no such file"):
+        load_weights(tmp_path / "none.safetensors")
+
+
+def test_a_localizer_takes_the_path_of_weights(make_localizer, weights, tmp_path):
+    save_file(weights, tmp_path / "mine.safetensors")
+    path = str(tmp_path / "mine.safetensors")
+    localizer = make_localizer("ball", "gelsight-mini", max_poses=4000, touches=(40, 20), scorer=path)
+    assert localizer.scorer.scorer.stored.shape == (len(localizer.index), 8)
+    mask = np.zeros((240, 320), bool)
+    mask[100:140, 150:190] = True
+    posterior = localizer.localize(mask, kind="mask", effort="fast")
+    assert np.exp(posterior.log_prob).sum() == pytest.approx(1, abs=1e-5)
+    assert posterior.settings["scorer"] == "encoder"
