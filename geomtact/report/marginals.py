@@ -15,8 +15,7 @@ from geomtact.se3 import Array
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Posterior
 
-_NEGLIGIBLE = 1e-9  # of the largest weight
-_TURNS = 4000  # poses that the distribution of turns is drawn from
+_POSES, _TURNS = 40_000, 4_000  # that the distributions of the centre and of the turns are drawn from
 
 
 @dataclass(frozen=True)
@@ -55,10 +54,9 @@ def marginals(posterior: Posterior, T_first: Array) -> list[Samples]:
     The turn is about the z axis of the posterior's frame, the tilt is the rest: R = R_z(turn) R_tilt R_first. A ball has
     neither.
     """
-    poses, weights = np.asarray(posterior.poses), np.exp(np.asarray(posterior.log_prob, float))
-    weights = np.where(weights > _NEGLIGIBLE * weights.max(), weights, 0)
-    kept = np.flatnonzero(weights)
-    poses, weights = poses[kept], weights[kept] / weights[kept].sum()
+    some = _systematic(np.exp(np.asarray(posterior.log_prob, float)), _POSES)
+    poses = posterior.poses_of(some)
+    weights = np.full(len(some), 1 / len(some))
     centre = np.asarray(posterior.mesh.centre, float)
     at = 1e3 * (poses[:, :3, :3] @ centre + poses[:, :3, 3])
     first = 1e3 * (T_first[:3, :3] @ centre + T_first[:3, 3])
@@ -73,8 +71,8 @@ def marginals(posterior: Posterior, T_first: Array) -> list[Samples]:
     ]
     if ball:
         return out
-    few = _systematic(weights, _TURNS)
-    turn, tilt = turn_and_tilt(poses[few, :3, :3], T_first[:3, :3], posterior.mesh.symmetry)
+    few = poses[:: _POSES // _TURNS, :3, :3]
+    turn, tilt = turn_and_tilt(few, T_first[:3, :3], posterior.mesh.symmetry)
     even = np.full(len(few), 1 / len(few))
     angle = float(np.degrees(level_step(grid.level)))
     return [
