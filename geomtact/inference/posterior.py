@@ -20,7 +20,7 @@ from geomtact.se3 import Array, check_transforms, inverse
 from geomtact.sensing.sensor import Sensor
 
 _SEEDS = 400  # of the most probable cells, from which modes are grown
-_LEAST, _SPARE = 8, 4  # modes grown at least, and beyond those asked for
+_LEAST, _SPARE = 6, 2  # modes grown at least, and beyond those asked for
 _POINTS = 128  # of the surface, for distances between modes
 
 
@@ -220,7 +220,8 @@ class Posterior:
 
     @cached_property
     def _probability(self) -> Array:
-        return np.exp(self.log_prob)
+        # exponentials in single precision take a fifth of the time, and the scores have no more
+        return np.exp(self.log_prob.astype(np.float32)).astype(float)
 
     @cached_property
     def _log_density(self) -> Array:
@@ -260,7 +261,7 @@ class Posterior:
         A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most.
         """
         p = self._probability
-        top = np.argpartition(p, -min(_SEEDS, len(p)))[-_SEEDS:]
+        top = np.argpartition(p.astype(np.float32), -min(_SEEDS, len(p)))[-_SEEDS:]
         top = top[p[top] > 0]
         moved = self._rows_of(np.array(list(self.refined), np.int64))
         seeds = _sorted(np.union1d(moved, top), p)
