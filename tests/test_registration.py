@@ -266,3 +266,13 @@ def test_specks_have_no_rim_and_a_curved_membrane_lifts_it():
     rim = make_problem(mask, curved).rim
     np.testing.assert_allclose(rim[:, 2], -curved.sag(rim[:, 0], rim[:, 1]), atol=1e-9)
     assert isinstance(clean, Problem) and (clean.rim[:, 2] == 0).all()
+
+
+def test_open3d_repeats_itself_to_the_last_digit(pin, a_touch):
+    """Its sums run over threads, and a rim that tells little turns another order of adding into another pose."""
+    mask = pin.localize(a_touch(pin)[1], effort="fast").observation.contact.mask
+    problem = make_problem(mask, pin.sensor)
+    starts = pin.index.poses(pin.localize(a_touch(pin)[1], effort="fast").leading_cells(3))
+    icp = next(r for r in pin._refinery._refiners(pin.index) if r.name == "icp")
+    first = icp.refine(problem, starts).T
+    assert all((icp.refine(problem, starts).T == first).all() for _ in range(15))

@@ -6,11 +6,11 @@ tell; so its answer is judged by the rim's own measure, and kept only as far as 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from geomtact.registration.filterreg import RimFilter
 from geomtact.registration.fit import Fit, gather, judged, rejected
@@ -38,7 +38,8 @@ class Icp:
 
     def refine(self, problem: Problem, T: Array) -> Refinement:
         """Refine the poses ``T`` (k, 4, 4), T_sensor_object, one after the other."""
-        fits = [self._refine_one(problem, start) for start in np.asarray(T, float).reshape(-1, 4, 4)]
+        with _one_thread():
+            fits = [self._refine_one(problem, start) for start in np.asarray(T, float).reshape(-1, 4, 4)]
         return gather(fits, problem, self.spread)
 
     def _refine_one(self, problem: Problem, start: Array) -> Fit:
@@ -65,7 +66,6 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
     import open3d as o3d
 
     registration = o3d.pipelines.registration
-    threads = _threads()
     rim, cloud = o3d.geometry.PointCloud(), o3d.geometry.PointCloud()
     # Open3D's tolerances are absolute and made for metres of room: in units of a pixel they fit
     unit = problem.pitch
@@ -75,16 +75,14 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
     cloud.normals = o3d.utility.Vector3dVector(np.concatenate([normals, axes]))
     motion, found = np.eye(4), False
     for within in (reach, 3 * problem.noise + problem.pitch):
-        # sums over several threads end in another order each time, and with them the pose
-        with threads.limit(limits=1, user_api="openmp"):
-            result = registration.registration_icp(
-                rim,
-                cloud,
-                within / unit,
-                motion,
-                registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=within / unit)),
-                registration.ICPConvergenceCriteria(1e-4, 1e-4, _MAX_ITERATIONS),
-            )
+        result = registration.registration_icp(
+            rim,
+            cloud,
+            within / unit,
+            motion,
+            registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=within / unit)),
+            registration.ICPConvergenceCriteria(1e-4, 1e-4, _MAX_ITERATIONS),
+        )
         if result.fitness == 0:
             break  # it ran off; Open3D says so in no other way
         motion, found = np.array(result.transformation), True
@@ -94,10 +92,17 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
     return motion
 
 
-@cache
-def _threads() -> ThreadpoolController:
-    """The thread pools of the libraries that are loaded by now, Open3D's among them."""
-    return ThreadpoolController()
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Open3D kept to one thread: several end their sums in another order each time, and with them the pose."""
+    import open3d as o3d
+
+    before = o3d.utility.get_max_threads()
+    o3d.utility.set_max_threads(1)
+    try:
+        yield
+    finally:
+        o3d.utility.set_max_threads(before)
 
 
 def _anchors(problem: Problem, reach: float) -> tuple[Array, Array]:
