@@ -60,7 +60,9 @@ class Refinery:
         candidates = [start, self._centred(posterior, contact, cells, start)]
         refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index)]
         poses = np.stack([*candidates, *(r.T for r in refinements)])
-        merit = self.agreement(contact, poses.reshape(-1, 4, 4)).reshape(poses.shape[:2])
+        # a rejected refinement is its own start: each pose is cast once
+        different, which = np.unique(poses.reshape(-1, 16), axis=0, return_inverse=True)
+        merit = self.agreement(contact, different.reshape(-1, 4, 4))[which.ravel()].reshape(poses.shape[:2])
         out = {}
         for i, cell in enumerate(cells):
             best = int(merit[:, i].argmax())
