@@ -13,8 +13,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geomtact import se3
+from geomtact.files import write_whole
 from geomtact.geometry.mesh import load_mesh
-from geomtact.report.files import write_whole
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
 from geomtact.report.result import plain, result, to_text
 from geomtact.report.summary import MOTIONS, caution, contact_centre, facts, percent, summaries_of, summarise, told

@@ -21,6 +21,7 @@ from matplotlib.patches import Arc, Circle, Polygon, Rectangle
 
 from geomtact import Localizer, Sensor, load_mesh
 from geomtact.contact_space.heightmap import NOTHING, HeightMap, Window
+from geomtact.contact_space.index import unpack
 from geomtact.report.marginals import marginals
 from geomtact.report.view import Viewer
 from geomtact.se3 import Array, inverse
@@ -238,16 +239,13 @@ def augmentations() -> Figure:
 
     scene = make_scene(random_part(11, 0.06), Sensor.load("gelslim"), 600_000, np.random.default_rng(5))
 
-    def unpacked(words: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-        return np.unpackbits(words.view(np.uint8), axis=1).reshape(-1, *shape)
-
-    elastic = unpacked(scene.elastic, TOUCH_SHAPE)
+    elastic = unpack(scene.elastic, TOUCH_SHAPE)
     # middling contacts, as different as five of them can be
     some = np.argsort(elastic.sum((1, 2)))[(np.linspace(0.5, 0.97, 5) * len(elastic)).astype(int)]
     masks = torch.from_numpy(elastic[some]).float()[:, None]
     columns = [
-        ("stored, of the cell", unpacked(scene.stored[scene.true[some]], KEY_SHAPE)),
-        ("touch, rigid", unpacked(scene.rigid[some], TOUCH_SHAPE)),
+        ("stored, of the cell", unpack(scene.stored[scene.true[some]], KEY_SHAPE)),
+        ("touch, rigid", unpack(scene.rigid[some], TOUCH_SHAPE)),
         ("touch, elastic", elastic[some]),
     ]
     for i, a in enumerate(AUGMENTATIONS):

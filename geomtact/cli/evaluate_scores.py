@@ -189,7 +189,7 @@ def _overall(parts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _draw(content: Mapping[str, Any], path: Path) -> None:
-    from geomtact.report.files import write_whole
+    from geomtact.files import write_whole
     from geomtact.report.score_plot import draw_scores
 
     picture = draw_scores(content)

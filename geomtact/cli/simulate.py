@@ -128,7 +128,7 @@ def _touch_at(scene: _Scene, T: Array, seed: int, elastic: bool, noise: Noise) -
 
 def _write(stem: Path, mask: Any, truth: dict, metadata: dict) -> None:
     """Write STEM.png, with ``metadata`` as text entries, and STEM.json."""
-    from geomtact.report.files import write_whole
+    from geomtact.files import write_whole
     from geomtact.report.result import plain, to_text
     from geomtact.sensing.image_file import write_image
 

@@ -65,7 +65,7 @@ def collect(done: list, more: Iterable, total: int, title: str, keep: Callable[[
 
 def save(out: Path | None, content: dict[str, Any]) -> None:
     """Write ``content``, with the versions of what made it, if there is a file to write."""
-    from geomtact.report.files import write_whole
+    from geomtact.files import write_whole
     from geomtact.report.result import to_text, versions
 
     content["versions"] = versions()

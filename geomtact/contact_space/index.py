@@ -187,14 +187,18 @@ class Index:
     def masks(self, ids: ArrayLike) -> NDArray[np.bool_]:
         """The stored contact masks (m, h, w) of poses ``ids`` (m,)."""
         level, place = np.divmod(np.asarray(ids), self.places)
-        words = np.ascontiguousarray(self.bits[level, :, place])
-        bits = np.unpackbits(words.view(np.uint8), axis=1)
-        return bits.astype(bool).reshape(-1, *self.resolution.mask_shape)
+        return unpack(self.bits[level, :, place], self.resolution.mask_shape)
 
 
 def pack(masks: NDArray[np.bool_]) -> NDArray[np.uint64]:
     """Masks (..., h*w) as packed words (..., h*w/64)."""
     return np.packbits(masks, axis=-1).view(np.uint64)
+
+
+def unpack(words: NDArray[np.uint64], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Masks (m, h, w) of packed ``words`` (m, h*w/64): what :func:`pack` packed."""
+    bits = np.unpackbits(np.ascontiguousarray(words).view(np.uint8), axis=1)
+    return bits.astype(bool).reshape(-1, *shape)
 
 
 def _nearest_true(table: NDArray[np.bool_], row: NDArray[np.int64]) -> NDArray[np.int64]:

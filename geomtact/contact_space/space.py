@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import MeshError
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.rotations import Approach, allowed, approach_of, check_approach, facing, in_cone
+from geomtact.geometry.rotations import Approach, allowed, approach_of, check_approach, facing, in_cones
 from geomtact.se3 import Array, random_rotations, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
@@ -136,16 +136,7 @@ class ContactSpace:
         """Rotations (n, 3, 3) uniform over what the approach allows."""
         if self.cones is None:
             return random_rotations(n, rng)
-        a = np.zeros((n, 3))
-        todo = np.arange(n)
-        size = np.array([1 - np.cos(half) if half else 1.0 for _, half in self.cones])
-        while len(todo):
-            which = rng.choice(len(self.cones), len(todo), p=size / size.sum())
-            v = np.stack([self.cones[i][0] for i in which])
-            a[todo] = in_cone(v, np.array([self.cones[i][1] for i in which]), rng)
-            # a direction inside m cones is drawn m times too often
-            m = sum(allowed(a[todo], [cone]).astype(int) for cone in self.cones)
-            todo = todo[rng.random(len(todo)) > 1 / m]
+        a = in_cones(self.cones, n, rng)
         turn = rng.uniform(0, 2 * np.pi, n)
         c, s, o = np.cos(turn), np.sin(turn), np.zeros(n)
         Rz = np.stack([c, -s, o, s, c, o, o, o, o + 1], -1).reshape(n, 3, 3)

@@ -12,7 +12,7 @@ from geomtact.sensing.elastic import elastic_mask
 from geomtact.sensing.noise import Noise, perturb
 
 CALIBRATION_NOISE = Noise(outline_rms=0.5e-3, correlation=(0.5e-3, 4e-3), specks=5, missing_probability=0.2)
-_MARGIN = 0.25  # of the window, on each side: the gel is dragged along by what presses beside the window
+MARGIN = 0.25  # of the window, on each side: the gel is dragged along by what presses beside the window
 
 
 def felt_mask(
@@ -30,16 +30,14 @@ def felt_mask(
     if not elastic:
         return space.caster.contact(sensor, T, (h, w)).mask
     # the membrane is solved as flat: its bulge is shallow over the width of a contact
-    my, mx = round(_MARGIN * h), round(_MARGIN * w)
+    my, mx = round(MARGIN * h), round(MARGIN * w)
     size = (w + 2 * mx, h + 2 * my)
     pitch = (2 * sensor.half_window[0] / w, 2 * sensor.half_window[1] / h)
     wide = replace(sensor, image_size_px=size, pixel_pitch=pitch, membrane_radius=0.0)
     x, y = wide.pixel_centres()
     rays = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     depth = space.caster.ray_depths(sensor, np.asarray(T, float)[None], rays)[0].reshape(len(y), len(x))
-    # beside the window an object may reach far below the membrane, into the housing: the gel ends there
-    depth[(depth > sensor.max_penetration) & _outside(depth.shape, my, mx)] = -np.inf
-    return elastic_mask(depth, pitch)[my : my + h, mx : mx + w]
+    return elastic_in_window(depth, pitch, (my, mx), sensor.max_penetration)
 
 
 def draw_noise(noise: Noise, rng: np.random.Generator) -> Noise:
@@ -54,7 +52,15 @@ def spoilt(mask: NDArray[np.bool_], space: ContactSpace, noise: Noise, rng: np.r
     return perturb(mask, (float(pitch[0]), float(pitch[1])), noise, rng)
 
 
-def _outside(shape: tuple[int, int], my: int, mx: int) -> NDArray[np.bool_]:
-    out = np.ones(shape, bool)
-    out[my : shape[0] - my, mx : shape[1] - mx] = False
-    return out
+def elastic_in_window(
+    depth: NDArray, pitch: tuple[float, float], margin: tuple[int, int], deepest: float
+) -> NDArray[np.bool_]:
+    """The elastic contact in a window, of a depth field [m] that reaches ``margin`` (rows, columns) beyond it each side.
+
+    Beside the window an object may reach far below the membrane, into the housing: where it is deeper than ``deepest``
+    [m] there, the gel has ended.
+    """
+    window = tuple(slice(m, n - m) for m, n in zip(margin, depth.shape, strict=True))
+    outside = np.ones(depth.shape, bool)
+    outside[window] = False
+    return elastic_mask(np.where(outside & (depth > deepest), -np.inf, depth), pitch)[window]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from geomtact.contact_space.build import Progress
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.store import open_index
 from geomtact.evaluation import study
@@ -24,7 +25,6 @@ from geomtact.sensing.sensor import Sensor
 
 THESIS_PARTS = ("pin", "damping_pin", "head", "elbow_pipe")
 FELT = {"elastic": True, "rigid": False, "both": None}  # as ``study.make_touches`` takes it
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)

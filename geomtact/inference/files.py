@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from geomtact.contact_space.store import open_index
 from geomtact.errors import InputError
+from geomtact.files import write_whole
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.posterior import Posterior, Refined
@@ -69,15 +69,12 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "refined_covariance": np.array([refined[int(k)].covariance for k in keys]).reshape(-1, 6, 6),
         "meta": np.array(json.dumps(meta)),
     }
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with open(temporary, "wb") as file:
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as file:  # given a name, numpy would add .npz to it
             np.savez(file, allow_pickle=False, **arrays)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+
+    write_whole(Path(path), write)
 
 
 def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:

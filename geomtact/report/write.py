@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from geomtact.files import write_whole
 from geomtact.report.figure import draw
-from geomtact.report.files import write_whole
 from geomtact.report.page import page
 from geomtact.report.result import result, to_text
 from geomtact.report.summary import caution, facts, summaries_of, table

@@ -130,7 +130,7 @@ def posterior_log_prob(
     # normalised before it is rounded: a log density is given up to a constant, however large
     prior = (log_prior - _log_sum_exp(log_prior)).astype(np.float32)
     joint = score.ravel() * np.float32(1 / calibration.temperature) + prior
-    floor, total = calibration.floor, _log_sum_exp(joint)
+    floor, total, evidence = calibration.floor, _log_sum_exp(joint), _log_sum_exp(score.ravel() + prior)
     # written out, and in single precision, because numpy's logaddexp takes many times as long
     joint -= np.float32(total - np.log1p(-floor))
     prior += np.float32(np.log(floor))
@@ -140,8 +140,7 @@ def posterior_log_prob(
         log_prob = np.log(probability).astype(float)
     tiny = np.flatnonzero((probability < _TINY) & (prior > -np.inf))
     log_prob[tiny] = np.logaddexp(joint[tiny], prior[tiny], dtype=float)
-    prior -= np.float32(np.log(floor))
-    return log_prob, _log_sum_exp(score.ravel() + prior)
+    return log_prob, evidence
 
 
 def _log_sum_exp(x: NDArray[np.floating]) -> float:

@@ -5,23 +5,23 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
-import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.contact_space.build import Progress
 from geomtact.contact_space.index import Index
 from geomtact.errors import MeshError, UsageError, nearest_name
+from geomtact.files import write_whole
 from geomtact.scoring.calibration import Calibration, Touches, calibrate, simulate_touches
 from geomtact.scoring.descriptors import CLASSICAL
 from geomtact.scoring.encoder import EncoderScorer, Tower, load_weights
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.overlap import OVERLAPS
 from geomtact.scoring.protocol import Scorer
-from geomtact.scoring.vectors import Descriptor, Progress, VectorScorer, describe_index
+from geomtact.scoring.vectors import Descriptor, VectorScorer, describe_index
 
 FORMAT = 3
 DESCRIPTORS: dict[str, Descriptor] = {**CLASSICAL}
@@ -76,10 +76,7 @@ def fitted_scorer(
     fitted = FittedScorer(scorer, calibrate(scorer, index, Touches(touches.masks[n:], touches.ids[n:])))
     if path is not None:
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
-            handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".json")
-            with os.fdopen(handle, "w") as file:
-                json.dump(_to_json(fitted), file)
-            os.replace(temporary, path)
+            write_whole(path, lambda temporary: temporary.write_text(json.dumps(_to_json(fitted)), "utf-8"))
     return fitted
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,13 +12,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.contact_space.build import Progress
 from geomtact.contact_space.index import Index
+from geomtact.files import write_whole
 from geomtact.scoring.overlap import to_grid
 from geomtact.sensing.moments import without_specks
 from geomtact.sensing.sensor import Sensor
 
 _BATCH = 4096  # contacts described at a time
-Progress = Callable[[float, str], None]
 
 
 class Descriptor(Protocol):
@@ -82,10 +82,7 @@ def describe_index(
     stored = np.concatenate(list(_batches(index, descriptor, progress)))
     if path is not None:
         with contextlib.suppress(OSError):  # a read-only cache costs the pass each time, no more
-            temporary = path.with_name(f".{path.name}.{os.getpid()}")
-            with open(temporary, "wb") as file:
-                np.save(file, stored, allow_pickle=False)
-            os.replace(temporary, path)
+            write_whole(path, lambda temporary: np.save(temporary, stored, allow_pickle=False))
     return stored
 
 

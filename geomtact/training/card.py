@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
+from geomtact.files import write_whole
 from geomtact.scoring.network import Encoder
 from geomtact.training.augment import AUGMENTATIONS
 from geomtact.training.scenes import Scene
@@ -28,9 +28,8 @@ def write_encoder(
     ``data`` says where the scenes come from.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    save_file({name: value.half().contiguous() for name, value in network.state_dict().items()}, temporary)
-    os.replace(temporary, path)
+    weights = {name: value.half().contiguous() for name, value in network.state_dict().items()}
+    write_whole(path, lambda temporary: save_file(weights, temporary))
     card = {
         "schema": SCHEMA,
         "parameters": sum(p.numel() for p in network.parameters()),

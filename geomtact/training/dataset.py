@@ -13,7 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from geomtact.contact_space.build import Progress
 from geomtact.errors import MeshError
+from geomtact.files import write_whole
 from geomtact.geometry.mesh import Mesh
 from geomtact.sensing.sensor import Sensor
 from geomtact.training.parts import random_part
@@ -23,7 +25,6 @@ SENSORS = ("gelslim", "gelslim", "gelslim", "gelsight-mini", "digit")  # one aft
 SIZES = (0.5, 3.5)  # longest side of a part, in long sides of the window
 POSES = (1e5, 1.5e6)  # that the grid is chosen for
 _FEWEST = 32  # touches of a scene
-Progress = Callable[[float, str], None]
 Make = Callable[[int], Scene]
 
 
@@ -95,10 +96,7 @@ def _write(path: Path, make: Make, i: int) -> None:
         scene = make(i)
     except MeshError:  # nothing of this part touches this sensor
         return
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with open(temporary, "wb") as file:
-        np.savez(file, allow_pickle=False, **asdict(scene))
-    os.replace(temporary, path)
+    write_whole(path, lambda temporary: np.savez(temporary, allow_pickle=False, **asdict(scene)))
 
 
 def _read(path: Path) -> Scene | None:

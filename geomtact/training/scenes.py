@@ -17,19 +17,18 @@ from geomtact.contact_space.build import choose_resolution, places
 from geomtact.contact_space.heightmap import NOTHING, Frame, HeightMap, Window
 from geomtact.contact_space.index import pack
 from geomtact.contact_space.resolution import Resolution
+from geomtact.contact_space.touch import MARGIN, elastic_in_window
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Directions, approach_of, facing
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array
 from geomtact.sensing.cast import Caster
-from geomtact.sensing.elastic import elastic_mask
 from geomtact.sensing.sensor import Sensor
 
 DIRECTIONS, TURNS, TILTS = 12, 4, 4  # drawn of a part; turns and tilted views of each direction
 TOUCHES = 6  # of each tilted view
 _PLACES = 120  # of a rotation at most
 KEY_SHAPE, TOUCH_SHAPE = (24, 32), (48, 64)
-_MARGIN = 0.25  # of the window, that the gel is solved beyond it
 _LEAST_CONTACT = 1e-6  # m^2
 
 
@@ -117,11 +116,11 @@ class _View:
         self.reach = float(np.linalg.norm(mesh.vertices - mesh.centre, axis=1).max())
         self.frame = Frame.make(self.reach, sensor, resolution.step)
         self.window = Window(sensor, resolution.mask_shape, resolution.penetrations)
-        self.margin = 2.1 * float(np.hypot(*sensor.half_window)) * (1 + 2 * _MARGIN) + 2 * resolution.step
+        self.margin = 2.1 * float(np.hypot(*sensor.half_window)) * (1 + 2 * MARGIN) + 2 * resolution.step
         h, w = TOUCH_SHAPE[::-1] if tall else TOUCH_SHAPE
         self.pitch = 2 * sensor.half_window / (w, h)
         self.pixel = float(np.sqrt(self.pitch.prod()))
-        self.my, self.mx = round(_MARGIN * h), round(_MARGIN * w)
+        self.my, self.mx = round(MARGIN * h), round(MARGIN * w)
         x = (np.arange(w + 2 * self.mx) - (w + 2 * self.mx - 1) / 2) * self.pitch[0]
         y = (np.arange(h + 2 * self.my) - (h + 2 * self.my - 1) / 2) * self.pitch[1]
         self.grid = np.stack(np.meshgrid(x, y), -1)
@@ -160,11 +159,9 @@ class _View:
 
     def felt(self, depth: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """The rigid and the elastic contact (h, w) of a depth field that reaches beyond the window."""
-        window = np.s_[self.my : -self.my, self.mx : -self.mx]
-        outside = np.ones(depth.shape, bool)
-        outside[window] = False
-        depth = np.where(outside & (depth > self.sensor.max_penetration), -np.inf, depth)
-        return depth[window] > 0, elastic_mask(depth, (float(self.pitch[0]), float(self.pitch[1])))[window]
+        pitch = (float(self.pitch[0]), float(self.pitch[1]))
+        elastic = elastic_in_window(depth, pitch, (self.my, self.mx), self.sensor.max_penetration)
+        return depth[self.my : -self.my, self.mx : -self.mx] > 0, elastic
 
     def lying(self, masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Flat masks (..., h w), or masks (n, h, w), of a tall window turned by 90 degrees; others as they are."""

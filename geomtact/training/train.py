@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -24,13 +22,14 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
+from geomtact.contact_space.build import Progress
+from geomtact.contact_space.index import unpack
 from geomtact.errors import GeomtactError, InputError
+from geomtact.files import write_whole
 from geomtact.scoring.encoder import SHAPE
 from geomtact.scoring.network import Encoder
 from geomtact.training.augment import augmented
 from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, Scene
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
@@ -163,8 +162,7 @@ def _batch(
 
 
 def _unpacked(words: NDArray[np.uint64], shape: tuple[int, int]) -> torch.Tensor:
-    bits = np.unpackbits(np.ascontiguousarray(words).view(np.uint8), axis=1)
-    return torch.from_numpy(bits.reshape(-1, *shape)).float()
+    return torch.from_numpy(unpack(words, shape)).float()
 
 
 def _schedule(step: int, steps: int) -> float:
@@ -181,9 +179,7 @@ def _save(
     for i, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{i}.{k}": v.clone() for k, v in state.items()}
     meta = {"step": str(step), "settings": json.dumps(asdict(settings)), "curve": json.dumps(asdict(curve))}
-    temporary = folder / f".state.{os.getpid()}"
-    save_file(tensors, temporary, meta)
-    os.replace(temporary, folder / "state.safetensors")
+    write_whole(folder / "state.safetensors", lambda temporary: save_file(tensors, temporary, meta))
 
 
 def _resume(folder: Path, network: Encoder, optimizer: torch.optim.Optimizer, settings: Settings, curve: Curve) -> int:
