@@ -68,10 +68,16 @@ def outcomes(content, part, name):
 
 def test_the_file_says_all_that_the_figures_depend_on(whole, folder):
     content, _, _ = whole
-    assert content["schema"] == "geomtact/scores/1" and content["versions"]["numpy"] == np.__version__
+    assert content["schema"] == "geomtact/scores/2" and content["versions"]["numpy"] == np.__version__
     settings = content["settings"]
     assert settings["noise"]["name"] == "moderate" and settings["noise"]["specks"] == 2
-    assert [settings[k] for k in ("seed", "touches", "felt", "effort", "max_poses")] == [7, 6, "elastic", "fast", 3000]
+    assert [settings[k] for k in ("seed", "touches", "felt", "effort", "max_poses")] == [
+        7,
+        6,
+        "elastic",
+        "balanced",
+        3000,
+    ]
     assert list(content["parts"]) == ["ball", "hex_nut"]
     for part, found in content["parts"].items():
         assert found["object_sha256"] == load_mesh(part).sha256
@@ -134,7 +140,7 @@ def test_the_screen_shows_a_table_for_each_part_and_one_over_all(whole):
     tables = [printed.index(title) for title in titles]
     assert tables == sorted(tables)
     gain = content["overall"]["moments"]["figures"]["all"]["gain_mean"]
-    (row,) = [line for line in printed[tables[2] :].splitlines() if line.startswith(" moments")]
+    row = next(line for line in printed[tables[2] :].splitlines() if line.startswith(" moments"))
     assert f"{gain:.2f} ±" in row
     assert max(map(len, printed.splitlines())) <= 160
 
@@ -159,7 +165,7 @@ def test_a_stopped_study_goes_on_and_ends_as_the_whole_one(whole, stopped, evalu
             before[part, name] = outcomes(whole[0], part, name)
 
     def judged(localizer, touches, effort, seed):
-        asked.append((localizer.mesh.name, localizer.scorer.scorer.name, len(touches)))
+        asked.append((localizer.mesh.name, localizer.scorer.name, len(touches)))
         return iter(before[asked[-1][:2]][TOUCHES - len(touches) :])
 
     monkeypatch.setattr(scores, "judged", judged)
@@ -237,7 +243,9 @@ def test_words_are_told_apart_and_wrong_ones_named(evaluate):
 def test_by_default_all_scores_are_judged_on_the_thesis_parts():
     from geomtact.cli.evaluate_scores import sort_words
 
-    assert sort_words([], []) == (["pin", "damping_pin", "head", "elbow_pipe"], list(fitted.SCORERS))
+    names = [*(name for name in fitted.SCORERS if name != fitted.DEFAULT_SCORER), "fast", "balanced", "exact"]
+    assert sort_words([], []) == (["pin", "damping_pin", "head", "elbow_pipe"], names)
+    assert sort_words([], ["mine.safetensors"])[1] == ["mine.safetensors"]
     assert sort_words(["iou", "head"], ["l1"]) == (["head"], ["l1", "iou"])
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from geomtact.contact_space.draw import draw_within
+from geomtact.contact_space.index import spelled_out
 from geomtact.errors import InputError, PoseError, UsageError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.posterior import Posterior
@@ -27,7 +28,7 @@ def posteriors(a_touch):
     def of(localizer) -> Posterior:
         key = localizer.index.key
         if key not in found:
-            found[key] = localizer.localize(a_touch(localizer)[1], effort="fast")
+            found[key] = replace(localizer.localize(a_touch(localizer)[1]), refined={})
         return found[key]
 
     return of
@@ -47,6 +48,10 @@ def samples(posteriors):
     return of
 
 
+def runs_of(posterior):
+    return np.ones(len(posterior.cells), int) if posterior.runs is None else posterior.runs
+
+
 def test_probabilities_are_a_distribution(localizer, posteriors):
     posterior = posteriors(localizer)
     assert np.exp(posterior.log_prob).sum() == pytest.approx(1, abs=1e-5)
@@ -54,14 +59,15 @@ def test_probabilities_are_a_distribution(localizer, posteriors):
     assert posterior.contact and posterior.frame == "sensor"
     assert (np.diff(posterior.cells) > 0).all()
     p = np.exp(posterior.log_prob)
-    assert posterior.effective_poses == pytest.approx(np.exp(-(p * np.log(p)).sum()), rel=1e-4)
-    assert 1 <= posterior.effective_poses <= len(p)
+    runs = runs_of(posterior)
+    assert posterior.effective_poses == pytest.approx(np.exp(-(p * np.log(p / runs)).sum()), rel=1e-4)
+    assert 1 <= posterior.effective_poses <= runs.sum()
 
 
 def test_entropy_is_minus_the_mean_log_density(localizer, posteriors, samples):
     """By its definition as a sum over cells, and over poses drawn from the posterior."""
     posterior = posteriors(localizer)
-    w = np.asarray(localizer.index.weight, float).ravel()[posterior.cells]
+    w = localizer.index.mass(posterior.cells, runs_of(posterior))
     p = np.exp(posterior.log_prob)
     assert posterior.entropy_nats == pytest.approx(-(p * (posterior.log_prob - np.log(w))).sum(), abs=1e-5)
     assert posterior.entropy_nats < 0
@@ -76,7 +82,8 @@ def test_the_density_integrates_to_one(localizer, posteriors, uniform_poses):
     """Its mean over poses drawn uniformly, without the index, is 1 within its standard error and the grid's coarseness."""
     posterior = posteriors(localizer)
     # flattened, so that two hundred poses can tell: a mixture with the uniform of the posterior's square root
-    p = np.exp(0.25 * posterior.log_prob + 0.75 * np.log(np.asarray(localizer.index.weight).ravel()[posterior.cells]))
+    w = localizer.index.mass(posterior.cells, runs_of(posterior))
+    p = np.exp(0.25 * posterior.log_prob + 0.75 * np.log(w))
     flat = replace(posterior, log_prob=np.log(p / p.sum()))
     density = np.exp(flat.log_density(uniform_poses(localizer)[0]))
     error = density.std() / np.sqrt(len(density))
@@ -87,7 +94,7 @@ def test_the_uniform_scores_0_everywhere(localizer, posteriors, uniform_poses):
     index = localizer.index
     w = np.asarray(index.weight, float).ravel()
     cells = np.flatnonzero(w)
-    uniform = replace(posteriors(localizer), cells=cells, log_prob=np.log(w[cells] / w.sum()))
+    uniform = replace(posteriors(localizer), cells=cells, runs=None, log_prob=np.log(w[cells] / w.sum()))
     assert np.abs(uniform.log_density(uniform_poses(localizer)[0])).max() < 1e-5
     assert uniform.entropy_nats == pytest.approx(0, abs=1e-5)
 
@@ -131,12 +138,12 @@ def test_the_density_of_a_cell_is_its_mass_over_its_measure(localizer, posterior
     posterior, index = posteriors(localizer), localizer.index
     rows = rng.choice(len(posterior.cells), 40)
     rows[:10] = np.argsort(-posterior.log_prob)[:10]
-    T, _, found = draw_within(index, localizer.space, posterior.cells[rows], rng)
-    w = np.asarray(index.weight, float).ravel()[posterior.cells[rows]]
+    T, _, found = draw_within(index, localizer.space, posterior._heart(rows), rng)
+    w = index.mass(posterior.cells[rows], runs_of(posterior)[rows])
     expected = posterior.log_prob[rows] - np.log(w)
     agree = np.abs(posterior.log_density(T[found]) - expected[found]) < 1e-5
     assert agree.mean() > 0.95
-    ids = np.setdiff1d(np.arange(len(index)), posterior.cells)[:5]
+    ids = np.setdiff1d(np.arange(len(index)), spelled_out(posterior.cells, runs_of(posterior)))[:5]
     assert (posterior.cell_log_density(ids) == -np.inf).all()
 
 
@@ -163,7 +170,7 @@ def test_levels_are_repeatable_and_depend_on_the_seed(plug, posteriors, samples)
 
 def test_the_level_is_the_mass_of_what_is_denser(localizer, posteriors, samples):
     posterior = posteriors(localizer)
-    w = np.asarray(localizer.index.weight, float).ravel()[posterior.cells]
+    w = localizer.index.mass(posterior.cells, runs_of(posterior))
     p = np.exp(posterior.log_prob)
     T = samples(localizer)[:40]
     for rho, level in zip(posterior.log_density(T), posterior.credible_level(T), strict=True):
@@ -247,10 +254,12 @@ def test_samples_follow_the_probabilities_of_the_cells(localizer, posteriors, sa
     p = np.exp(posterior.log_prob)
     order = np.argsort(-p)
     groups = defaultdict(float)
-    group_of = np.zeros(len(index), int)
-    group_of[posterior.cells[order]] = np.minimum((np.cumsum(p[order]) * 5).astype(int), 4)
-    for g, mass in zip(group_of[posterior.cells], p, strict=True):
+    group = np.zeros(len(p), int)
+    group[order] = np.minimum((np.cumsum(p[order]) * 5).astype(int), 4)
+    for g, mass in zip(group, p, strict=True):
         groups[g] += mass
+    group_of = np.zeros(len(index), int)
+    group_of[spelled_out(posterior.cells, runs_of(posterior))] = np.repeat(group, runs_of(posterior))
     n = inside.sum()
     for g, mass in groups.items():
         got = (group_of[cell] == g).sum()

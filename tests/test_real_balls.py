@@ -153,8 +153,8 @@ def test_a_reading_of_another_simulator_runs_from_rgb_to_a_report(data_folder, t
         localizer.localize(folder / "040_large_marker" / "triplet_1" / f"Image_heatmap_{k}.png", background=background)
         for k in range(3)
     ]
-    touches = random_touches(localizer, 12, seed=0)
-    distinctive = min(localizer.localize(t.mask, kind="mask", effort="fast").entropy_nats for t in touches)
+    touches = random_touches(localizer, 40, seed=0)
+    distinctive = min(localizer.localize(t.mask, kind="mask").entropy_nats for t in touches)
     print(f"\nentropy [nats]: readings {[round(p.entropy_nats, 2) for p in found]}, distinctive {distinctive:.2f}")
     for posterior in found:
         assert posterior.contact and posterior.observation.kind == "reading"

@@ -22,6 +22,9 @@ from geomtact.training.train import Settings, scene_gain, train
 TINY = Settings(steps=6, scenes_a_step=2, touches=20, stored=200, width=32, dimension=8, validation=1)
 
 
+CELL = np.array([-0.7, -1.1], np.float32)
+
+
 def unpacked(words, shape):
     return np.unpackbits(words.view(np.uint8), axis=1).reshape(-1, *shape).astype(bool)
 
@@ -91,8 +94,8 @@ def test_a_touch_needs_no_torch_and_gets_the_same_vector(weights, rng):
     by_torch = Encoder(48, 8)
     by_torch.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
     with torch.no_grad():
-        expected = by_torch(torch.from_numpy(images.astype(np.float32)), "touch").numpy()
-    got = np.stack([vector(weights, image.astype(np.float32)) for image in images])
+        expected = by_torch(torch.from_numpy(images.astype(np.float32)), torch.from_numpy(CELL), "touch").numpy()
+    got = np.stack([vector(weights, image.astype(np.float32), CELL) for image in images])
     assert got == pytest.approx(expected, abs=1e-4)
 
 
@@ -111,12 +114,12 @@ def test_its_moments_are_those_of_sensing(rng):
 def test_a_tall_window_is_seen_lying(weights):
     masks = np.zeros((3, 24, 32), bool)
     masks[:, 2:9, 5:20] = True
-    tower = Tower(weights)
+    tower = Tower(weights, CELL)
     sensor = Sensor.load("gelslim")
     lying = tower.describe(masks, sensor)
     assert tower.describe(np.swapaxes(masks, 1, 2), sensor) == pytest.approx(lying)
     assert tower.describe(np.kron(masks, np.ones((1, 2, 2), bool)), sensor) == pytest.approx(lying, abs=1e-6)
-    assert run(weights, masks.astype(np.float32), "stored") == pytest.approx(lying, abs=1e-6)
+    assert run(weights, masks.astype(np.float32), CELL, "stored") == pytest.approx(lying, abs=1e-6)
 
 
 def test_training_learns_and_a_resumed_run_ends_where_a_whole_one_does(scenes, tmp_path):
@@ -177,7 +180,7 @@ def test_weights_are_written_read_and_refused(scenes, tmp_path):
     write_encoder(path, network, curve, TINY, scenes, {"parts": "three"})
     assert {p.suffix for p in tmp_path.glob("e.*")} == {".safetensors", ".json", ".png"}
     weights = load_weights(path)
-    assert weights["trunk.0.weight"].shape == (32, 774) and weights["trunk.0.weight"].dtype == np.float32
+    assert weights["trunk.0.weight"].shape == (32, 776) and weights["trunk.0.weight"].dtype == np.float32
     for content, message in (
         (b"", "not a whole safetensors file"),
         (path.read_bytes()[:-9], "not a whole safetensors"),
@@ -203,4 +206,24 @@ def test_a_localizer_takes_the_path_of_weights(make_localizer, weights, tmp_path
     mask[100:140, 150:190] = True
     posterior = localizer.localize(mask, kind="mask", effort="fast")
     assert np.exp(posterior.log_prob).sum() == pytest.approx(1, abs=1e-5)
-    assert posterior.settings["scorer"] == "encoder"
+    assert posterior.settings["scorer"] == path
+
+
+def test_a_contact_far_from_all_stored_ones_counts_for_less():
+    """Its best score becomes the worst that is usual, and all others shrink alike; a usual contact is left alone."""
+    from types import SimpleNamespace
+
+    from geomtact.scoring.encoder import EncoderScorer
+
+    stored = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+
+    class At(EncoderScorer):
+        def seen(self, index, mask):
+            return np.full(4, mask, np.float32)
+
+    index = SimpleNamespace(height=np.zeros((2, 25)))
+    plain, limited = At(None, stored), At(None, stored, usual=6.0)
+    assert limited.score(index, 0.1) == pytest.approx(plain.score(index, 0.1))
+    far, full = limited.score(index, 9.0), plain.score(index, 9.0)
+    assert far.max() == pytest.approx(-6, rel=1e-4)
+    assert far / full == pytest.approx(np.full((2, 25), 6 / -full.max()), rel=1e-4)

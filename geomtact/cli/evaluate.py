@@ -62,7 +62,11 @@ def evaluate(
     ] = None,
     scores: Annotated[
         list[str] | None,
-        typer.Option(metavar="SCORE...", help="Scores to judge; all by default.", rich_help_panel=_SCORES_ONLY),
+        typer.Option(
+            metavar="SCORE...",
+            help="Scores to judge, by name or weights file; fast, balanced or exact is the default score at that effort.",
+            rich_help_panel=_SCORES_ONLY,
+        ),
     ] = None,
     felt: Annotated[
         FeltName | None,
@@ -100,7 +104,7 @@ def evaluate(
             noise_name=str(noise),
             noise=_noise(noise),
             felt=str(felt or FeltName.elastic),
-            effort=str(effort or Effort.fast),
+            effort=str(effort or Effort.balanced),
             seed=seed,
             max_poses=max_poses or MAX_POSES,
         )

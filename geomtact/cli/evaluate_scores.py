@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from geomtact.sensing.noise import Noise
     from geomtact.sensing.sensor import Sensor
 
-SCHEMA = "geomtact/scores/1"
+SCHEMA = "geomtact/scores/2"
 MAX_POSES = 1_200_000
 
 
@@ -56,17 +56,24 @@ def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], 
     from geomtact.errors import UsageError, nearest_name
     from geomtact.evaluation.scores import THESIS_PARTS
     from geomtact.geometry.catalogue import catalogue
-    from geomtact.scoring.fitted import SCORERS
+    from geomtact.inference.localizer import EFFORTS
+    from geomtact.scoring.fitted import DEFAULT_SCORER, SCORERS
 
+    known = (*SCORERS, *EFFORTS)
     for name in scores:
-        if name not in SCORERS:
-            raise UsageError(f"no score named {name!r}{nearest_name(name, SCORERS)}")
-    more = [word for word in words if scores and word in SCORERS]
+        if not _is_score(name, known):
+            raise UsageError(f"no score named {name!r}{nearest_name(name, known)}")
+    more = [word for word in words if scores and _is_score(word, known)]
     parts = [word for word in words if word not in more]
     for word in parts:
         if scores and word not in catalogue() and not Path(word).suffix:
-            raise UsageError(f"no score or part named {word!r}{nearest_name(word, [*SCORERS, *catalogue()])}")
-    return parts or list(THESIS_PARTS), list(dict.fromkeys([*scores, *more])) or list(SCORERS)
+            raise UsageError(f"no score or part named {word!r}{nearest_name(word, [*known, *catalogue()])}")
+    every = [*(name for name in SCORERS if name != DEFAULT_SCORER), *EFFORTS]
+    return parts or list(THESIS_PARTS), list(dict.fromkeys([*scores, *more])) or every
+
+
+def _is_score(name: str, known: Sequence[str]) -> bool:
+    return name in known or Path(name).suffix == ".safetensors"
 
 
 def judge_scores(
@@ -101,12 +108,14 @@ def judge_scores(
             _compare(part, options.touches)
         _print(f"{mesh.name}: {options}", part["scores"])
     content["overall"] = plain(_overall(content["parts"]))
+    content["classes"] = plain(_by_class(content["parts"]))
     study_file.save(out, content)
     tables = {name: part["scores"] for name, part in content["parts"].items()}
     if len(tables) > 1:
         tables["overall"] = content["overall"]
         _print(f"mean over {', '.join(content['parts'])}", content["overall"])
     _print_coverage(tables)
+    _print_classes(content["classes"])
     if plot is not None:
         _draw(content, plot)
     return content
@@ -132,10 +141,14 @@ def _judge(
 ) -> None:
     """Judge one score on one part, from where the file ends."""
     from geomtact.evaluation import scores, study
+    from geomtact.inference.localizer import EFFORTS
     from geomtact.report.result import plain
+    from geomtact.scoring.fitted import DEFAULT_SCORER
 
+    # the name of an effort stands for the default score at that effort
+    scorer, effort = (DEFAULT_SCORER, name) if name in EFFORTS else (name, options.effort)
     with progress_bar(f"preparing {mesh.name}, {name}") as progress:
-        localizer, seconds = scores.prepare(mesh, options.sensor, name, options.max_poses, cache_dir, progress)
+        localizer, seconds = scores.prepare(mesh, options.sensor, scorer, options.max_poses, cache_dir, progress)
     described = plain(study.describe(localizer))
     found = part["scores"].get(name)
     outcomes = study_file.earlier(found, described, scores.Scored)
@@ -157,7 +170,7 @@ def _judge(
     if len(outcomes) < options.touches and not touches:
         elastic = scores.FELT[options.felt]
         touches += study.make_touches(localizer, options.touches, options.seed, options.noise, elastic=elastic)
-    todo = scores.judged(localizer, touches[len(outcomes) :], options.effort, options.seed)
+    todo = scores.judged(localizer, touches[len(outcomes) :], effort, options.seed)
     keep(study_file.collect(outcomes, todo, options.touches, f"judging {mesh.name}, {name}", keep))
     tell(f"{mesh.name}, {name}: done")
 
@@ -186,6 +199,30 @@ def _overall(parts: Mapping[str, Any]) -> dict[str, Any]:
         )
         for name in names
     }
+
+
+def _by_class(parts: Mapping[str, Any]) -> dict[str, Any]:
+    """Gain and coverage by contact class, of those scores that have been judged on each part."""
+    from geomtact.evaluation import scores, study
+
+    entries = [part["scores"] for part in parts.values()]
+    names = [name for name in entries[0] if all("figures" in some.get(name, {}) for some in entries)]
+    return {
+        name: study.by_class([o for some in entries for o in study_file.outcomes(some[name], scores.Scored)])
+        for name in names
+    }
+
+
+def _print_classes(classes: Mapping[str, Mapping[str, Any]]) -> None:
+    """Gain and coverage of each score by the kind of contact."""
+    rows = []
+    for name, kinds in classes.items():
+        for kind, f in kinds.items():
+            inside = [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in f["coverage"]]
+            rows.append([name, kind, str(f["n"]), _number(f["gain_mean"], 2), *inside])
+            masses = [f"in {100 * c['nominal']:.0f} %" for c in f["coverage"]]
+    typer.echo("By kind of contact: percentage of truths inside the region of each mass, with 99 % intervals")
+    print_table(["score", "contact", "n", "gain [nats]", *masses], rows, ["n", "gain [nats]", *masses])
 
 
 def _draw(content: Mapping[str, Any], path: Path) -> None:

@@ -17,7 +17,7 @@ from geomtact.contact_space.resolution import Resolution
 from geomtact.errors import MeshError
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Approach, Directions
-from geomtact.se3 import Array
+from geomtact.se3 import Array, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.moments import moments
 from geomtact.sensing.sensor import Sensor
@@ -85,7 +85,9 @@ def build(
             f"{mesh.name}: no pose touches the sensor {sensor.name!r} as the approach and the housing allow; "
             "widen the approach or check the object's unit"
         )
-    return _join(turns, directions, frame)
+    coarse = Directions.make(mesh.symmetry, approach, max(resolution.level - 1, 0), 2 * resolution.turn_step)
+    _, of, turn = coarse.lookup(transform(directions.rotations()[0], np.zeros(3)))
+    return _join(turns, directions, frame, _blocks(turns, coarse.first_turn[of] + turn, frame))
 
 
 def choose_resolution(
@@ -136,13 +138,15 @@ def _touches(there: HeightMap, turn: float, frame: Frame, window: Window) -> _Tu
     return _Turn(cell, -centres, z, share, packed, masks.sum(2), np.moveaxis(summed, 2, 0))
 
 
-def _join(turns: list[_Turn], directions: Directions, frame: Frame) -> dict[str, NDArray]:
-    """One array of each kind for all rotations; the weights made a share of the whole."""
+def _join(turns: list[_Turn], directions: Directions, frame: Frame, block: NDArray[np.int64]) -> dict[str, NDArray]:
+    """One array of each kind for all rotations, sorted by ``block`` (n,); the weights made a share of the whole."""
     first = np.concatenate([[0], np.cumsum([len(t.cell) for t in turns])])
     some, n = turns[0], int(first[-1])
+    rank = np.empty(n, np.int64)
+    rank[np.argsort(block, kind="stable")] = np.arange(n)
     p, words = some.bits.shape[:2]
     out: dict[str, NDArray] = {
-        "rotation": np.repeat(np.arange(len(turns), dtype=np.int32), np.diff(first)),
+        "rotation": np.zeros(n, np.int32),
         "shift": np.zeros((n, 2), np.float32),
         "height": np.zeros((p, n), np.float32),
         "weight": np.zeros((p, n), np.float32),
@@ -150,10 +154,12 @@ def _join(turns: list[_Turn], directions: Directions, frame: Frame) -> dict[str,
         "area": np.zeros((p, n), np.uint16),
         "moments": np.zeros((some.moments.shape[0], p, n), np.float32),
         "table": np.zeros((len(turns), *frame.cells), np.int32),
+        "blocks": np.concatenate([[0], np.cumsum(np.bincount(block))]).astype(np.int32),
     }
     share = np.repeat(directions.weights / directions.turns, directions.turns)
     for r, turn in enumerate(turns):
-        part = slice(first[r], first[r + 1])
+        part = rank[first[r] : first[r + 1]]
+        out["rotation"][part] = r
         out["shift"][part] = turn.shift
         out["height"][:, part] = turn.height
         out["weight"][:, part] = turn.weight * share[r]
@@ -161,7 +167,7 @@ def _join(turns: list[_Turn], directions: Directions, frame: Frame) -> dict[str,
         out["area"][:, part] = turn.area
         out["moments"][:, :, part] = turn.moments
         table = np.full(frame.cells, -1)
-        table.flat[turn.cell] = np.arange(first[r], first[r + 1])
+        table.flat[turn.cell] = part
         out["table"][r] = _fill(table) if len(turn.cell) else -1
     out["weight"] /= out["weight"].sum(dtype=np.float64)
     out["moments"] = out["moments"].reshape(some.moments.shape[0], p * n)
@@ -169,6 +175,17 @@ def _join(turns: list[_Turn], directions: Directions, frame: Frame) -> dict[str,
     for r in np.flatnonzero(out["table"][:, 0, 0] < 0).tolist():
         out["table"][r] = out["table"][r - 1] if r else 0
     return out
+
+
+def _blocks(turns: list[_Turn], parent: NDArray[np.int64], frame: Frame) -> NDArray[np.int64]:
+    """The block of the next coarser grid that holds each place (n,), counted without gaps.
+
+    A block is 2 x 2 lattice cells of the rotations that have the same ``parent`` (M,) rotation.
+    """
+    y, x = np.divmod(np.concatenate([t.cell for t in turns]), frame.cells[1])
+    owner = np.repeat(parent, [len(t.cell) for t in turns])
+    ny, nx = (n // 2 + 1 for n in frame.cells)
+    return np.unique((owner * ny + y // 2) * nx + x // 2, return_inverse=True)[1]
 
 
 def _fill(table: NDArray[np.int64]) -> NDArray[np.int64]:

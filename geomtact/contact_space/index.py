@@ -2,12 +2,12 @@
 
 A *place* is an approach direction, a turn, and a lattice cell of the object's centre over the window; a *pose* is a
 place at one penetration. Every array is laid out penetration by penetration, so pose ``i`` is penetration
-``i // places`` of place ``i % places``.
+``i // places`` of place ``i % places``. Places that the next coarser grid holds in one cell, a *block*, stand together.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,8 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Approach, Directions, level_step
 from geomtact.se3 import Array, hat, transform
 from geomtact.sensing.sensor import Sensor
+
+_DRAWN = 30_000  # poses that stand for all
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Index:
     area : (P, n) number of contact pixels
     moments : (6, P n) moments of each mask (see ``sensing.moments``)
     table : (rotations, ny, nx) place of each lattice cell, the nearest one where the cell does not touch
+    blocks : (B + 1,) first place of each block, and the number of places
     """
 
     mesh: Mesh
@@ -52,8 +55,9 @@ class Index:
     area: NDArray[np.uint16]
     moments: NDArray[np.float32]
     table: NDArray[np.int32]
+    blocks: NDArray[np.int32]
 
-    ARRAYS = ("rotation", "shift", "height", "weight", "bits", "area", "moments", "table")
+    ARRAYS = ("rotation", "shift", "height", "weight", "bits", "area", "moments", "table", "blocks")
 
     def __len__(self) -> int:
         return self.height.size
@@ -86,10 +90,6 @@ class Index:
     def rotations(self) -> Array:
         """R_sensor_object (M, 3, 3) of every rotation of the grid."""
         return self.directions.rotations()[0]
-
-    @cached_property
-    def _first_turn(self) -> NDArray[np.int64]:
-        return np.concatenate([[0], np.cumsum(self.directions.turns)])[:-1]
 
     def poses(self, ids: ArrayLike | None = None) -> Array:
         """T_sensor_object (m, 4, 4) of poses ``ids`` (m,), all by default."""
@@ -155,7 +155,7 @@ class Index:
         Constant time a pose. A pose between the cells that touch gets the nearest one that does.
         """
         T, k, j = self.directions.lookup(np.asarray(T, float).reshape(-1, 4, 4))
-        rotation = self._first_turn[k] + j
+        rotation = self.directions.first_turn[k] + j
         centre = T[:, :2, :3] @ self.mesh.centre + T[:, :2, 3]
         ny, nx = self.table.shape[1:]
         x, y = self._lattice(centre)
@@ -184,10 +184,92 @@ class Index:
         depth = (level + rng.random(len(place))) / bins * self.sensor.max_penetration
         return transform(R, centre - R @ self.mesh.centre), depth
 
+    @cached_property
+    def _mass_before(self) -> Array:
+        """Uniform measure of all poses before each (N + 1,)."""
+        return np.concatenate([[0.0], np.cumsum(self.weight, dtype=np.float64)])
+
+    @cached_property
+    def log_weight(self) -> NDArray[np.float32]:
+        """Log of the uniform measure of every pose's cell (N,); -inf where the housing forbids the pose."""
+        with np.errstate(divide="ignore"):
+            return np.log(np.asarray(self.weight).ravel())
+
+    @cached_property
+    def possible(self) -> NDArray[np.int64]:
+        """Ids (n,) of the poses that the housing does not forbid."""
+        return np.flatnonzero(np.asarray(self.weight).reshape(-1) > 0)
+
+    @cached_property
+    def log_possible_weight(self) -> NDArray[np.float32]:
+        """:attr:`log_weight` of :attr:`possible`."""
+        return self.log_weight[self.possible]
+
+    @cached_property
+    def log_block_weight(self) -> NDArray[np.float32]:
+        """Log of the uniform measure (P B,) of :attr:`block_runs`."""
+        with np.errstate(divide="ignore"):
+            return np.log(np.maximum(self.mass(*self.block_runs), 0)).astype(np.float32)
+
+    def mass(self, first: ArrayLike, counts: ArrayLike) -> Array:
+        """Share of the uniform measure (n,) in runs of poses, each ``counts`` (n,) long from ``first`` (n,)."""
+        first = np.asarray(first, np.int64)
+        one = np.asarray(self.weight).reshape(-1)[first].astype(float)
+        # the difference of sums has an error of its own, which a single cell need not have
+        return np.where(counts == 1, one, self._mass_before[first + counts] - self._mass_before[first])
+
+    def within_runs(self, first: ArrayLike, counts: ArrayLike, share: ArrayLike) -> NDArray[np.int64]:
+        """The pose id (n,) up to which a run of poses holds ``share`` (n,), 0 to 1, of the run's measure."""
+        first = np.asarray(first, np.int64)
+        end = first + np.asarray(counts, np.int64)
+        low, high = self._mass_before[first], self._mass_before[end]
+        return np.clip(np.searchsorted(self._mass_before, low + share * (high - low), "right") - 1, first, end - 1)
+
+    @cached_property
+    def block_runs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First pose id and number of poses (P B,) of every block at every penetration."""
+        first = np.arange(len(self.height))[:, None] * self.places + self.blocks[:-1]
+        return first.ravel(), np.tile(np.diff(self.blocks), len(self.height)).astype(np.int64)
+
+    def at_places(self, places: NDArray[np.int64]) -> Index:
+        """What is stored of some places (m,) alone, for scores; without a grid to look poses up in."""
+        moments = self.moments.reshape(-1, *self.height.shape)[:, :, places]
+        return replace(
+            self,
+            rotation=self.rotation[places],
+            shift=self.shift[places],
+            height=self.height[:, places],
+            weight=self.weight[:, places],
+            bits=self.bits[:, :, places],
+            area=self.area[:, places],
+            moments=moments.reshape(len(moments), -1),
+            table=np.zeros((0, 0, 0), np.int32),
+            blocks=np.array([0, len(places)], np.int32),
+        )
+
+    @cached_property
+    def drawn_moments(self) -> NDArray[np.float32]:
+        """Moments (6, m) of poses drawn by their measure; always the same ones."""
+        at = (np.arange(_DRAWN) + np.random.default_rng(0).random(_DRAWN)) / _DRAWN * self._mass_before[-1]
+        found = np.searchsorted(self._mass_before, at, "right") - 1
+        return np.ascontiguousarray(self.moments[:, np.clip(found, 0, len(self) - 1)])
+
+    def block_of(self, ids: ArrayLike) -> NDArray[np.int64]:
+        """Which of :attr:`block_runs` (n,) holds each pose id (n,)."""
+        level, place = np.divmod(np.asarray(ids, np.int64), self.places)
+        return level * (len(self.blocks) - 1) + np.searchsorted(self.blocks, place, "right") - 1
+
     def masks(self, ids: ArrayLike) -> NDArray[np.bool_]:
         """The stored contact masks (m, h, w) of poses ``ids`` (m,)."""
         level, place = np.divmod(np.asarray(ids), self.places)
         return unpack(self.bits[level, :, place], self.resolution.mask_shape)
+
+
+def spelled_out(first: ArrayLike, counts: ArrayLike) -> NDArray[np.int64]:
+    """The pose ids (sum of counts,) of runs that begin at ``first`` (n,) and are ``counts`` (n,) long."""
+    first, counts = np.asarray(first, np.int64), np.asarray(counts, np.int64)
+    begins = np.cumsum(counts) - counts
+    return np.repeat(first - begins, counts) + np.arange(counts.sum())
 
 
 def pack(masks: NDArray[np.bool_]) -> NDArray[np.uint64]:

@@ -26,7 +26,7 @@ from geomtact.geometry.rotations import Approach, check_approach
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.sensing.sensor import Sensor
 
-FORMAT = 3  # raise whenever a built index would differ
+FORMAT = 5  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
 _KEY_LENGTH = 32  # hexadecimal digits of an entry's name
 

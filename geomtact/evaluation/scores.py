@@ -17,8 +17,9 @@ from geomtact.evaluation import study
 from geomtact.evaluation.touches import Touch
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
+from geomtact.scoring.fitted import PIXELWISE
 from geomtact.scoring.moments import Moments
-from geomtact.scoring.overlap import OVERLAPS
+from geomtact.scoring.product import Product
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.sensor import Sensor
@@ -73,7 +74,7 @@ def prepare(
         mesh, sensor=sensor, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir, progress=watch
     )
     described = watch.of("describing")
-    stores = isinstance(localizer.scorer.scorer, VectorScorer)
+    stores = localizer.scorer.cascade is not None
     return localizer, {
         "index": index_s,
         "describe": None if stores and not described else described,
@@ -83,11 +84,13 @@ def prepare(
 
 def bytes_per_pose(scorer: Scorer, index: Index) -> float:
     """Bytes that ``scorer`` reads of every pose to compare a touch with it; all that is stored, for one unknown here."""
+    if isinstance(scorer, Product):
+        return sum(bytes_per_pose(part, index) for part in scorer.scorers)
     if isinstance(scorer, VectorScorer):
         return scorer.stored.nbytes / len(index)
     if isinstance(scorer, Moments):
         return index.moments.nbytes / len(index)
-    if scorer.name in OVERLAPS:
+    if scorer.name in PIXELWISE:
         return (index.bits.nbytes + index.area.nbytes) / len(index)
     return index.bytes_per_pose
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
+from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.pose_error import coverage, mssd, random_add
 from geomtact.evaluation.touches import Touch, random_touches
 from geomtact.geometry.distance import PoseDistance
@@ -37,6 +38,8 @@ class Outcome:
     level : credible level of the true pose
     mssd_mm, add_mm, mssd10_mm, add10_mm : of the first mode, and of the best of ten; inf without contact found
     probability : of the first mode
+    ms : that localizing took
+    contact : one of ``contact_class.CLASSES``
     """
 
     elastic: bool
@@ -50,6 +53,7 @@ class Outcome:
     add10_mm: float
     probability: float
     ms: float
+    contact: str
 
 
 def make_touches(
@@ -104,6 +108,7 @@ def judged(
             add10_mm=float(mean.min(initial=np.inf)),
             probability=modes[0].probability if modes else 0.0,
             ms=ms,
+            contact=contact_class(localizer.space, T),
         )
         yield outcome, posterior
 
@@ -123,9 +128,20 @@ def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Any]]:
     return {name: some for name, some in found.items() if some}
 
 
-def coverage_figures(levels: ArrayLike) -> dict[str, Any]:
+def by_class(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
+    """Coverage and gain of the outcomes of each contact class, with 99 % binomial intervals."""
+    out = {}
+    for name in CLASSES:
+        some = [o for o in outcomes if o.contact == name]
+        if some:
+            gain = float(np.mean([o.gain for o in some]))
+            out[name] = {"n": len(some), "gain_mean": gain, **coverage_figures([o.level for o in some], 0.99)}
+    return out
+
+
+def coverage_figures(levels: ArrayLike, confidence: float = 0.95) -> dict[str, Any]:
     """Coverage at the nominal masses of the credible levels (n,) of true poses, and the greatest error among them."""
-    found = coverage(levels, NOMINAL)
+    found = coverage(levels, NOMINAL, confidence)
     return {
         "coverage": [asdict(c) for c in found],
         "coverage_error": max(abs(c.share - c.nominal) for c in found),
@@ -148,13 +164,14 @@ def describe(localizer: Localizer) -> dict[str, Any]:
         "index": index.key,
         "poses": len(index),
         "grid": index.resolution.to_json(),
-        "scorer": localizer.scorer.scorer.name,
+        "scorer": localizer.scorer.name,
         "calibration": asdict(calibration),
     }
 
 
 def _figures(outcomes: Sequence[Outcome], random_add_mm: float) -> dict[str, Any]:
-    column = {name: np.array([getattr(o, name) for o in outcomes], float) for name in Outcome.__annotations__}
+    numbers = [name for name in Outcome.__annotations__ if name != "contact"]
+    column = {name: np.array([getattr(o, name) for o in outcomes], float) for name in numbers}
     n = len(outcomes)
     gain = column["gain"]
     out: dict[str, Any] = {

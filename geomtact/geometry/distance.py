@@ -73,16 +73,24 @@ class PoseDistance:
     def turned(self, R: ArrayLike, others: ArrayLike) -> Array:
         """Root mean square point distance (m,) [m] that the rotation alone makes, from ``R`` (3, 3) to ``others``
         (m, 3, 3), about :attr:`anchor`, modulo the object's symmetry."""
-        symmetry = self.mesh.symmetry
+        symmetry, others = self.mesh.symmetry, np.asarray(others, float).reshape(-1, 9)
         if symmetry is not None and symmetry.kind == "sphere":
-            return np.zeros(len(np.asarray(others)))
+            return np.zeros(len(others))
         about = self.points - self.anchor
-        fixed = transform(np.eye(3), np.zeros(3))
-        here, there = fixed.copy(), np.repeat(fixed[None], len(np.asarray(others)), 0)
-        here[:3, :3], there[:, :3, :3] = R, others
-        relative = here[:3, :3].T @ self.aligned(here, there)[:, :3, :3]
         C = about.T @ about / len(about)
-        return np.sqrt(np.maximum(2 * (np.trace(C) - np.einsum("mij,ji->m", relative, C)), 0))
+        elements = np.eye(3)[None] if symmetry is None else symmetry.elements[:, :3, :3]
+
+        def overlap(part: Array) -> Array:
+            """tr(R^T R' S C) (m, G) for ``part`` of a turn before every element."""
+            kernel = np.swapaxes(part @ elements @ C @ np.asarray(R, float).T, 1, 2)
+            return others @ kernel.reshape(-1, 9).T
+
+        if symmetry is not None and symmetry.axis is not None:
+            along = np.outer(symmetry.axis, symmetry.axis)
+            nearest = overlap(along) + np.hypot(overlap(np.eye(3) - along), overlap(hat(symmetry.axis)))
+        else:
+            nearest = overlap(np.eye(3))
+        return np.sqrt(np.maximum(2 * (np.trace(C) - nearest.max(1)), 0))
 
     def _distances(self, T: ArrayLike, others: ArrayLike, over: str) -> Array:
         T, others = np.asarray(T, float), np.asarray(others, float).reshape(-1, 4, 4)

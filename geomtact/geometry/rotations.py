@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import healpix
 import numpy as np
@@ -157,6 +158,11 @@ class Directions:
             weights = same[first].sum(1) / len(image)
         turns = np.maximum(1, np.ceil(periods / turn_step - 1e-9)).astype(np.int64)
         return cls(vectors, weights, turns, periods, symmetry, cones, None, np.arange(len(vectors)))
+
+    @cached_property
+    def first_turn(self) -> NDArray[np.int64]:
+        """Which of :meth:`rotations` is turn 0 of each direction (D,)."""
+        return np.cumsum(self.turns) - self.turns
 
     def rotations(self) -> tuple[Array, NDArray[np.int64], Array]:
         """R_sensor_object (M, 3, 3) of all cells, direction by direction, their direction (M,) and turn [rad] (M,)."""

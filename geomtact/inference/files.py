@@ -18,7 +18,7 @@ from geomtact.inference.posterior import Posterior, Refined
 from geomtact.sensing.sensor import Sensor
 
 _KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many
-_FORMAT = "geomtact/posterior/1"
+_FORMAT = "geomtact/posterior/2"
 
 
 def save(posterior: Posterior, path: str | Path) -> None:
@@ -26,13 +26,12 @@ def save(posterior: Posterior, path: str | Path) -> None:
     :func:`load` needs.
 
     A posterior may be spread over a million poses. For other programs the most probable are written out, those that
-    hold 99 % of the mass but at most 50,000, with log_prob normalised over them; ``cell_log_prob`` holds every cell.
+    hold 99 % of the mass but at most 50,000, with log_prob normalised over them; ``row_log_prob`` holds all, for the runs
+    of ``row_length`` cells that begin at ``row_cell``.
     """
     p = np.exp(posterior.log_prob)
     order = np.argsort(-p, kind="stable")
     some = np.sort(order[: min(_MOST, int(np.searchsorted(np.cumsum(p[order]), _KEPT)) + 1)])
-    every = np.full(len(posterior.index), -np.inf, np.float32)
-    every[posterior.cells] = posterior.log_prob
     refined, symmetry = posterior.refined, posterior.mesh.symmetry
     assert symmetry is not None
     keys = np.array(sorted(refined), np.int64)
@@ -57,7 +56,10 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "object_sha256": np.array(posterior.mesh.sha256),
         "sensor_toml": np.array(posterior.sensor.to_toml()),
         "seed": np.array(posterior.seed),
-        "cell_log_prob": every,
+        "row_cell": posterior.cells,
+        "row_length": np.ones(len(p), np.int64) if posterior.runs is None else posterior.runs,
+        "row_log_prob": posterior.log_prob.astype(np.float32),
+        "index_poses": np.array(len(posterior.index)),
         "T_frame_sensor": posterior.T_frame_sensor,
         "symmetry_elements": symmetry.elements,
         "symmetry_line": np.stack([symmetry.centre, np.zeros(3) if symmetry.axis is None else symmetry.axis]),
@@ -97,8 +99,8 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
             raise ValueError(f"format {meta['format']!r}")
         mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"], symmetry=_symmetry(data, meta))
         sensor = Sensor.from_toml(str(data["sensor_toml"]), str(path))
-        every = data["cell_log_prob"].astype(float)
-        cells = np.flatnonzero(np.isfinite(every))
+        cells, runs, log_prob = data["row_cell"], data["row_length"], data["row_log_prob"].astype(float)
+        poses = int(data["index_poses"])
         extra = meta["refined"]
         refined = {
             int(k): Refined(T, C, np.array(rows).reshape(-1, 6), length, moved)
@@ -111,17 +113,18 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     settings = meta["settings"]
     max_poses, key = settings.get("max_poses", 1_200_000), str(data["index_key"])
     index = open_index(mesh, sensor, meta["approach"], max_poses, cache_dir, key=key)
-    if len(every) != len(index):
+    if poses != len(index):
         raise InputError(f"{path}: its poses are not those of this version's grid; localize again")
     return Posterior(
         index,
         cells,
-        every[cells] - np.log(np.exp(every[cells]).sum() or 1.0),
+        log_prob - np.log(np.exp(log_prob).sum() or 1.0),
         frame=str(data["frame"]),
         T_frame_sensor=data["T_frame_sensor"],
         contact=bool(meta["contact"]),
         log_evidence=float(meta["log_evidence"]),
         seed=int(data["seed"]),
+        runs=runs,
         refined=refined,
         settings=settings,
         warnings=meta["warnings"],

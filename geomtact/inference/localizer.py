@@ -22,13 +22,30 @@ from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.scoring.calibration import posterior_log_prob
-from geomtact.scoring.fitted import FittedScorer, fitted_scorer
+from geomtact.scoring.fitted import DEFAULT_SCORER, FittedScorer, fitted_scorer
 from geomtact.se3 import check_transforms
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
 
-EFFORTS = {"fast": 0, "balanced": 5, "exact": 25}  # modes that are refined
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is done for a touch.
+
+    Attributes
+    ----------
+    resolved : what is scored: "blocks" of about 20 cells, "cells" where the mass is, or "all" cells
+    modes : that are refined
+    thorough : whether each is refined by all registrations, from the whole outline, or by one from half of its points
+    """
+
+    resolved: str
+    modes: int
+    thorough: bool = True
+
+
+EFFORTS = {"fast": Effort("blocks", 0), "balanced": Effort("cells", 5, thorough=False), "exact": Effort("all", 25)}
 Progress = Callable[[float, str], None]
 
 
@@ -56,7 +73,7 @@ class Localizer:
         sensor: str | Path | Sensor = "gelslim",
         approach: Approach | None = None,
         *,
-        scorer: str = "moments",
+        scorer: str = DEFAULT_SCORER,
         max_poses: int = 1_200_000,
         cache_dir: str | Path | None = None,
         progress: Progress | None = None,
@@ -70,7 +87,7 @@ class Localizer:
         sensor : name of a bundled sensor, path of a TOML file, or a Sensor
         approach : [(direction (3,), half angle)]: only touches whose direction from the object towards the sensor, in
             the object frame, lies within the angle [rad] of one of these; 0 means exactly that face
-        scorer : how contacts are compared, one of ``geomtact.scoring.fitted.SCORERS``
+        scorer : how contacts are compared, one of ``geomtact.scoring.fitted.SCORERS``, or weights (.safetensors)
         max_poses : about how many poses the grid may have
         cache_dir : folder of the index cache; by default ``$GEOMTACT_CACHE`` or the user's cache folder
         progress : called with the share done (0 to 1) and what is being done
@@ -104,7 +121,8 @@ class Localizer:
         background : a reading without contact, for readings
         T_world_sensor : (4, 4), or [(4, 4)] for one image: the posterior is then in the world frame
         prior : None, a Posterior, its path, a pair (poses, log weights) or a log density (see ``inference.prior``)
-        effort : "fast" (no refinement), "balanced" (five refined modes) or "exact" (twenty-five)
+        effort : "fast" (the grid's blocks, nothing refined), "balanced" (cells where the mass is, five refined modes) or
+            "exact" (every cell, twenty-five refined modes)
         seed : of the random choices made where credible levels tie
 
         Raises
@@ -131,18 +149,22 @@ class Localizer:
             elsewhere = prior_log_density(prior, self.mesh, frame, self.cache_dir)
             nothing = Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, **common)
             return replace(nothing, elsewhere=elsewhere, warnings=warnings)
+        log_prior = None
         with _timed(timing, "score"):
-            score = self.scorer.score(self.index, mask)
+            if prior is None:
+                rows = self.scorer.rows(self.index, mask, EFFORTS[effort].resolved)
+            else:
+                log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame, self.cache_dir)
+                rows = self.scorer.cells(self.index, mask, log_prior, EFFORTS[effort].resolved == "all")
         with _timed(timing, "posterior"):
-            log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame, self.cache_dir)
-            log_prob, evidence = posterior_log_prob(score, log_prior, self.scorer.calibration)
-            cells = np.flatnonzero(np.isfinite(log_prob))
-        if score.max() < self.scorer.calibration.usual:
+            log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
+            evidence, likeliest = self.scorer.witness.hear(self.index, mask, log_prior)
+            posterior = Posterior(self.index, rows.first, log_prob, runs=rows.runs, log_evidence=evidence, **common)
+        if prior is None and likeliest < self.scorer.witness.usual:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
-        posterior = Posterior(self.index, cells, log_prob[cells], log_evidence=evidence, warnings=warnings, **common)
         with _timed(timing, "refine"):
-            posterior = replace(posterior, refined=self._refinery.refine(posterior, mask, EFFORTS[effort]))
-        return posterior
+            refined = self._refinery.refine(posterior, mask, EFFORTS[effort].modes, EFFORTS[effort].thorough)
+        return replace(posterior, refined=refined, warnings=warnings)
 
     def simulate(self, T_sensor_object: Any) -> Contact:
         """What the sensor would see at a pose (4, 4), without noise (thesis 6.1.3)."""
@@ -152,7 +174,7 @@ class Localizer:
         return self.space.caster.contact(self.sensor, T)
 
     def __repr__(self) -> str:
-        name = self.scorer.scorer.name
+        name = self.scorer.name
         return f"Localizer({self.mesh.name} on {self.sensor.name}, {len(self.index):,} poses, scored by {name})"
 
     @property
@@ -176,7 +198,7 @@ class Localizer:
         return {
             "effort": effort,
             "seed": seed,
-            "scorer": self.scorer.scorer.name,
+            "scorer": self.scorer.name,
             "temperature": self.scorer.calibration.temperature,
             "floor": self.scorer.calibration.floor,
             "max_poses": self.max_poses,

@@ -69,7 +69,7 @@ class Posterior:
     Attributes
     ----------
     index : the discretised contact pose space it lives on
-    cells : (N,) pose ids of the index, ascending; cells that are not among them have no mass
+    cells : (N,) pose ids of the index, ascending; cells that are not among them, nor in their runs, have no mass
     log_prob : (N,) log probability of each, normalised
     frame : "sensor" or "world"
     T_frame_sensor : (4, 4)
@@ -77,19 +77,22 @@ class Posterior:
     elsewhere : without contact, the prior's log density at poses (n, 4, 4) in ``frame``; it is not saved
     log_evidence : log of the mean likelihood under the prior, comparable between objects on one sensor
     seed : of the random choices made where credible levels tie
+    runs : (N,) how many cells from each of ``cells`` on share one density, as the cells of a block do where there is
+        little mass; one each by default
     refined : what registration found, by pose id
     observations, settings, timing_ms, warnings : how it came about
     """
 
     index: Index
     cells: NDArray[np.int64]
-    log_prob: Array
+    log_prob: NDArray[np.floating]
     frame: str = "sensor"
     T_frame_sensor: Array = field(default_factory=lambda: np.eye(4))
     contact: bool = True
     elsewhere: Any = None
     log_evidence: float = 0.0
     seed: int = 0
+    runs: NDArray[np.int64] | None = None
     refined: dict[int, Refined] = field(default_factory=dict)
     observations: list[Any] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
@@ -120,7 +123,7 @@ class Posterior:
 
     @cached_property
     def poses(self) -> Array:
-        """Poses (N, 4, 4) of the object in ``frame``, one a cell; refined ones where registration found better."""
+        """Poses (N, 4, 4) of the object in ``frame``, one a run; refined ones where registration found better."""
         return self.poses_of(np.arange(len(self.cells)))
 
     def poses_of(self, rows: ArrayLike) -> Array:
@@ -137,18 +140,19 @@ class Posterior:
     def effective_poses(self) -> float:
         """How many equally likely cells would be as uncertain: exp of the discrete entropy."""
         p = self._probability
-        return float(np.exp(-(p @ np.where(p > 0, self.log_prob, 0.0)))) if len(p) else 0.0
+        each = self.log_prob if self.runs is None else self.log_prob - np.log(self.runs)
+        return float(np.exp(-(p @ np.where(p > 0, each, 0.0)))) if len(p) else 0.0
 
     def modes(self, k: int = 5) -> list[Mode]:
         """The ``k`` most probable modes, most probable first; none without contact."""
         if not self.contact or k < 1:
             return []
-        found = self._grown(k)
-        return [self._mode(i, mass) for i, mass in found]
+        return [self._mode(cell, mass) for cell, mass in self._grown(k)]
 
     def leading_cells(self, k: int) -> NDArray[np.int64]:
-        """Pose ids (m,) of the index at the heart of the ``k`` most probable modes."""
-        return self.cells[[row for row, _ in self._grown(k)]] if self.contact and k > 0 else self.cells[:0]
+        """Pose ids (m,) of the index at the heart of the ``k`` leading modes, weighed by the most probable cells alone."""
+        found = self._grown(k, full=False) if self.contact and k > 0 else []
+        return np.array([cell for cell, _ in found], np.int64)
 
     def log_density(self, T: ArrayLike) -> Any:
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
@@ -171,9 +175,8 @@ class Posterior:
 
     def cell_log_density(self, ids: ArrayLike) -> Array:
         """Log density (n,) in the cells of pose ids (n,) of the index, relative to the uniform distribution."""
-        ids = np.asarray(ids)
-        where = np.minimum(np.searchsorted(self.cells, ids), len(self.cells) - 1)
-        return np.where(self.cells[where] == ids, self._log_density[where], -np.inf)
+        row, held = self._rows_of(np.asarray(ids))
+        return np.where(held, self._log_density_of(row), -np.inf)
 
     def credible_level(self, T: ArrayLike) -> Any:
         """Smallest highest-density mass in [0, 1] whose region holds ``T`` (4, 4) or (n, 4, 4).
@@ -218,6 +221,10 @@ class Posterior:
 
         return load(path, cache_dir)
 
+    def _runs_of(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """How many cells each of ``rows`` (m,) stands for."""
+        return np.ones(len(rows), np.int64) if self.runs is None else self.runs[rows]
+
     @cached_property
     def _probability(self) -> Array:
         # exponentials in single precision take a fifth of the time, and the scores have no more
@@ -225,9 +232,17 @@ class Posterior:
 
     @cached_property
     def _log_density(self) -> Array:
-        """Log density (N,) of the cells relative to the uniform distribution."""
+        """Log density (N,) of the runs relative to the uniform distribution."""
+        return self._log_density_of(np.arange(len(self.cells)))
+
+    def _log_density_of(self, rows: NDArray[np.int64]) -> Array:
+        """As :attr:`_log_density`, of some rows (m,)."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            density = self.log_prob - np.log(np.asarray(self.index.weight).reshape(-1)[self.cells].astype(float))
+            if self.runs is None:
+                log_mass = self.index.log_weight[self.cells[rows]]
+            else:
+                log_mass = np.log(self.index.mass(self.cells[rows], self.runs[rows]))
+            density = (self.log_prob[rows] - log_mass).astype(float)
         return np.where(np.isfinite(density), density, -np.inf)
 
     @cached_property
@@ -244,81 +259,111 @@ class Posterior:
 
     def _sensor_poses(self, rows: NDArray[np.int64]) -> Array:
         """Poses (m, 4, 4) of ``rows`` in the sensor frame."""
-        cells = self.cells[rows]
+        return self._poses_of_cells(self._heart(rows))
+
+    def _poses_of_cells(self, cells: NDArray[np.int64]) -> Array:
+        """Poses (m, 4, 4) of ``cells`` (m,) in the sensor frame."""
         T = self.index.poses(cells)
-        for i in np.flatnonzero(np.isin(cells, list(self.refined))):
-            T[i] = self.refined[int(cells[i])].T
+        if self.refined:
+            for i in np.flatnonzero(np.isin(cells, list(self.refined))):
+                T[i] = self.refined[int(cells[i])].T
         return T
+
+    def _heart(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The cell (m,) that stands for each of ``rows`` (m,): that of a run with half of the run's measure before it."""
+        cells, runs = self.cells[rows], self._runs_of(rows)
+        many = runs > 1
+        out = cells.copy()
+        out[many] = self.index.within_runs(cells[many], runs[many], 0.5)
+        return out
 
     def _draw_cells(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
         total = np.cumsum(self._probability)
-        row = np.searchsorted(total, rng.random(n) * total[-1])
-        return self.cells[np.minimum(row, len(total) - 1)]
+        row = np.minimum(np.searchsorted(total, rng.random(n) * total[-1]), len(total) - 1)
+        cells, runs = self.cells[row], self._runs_of(row)
+        many = runs > 1
+        cells[many] = self.index.within_runs(cells[many], runs[many], rng.random(int(many.sum())))
+        return cells
 
-    def _grown(self, k: int) -> list[tuple[int, float]]:
-        """Row of each of the ``k`` leading modes and the mass of the mode, most probable first.
+    def _grown(self, k: int, full: bool = True) -> list[tuple[int, float]]:
+        """The cell at the heart of each of the ``k`` leading modes and the mass of the mode, most probable first.
 
-        A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most.
+        A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most. Unless
+        ``full``, the mass is that of the mode's most probable cells.
         """
-        p = self._probability
-        top = np.argpartition(p.astype(np.float32), -min(_SEEDS, len(p)))[-_SEEDS:]
-        top = top[p[top] > 0]
-        moved = self._rows_of(np.array(list(self.refined), np.int64))
-        seeds = _sorted(np.union1d(moved, top), p)
+        moved = np.array(sorted(self.refined), np.int64)
+        seeds = np.union1d(moved, self._heart(self._top_rows()))
+        seeds = seeds[np.argsort(-self.cell_log_density(seeds) - self.index.log_weight[seeds], kind="stable")]
+        poses = self._poses_of_cells(seeds)
         distance, radius = PoseDistance(self.mesh, _POINTS), mode_radius(self.mesh)
         members: list[tuple[int, NDArray[np.int64]]] = []
         covered: set[int] = set()
-        for row, T in zip(seeds, self._sensor_poses(seeds), strict=True):
+        for cell, T in zip(seeds.tolist(), poses, strict=True):
             if len(members) == max(k, _LEAST) + _SPARE:
                 break
-            if int(row) not in covered:
-                inside = self._within(T, distance, radius, moved)
-                members.append((row, np.union1d(inside, [row])))
+            if cell not in covered:
+                inside = self._within(T, distance, radius, moved) if full else seeds[distance.within(T, poses, radius)]
+                members.append((cell, np.union1d(inside, [cell])))
                 covered.update(inside.tolist())
-        return _share_out(members, p)[:k]
+        return self._share_out(members)[:k]
+
+    def _top_rows(self) -> NDArray[np.int64]:
+        """The rows (m,) with the most mass a cell, ``_SEEDS`` of them where there are as many."""
+        p = self.log_prob
+        if self.runs is not None:
+            many = np.flatnonzero(self.runs > 1)
+            p = p.copy()
+            p[many] -= np.log(self.runs[many])
+        if len(p) > 100 * _SEEDS:
+            # the quantile of every fiftieth row leaves few to look at
+            some = p[::50]
+            rows = np.flatnonzero(p >= np.partition(some, -_SEEDS // 5)[-_SEEDS // 5])
+        else:
+            rows = np.arange(len(p))
+        if len(rows) > _SEEDS:
+            rows = rows[np.argpartition(p[rows], -_SEEDS)[-_SEEDS:]]
+        return rows[p[rows] > -np.inf]
 
     def _within(self, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Rows whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""
+        """Cells whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""
         # the mean over a surface is seldom less than a third of the root mean square: farther rotations are left out
         turned = distance.turned(T[:3, :3], self.index.rotations) <= 3 * radius
         here = T[:3, :3] @ distance.anchor + T[:3, 3]
         near = self.index.around(np.flatnonzero(turned), distance.anchor, here, radius + distance.slack)
-        rows = np.union1d(self._rows_of(near), moved)
-        return rows[distance.within(T, self._sensor_poses(rows), radius)]
+        cells = np.union1d(near, moved)
+        return cells[distance.within(T, self._poses_of_cells(cells), radius)]
 
-    def _rows_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Rows of those of the pose ids that have a row."""
-        where = np.minimum(np.searchsorted(self.cells, ids), len(self.cells) - 1)
-        return where[self.cells[where] == ids]
+    def _mass_of(self, cells: NDArray[np.int64]) -> Array:
+        """Probability (m,) of the run that each of ``cells`` (m,) stands for; 0 where it stands for none."""
+        row, held = self._rows_of(cells)
+        return np.where(held & (self._heart(row) == cells), np.exp(self.log_prob[row]), 0.0)
 
-    def _mode(self, row: int, mass: float) -> Mode:
-        found = self.refined.get(int(self.cells[row]))
-        T = self._sensor_poses(np.array([row]))[0]
+    def _rows_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """The row (n,) whose run may hold each pose id (n,), and whether it does."""
+        row = np.maximum(np.searchsorted(self.cells, ids, "right") - 1, 0)
+        return row, (ids >= self.cells[row]) & (ids < self.cells[row] + self._runs_of(row))
+
+    def _share_out(self, members: list[tuple[int, NDArray[np.int64]]]) -> list[tuple[int, float]]:
+        """Modes with the cells within reach of each, made exclusive: a cell belongs to its most probable mode."""
+        todo = [(cell, inside, self._mass_of(inside)) for cell, inside in members]
+        out: list[tuple[int, float]] = []
+        while todo:
+            best = int(np.argmax([mass.sum() for _, _, mass in todo]))
+            cell, taken, mass = todo.pop(best)
+            if mass.sum() <= 0:
+                break
+            out.append((int(cell), float(mass.sum())))
+            for _, inside, left in todo:
+                left[np.isin(inside, taken)] = 0
+        return out
+
+    def _mode(self, cell: int, mass: float) -> Mode:
+        found = self.refined.get(cell)
+        T = self._poses_of_cells(np.array([cell]))[0]
         if found is None:
             found = Refined(T, self.index.cell_covariance(T), np.zeros((0, 6)), self.mesh.radius_rms, False)
         T = self.T_frame_sensor @ T
         return Mode(T, mass, found.covariance, found.observable, found.length, found.moved)
-
-
-def _sorted(rows: NDArray[np.int64], p: Array) -> NDArray[np.int64]:
-    """``rows``, most probable first."""
-    return rows[np.argsort(-p[rows], kind="stable")]
-
-
-def _share_out(members: list[tuple[int, NDArray[np.int64]]], p: Array) -> list[tuple[int, float]]:
-    """Modes with the poses within reach of each, made exclusive: a pose belongs to its most probable mode."""
-    left = p.copy()
-    todo = list(members)
-    out: list[tuple[int, float]] = []
-    while todo:
-        masses = [float(left[inside].sum()) for _, inside in todo]
-        best = int(np.argmax(masses))
-        row, inside = todo.pop(best)
-        if masses[best] <= 0:
-            break
-        out.append((int(row), masses[best]))
-        left[inside] = 0
-    return out
 
 
 def _share(T: Array, seed: int) -> float:

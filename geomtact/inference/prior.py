@@ -15,7 +15,7 @@ from geomtact.errors import InputError, UsageError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.posterior import Posterior
-from geomtact.scoring.calibration import log_weights
+from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, check_transforms, inverse
 
 LogDensity = Callable[[Array], Array]
@@ -31,7 +31,7 @@ _TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a pr
 def prior_log_mass(
     index: Index, prior: Any, T_frame_sensor: Array, frame: str, cache_dir: str | Path | None = None
 ) -> NDArray[np.floating]:
-    """Log mass (N,) of every cell under ``prior``, not normalised; the uniform's without one.
+    """Log mass (N,) of every cell under ``prior``, normalised; the uniform's without one.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def prior_log_mass(
     UsageError, InputError
         Of no known kind, for another object or frame, or ruling out every pose that touches.
     """
-    uniform = log_weights(index)
+    uniform = index.log_weight
     if prior is None:
         return uniform
     if isinstance(prior, str | Path):
@@ -54,7 +54,7 @@ def prior_log_mass(
     elif callable(prior):
         density = _over_images(index, lambda T: _checked(prior(T_frame_sensor @ T), len(T)))
     elif isinstance(prior, tuple | list) and len(prior) == 2:
-        return _of_poses(index, prior[0], prior[1], T_frame_sensor)
+        return normalised(_of_poses(index, prior[0], prior[1], T_frame_sensor))
     else:
         raise UsageError(_EXPECTED.format(type(prior).__name__))
     if not (density < np.inf).all():
@@ -66,7 +66,7 @@ def prior_log_mass(
         raise InputError(
             "prior: it rules out every pose that touches the sensor; check its frame and its units (metres)"
         )
-    return out
+    return normalised(out)
 
 
 def prior_log_density(prior: Any, mesh: Mesh, frame: str, cache_dir: str | Path | None = None) -> LogDensity | None:

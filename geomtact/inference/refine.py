@@ -20,9 +20,11 @@ from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array
 from geomtact.sensing.moments import moments, without_specks
 
-_SURFACE_POINTS = 30_000
+_SURFACE_POINTS, _FEWER_POINTS = 30_000, 12_000  # of the object, in a thorough refinement and in a quick one
 _LEAST_TURN = 0.02  # rad
-_SHAPE = (48, 64)  # of the casts that judge a refinement
+_HURRY = 0.4  # narrowing of the filter in a refinement that is not thorough
+_RIM = 120  # points of the contact's outline, at most; half of them unless the refinement is to be thorough
+_SHAPE = (36, 48)  # of the casts that judge a refinement
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +35,28 @@ class Refinery:
 
     @cached_property
     def _surface(self) -> Surface:
-        mesh = self.space.mesh
-        points, normals = mesh.sample_surface(_SURFACE_POINTS, seed=0)
-        return Surface(points, normals)
+        return Surface(*self.space.mesh.sample_surface(_SURFACE_POINTS, seed=0))
 
-    def _refiners(self, index: Index) -> list[Refiner]:
+    @cached_property
+    def _sparse_surface(self) -> Surface:
+        return Surface(*self.space.mesh.sample_surface(_FEWER_POINTS, seed=0))
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        width, height = self.space.sensor.half_window
+        return _SHAPE if width >= height else _SHAPE[::-1]
+
+    def _refiners(self, index: Index, thorough: bool) -> list[Refiner]:
         # where symmetry leaves no rotation to search, registration is still free to turn a little
         rotation, step = max(index.angle_step, _LEAST_TURN), index.resolution.step
         spread = Spread(rotation / np.sqrt(12), step / np.sqrt(12))
+        if not thorough:
+            return [FilterReg(self._sparse_surface, spread, _HURRY)]
         return [FilterReg(self._surface, spread), Icp(self._surface, spread)]
 
-    def refine(self, posterior: Posterior, mask: NDArray[np.bool_], k: int) -> dict[int, Refined]:
+    def refine(
+        self, posterior: Posterior, mask: NDArray[np.bool_], k: int, thorough: bool = True
+    ) -> dict[int, Refined]:
         """The ``k`` leading modes of ``posterior`` refined against the observed ``mask`` (h, w), by pose id.
 
         Of the cell's own pose, the same with the contact's centroid moved onto the observed one, and what each
@@ -55,17 +68,15 @@ class Refinery:
             return {}
         index, sensor = posterior.index, self.space.sensor
         contact = without_specks(mask, sensor)
-        problem = make_problem(contact, sensor)
+        problem = make_problem(contact, sensor, max_points=_RIM if thorough else _RIM // 2)
         start = index.poses(cells)
         candidates = [start, self._centred(posterior, contact, cells, start)]
-        refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index)]
+        refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index, thorough)]
         poses = np.stack([*candidates, *(r.T for r in refinements)])
-        # a rejected refinement is its own start: each pose is cast once
-        different, which = np.unique(poses.reshape(-1, 16), axis=0, return_inverse=True)
-        merit = self.agreement(contact, different.reshape(-1, 4, 4))[which.ravel()].reshape(poses.shape[:2])
+        winner = self._best(contact, poses)
         out = {}
         for i, cell in enumerate(cells):
-            best = int(merit[:, i].argmax())
+            best = int(winner[i])
             T = poses[best, i]
             covariance, observable = index.cell_covariance(T), np.zeros((0, 6))
             if best >= len(candidates):
@@ -74,33 +85,45 @@ class Refinery:
             out[int(cell)] = Refined(T, covariance, observable, problem.length, best > 0)
         return out
 
+    def _best(self, mask: NDArray[np.bool_], poses: Array) -> NDArray[np.int64]:
+        """Which of the poses (c, n, 4, 4) agrees best with ``mask``, for each of n modes; the first where none touches."""
+        # a rejected refinement is its own start: each pose is cast once
+        different, which = np.unique(poses.reshape(-1, 16), axis=0, return_inverse=True)
+        merit = self.agreement(mask, different.reshape(-1, 4, 4))[which.ravel()].reshape(poses.shape[:2])
+        todo = np.arange(poses.shape[1])
+        while len(todo):  # only winners are asked whether they touch, which costs more
+            best = merit[:, todo].argmax(0)
+            off = ~np.isfinite(self.space.penetration(poses[best, todo])) & np.isfinite(merit[best, todo])
+            merit[best[off], todo[off]] = -np.inf
+            todo = todo[off]
+        return np.asarray(merit.argmax(0))
+
     def agreement(self, mask: NDArray[np.bool_], T: ArrayLike) -> Array:
-        """How well the contact cast at poses ``T`` (n, 4, 4) agrees with ``mask``, 0 to 1; -inf off the contact space.
+        """How well the contact cast at poses ``T`` (n, 4, 4) agrees with ``mask``, 0 to 1.
 
         Intersection over union, at the depth of contour that agrees best: an elastic gel touches less than the part
         of the object below the membrane, by an unknown depth.
         """
         T = np.asarray(T, float)
         sensor = self.space.sensor
-        wide = sensor.half_window[0] >= sensor.half_window[1]
-        shape = _SHAPE if wide else _SHAPE[::-1]
-        seen = to_grid(mask, shape).ravel()
-        depth = self.space.caster.depths(sensor, T, shape).reshape(len(T), -1)
+        seen = to_grid(mask, self._shape).ravel()
+        depth = self.space.caster.depths(sensor, T, self._shape).reshape(len(T), -1)
         out = np.zeros(len(T))
         for share in (0.0, 0.25, 0.5):
             felt = depth > np.maximum(depth.max(1, keepdims=True), 0) * share
             union = (felt | seen).sum(1)
             out = np.maximum(out, (felt & seen).sum(1) / np.maximum(union, 1))
-        out[~np.isfinite(self.space.penetration(T))] = -np.inf
         return out
 
     def _centred(self, posterior: Posterior, contact: NDArray[np.bool_], cells: NDArray[np.int64], T: Array) -> Array:
         """``T`` shifted in the membrane's plane, by at most a lattice step, towards the observed centroid."""
         sensor, index = self.space.sensor, posterior.index
         scale = float(np.hypot(*sensor.half_window))
-        seen = moments(contact[None], sensor)[0, :2] * scale
+        seen = moments(to_grid(contact, self._shape)[None], sensor)[0, :2] * scale
         shift = np.clip(seen - index.moments[:2, cells].T * scale, -index.resolution.step, index.resolution.step)
         out = T.copy()
         out[:, :2, 3] += shift
-        depths = np.array(index.resolution.penetrations)[cells // index.places]
-        return self.space.settle(out, depths, steps=4)[0]
+        wanted = np.array(index.resolution.penetrations)[cells // index.places]
+        deepest = self.space.caster.depths(sensor, out, self._shape).max((1, 2))
+        out[:, 2, 3] += np.where(np.isfinite(deepest), deepest - wanted, 0.0)
+        return out

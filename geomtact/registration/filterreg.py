@@ -18,7 +18,6 @@ from geomtact.se3 import Array, apply, inverse
 
 _NEIGHBOURS = 5
 _OUTLIER = 0.05  # filter value at which a rim point counts as half an outlier
-_NARROWING = 0.6  # of the filter, each step
 _STEPS_AT_END = 2
 _STRETCH = np.array([1.0, 1.0, 3.0])  # the rim is known better across the membrane (z) than along it
 _SLOPE_NOISE = 0.2  # noise across the membrane, as a share of that along it
@@ -32,10 +31,12 @@ class FilterReg:
     ----------
     surface : the object's surface, points denser than the sensor's pixels
     spread : how far the start poses may be off
+    narrowing : of the filter at each step; the smaller, the fewer steps
     """
 
     surface: Surface
     spread: Spread
+    narrowing: float = 0.6
     name: str = "filterreg"
 
     def refine(self, problem: Problem, T: Array) -> Refinement:
@@ -54,7 +55,7 @@ class FilterReg:
         held = np.append(1 / self.spread.metres(problem.length), 1 / problem.sink_std) ** 2
         state, T, sigma, at_end = np.zeros(7), start, reach / 3, 0
         while at_end < _STEPS_AT_END:
-            sigma = max(problem.noise, _NARROWING * sigma)
+            sigma = max(problem.noise, self.narrowing * sigma)
             at_end += sigma == problem.noise
             meeting = rim_filter.meet(T, state[6], sigma)
             if meeting.support < 6:

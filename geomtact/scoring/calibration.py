@@ -9,6 +9,7 @@ the logarithmic score is proper, so what maximises it is calibrated (Gneiting an
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ from geomtact.se3 import Array
 
 TEMPERATURES = np.geomspace(0.01, 30.0, 120)  # in units of the spread of the scores, whatever their scale
 _BINS = 1 << 14
+_CHUNK = 1 << 18  # rows worked on at a time
 _TINY = 1e-30  # probabilities below it are added up as logarithms: single precision ends near 1e-38
 _SPREAD_TOUCHES = 10  # that the spread of the scores is taken from
 FLOORS = np.geomspace(1e-3, 0.5, 16)
@@ -42,14 +44,12 @@ class Touches:
 class Calibration:
     """``log likelihood = score / temperature``; ``floor`` is the uniform's share of the posterior.
 
-    ``gain`` is the mean information gained by the touches it was fitted on [nats]; ``usual`` the score of the best
-    pose that all but one in fifty of them reached: an image below it is unlike any touch of the object.
+    ``gain`` is the mean information gained by the touches it was fitted on [nats].
     """
 
     temperature: float
     floor: float
     gain: float
-    usual: float
 
 
 def simulate_touches(index: Index, n: int, seed: int, progress: Callable[[float, str], None] | None = None) -> Touches:
@@ -83,66 +83,108 @@ def simulate_touches(index: Index, n: int, seed: int, progress: Callable[[float,
     return Touches(masks, np.array(ids, np.int64))
 
 
-def calibrate(scorer: Scorer, index: Index, touches: Touches) -> Calibration:
-    """The temperature and floor under which the true poses of ``touches`` are most probable."""
-    weight = np.asarray(index.weight).ravel()
-    spread = float(np.median([scorer.score(index, mask).std() for mask in touches.masks[:_SPREAD_TOUCHES]]))
+def calibrate(
+    scorer: Scorer, index: Index, touches: Touches, weight: NDArray[np.floating] | None = None
+) -> Calibration:
+    """The temperature and floor under which the true poses of ``touches`` are most probable.
+
+    ``weight`` is the measure of what ``scorer`` scores and ``touches.ids`` count: the cells of ``index`` by default.
+    """
+    weight = np.asarray(index.weight).ravel() if weight is None else weight
+    return calibrated(lambda i: scorer.score(index, touches.masks[i]).ravel(), touches.ids, weight)
+
+
+def calibrated(
+    score_of: Callable[[int], NDArray[np.float32]], ids: NDArray[np.int64], weight: NDArray[np.floating]
+) -> Calibration:
+    """As :func:`calibrate`: ``score_of(i)`` gives the scores (N,) of touch i, whose true row is ``ids[i]``, and rows have
+    measures ``weight`` (N,)."""
+    spread = float(np.median([score_of(i).std() for i in range(min(_SPREAD_TOUCHES, len(ids)))]))
     temperatures = TEMPERATURES * max(spread, 1e-9)
-    ratio = np.zeros((len(temperatures), len(touches.ids)))
-    best_score = np.zeros(len(touches.ids))
-    for i, (mask, true) in enumerate(zip(touches.masks, touches.ids, strict=True)):
-        score = scorer.score(index, mask).ravel()
-        best_score[i] = score.max()
-        below, mass = _histogram(best_score[i] - score, weight)
+    ratio = np.zeros((len(temperatures), len(ids)))
+    for i, true in enumerate(ids):
+        score = score_of(i)
+        top = score.max()
+        below, mass = _histogram(top - score, weight)
         # the likelihood at the true pose over its mean, for all temperatures from one pass over the scores
-        evidence = np.log(np.exp(-below / temperatures[:, None]) @ mass)
-        ratio[:, i] = (score[true] - best_score[i]) / temperatures - evidence
-    # the density at the truth is a mixture of the scored and the uniform one
-    mixed = np.log((1 - FLOORS[:, None, None]) * np.exp(np.minimum(ratio, 500)) + FLOORS[:, None, None]).mean(2)
-    best_floor, best = np.unravel_index(mixed.argmax(), mixed.shape)
-    usual = float(np.quantile(best_score, 0.02))
-    return Calibration(float(temperatures[best]), float(FLOORS[best_floor]), float(mixed.max()), usual)
+        terms = np.exp(below * np.float32(-1) / temperatures[:, None].astype(np.float32))
+        evidence = np.log(np.maximum((terms @ mass).astype(float), _TINY))
+        ratio[:, i] = (score[true] - top) / temperatures - evidence
+    found = [best_floor(each) for each in ratio]
+    best = int(np.argmax([gain for _, gain in found]))
+    return Calibration(float(temperatures[best]), *found[best])
 
 
-def _histogram(below: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[Array, Array]:
-    """How far below the best the scores lie, in fine bins (b,), and the uniform measure of the poses in each (b,)."""
+def best_floor(ratio: Array) -> tuple[float, float]:
+    """The floor under which the truths are most probable, and their mean gain with it.
+
+    ``ratio`` (n,) are the gains at the truths without a floor: the density there becomes a mixture with the uniform.
+    """
+    mixed = np.log((1 - FLOORS[:, None]) * np.exp(np.minimum(ratio, 500)) + FLOORS[:, None]).mean(1)
+    return float(FLOORS[mixed.argmax()]), float(mixed.max())
+
+
+def _histogram(
+    below: NDArray[np.float32], weight: NDArray[np.floating]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """How far below the best the scores lie, in those fine bins (b,) that hold any, and the measure in each (b,)."""
     width = max(float(below.max()), 1e-9) / (_BINS - 1)
     bin_of = (below / np.float32(width)).astype(np.int32)
     mass = np.bincount(bin_of, weight, minlength=_BINS)
-    middle = np.bincount(bin_of, weight * below, minlength=_BINS) / np.maximum(mass, 1e-300)
-    return np.asarray(middle, float), np.asarray(mass, float)
-
-
-def log_weights(index: Index) -> NDArray[np.float32]:
-    """Log of the uniform measure of every pose's cell (N,); -inf where the housing forbids the pose."""
-    with np.errstate(divide="ignore"):
-        return np.log(np.asarray(index.weight).ravel())
+    held = np.flatnonzero(mass)
+    middle = np.bincount(bin_of, weight * below, minlength=_BINS)[held] / mass[held]
+    return middle.astype(np.float32), mass[held].astype(np.float32)
 
 
 def posterior_log_prob(
     score: NDArray[np.float32], log_prior: NDArray[np.floating], calibration: Calibration
-) -> tuple[Array, float]:
-    """Log probability (N,) of every cell, and the log evidence: the mean of exp(score) under the prior.
+) -> NDArray[np.float32]:
+    """Log probability (N,) of every row; ``log_prior`` (N,) is the log mass of every row, normalised."""
+    score, prior, floor = score.ravel(), log_prior.astype(np.float32, copy=False), calibration.floor
+    out = np.empty(len(score), np.float32)
+    inverse = np.float32(1 / calibration.temperature)
 
-    ``log_prior`` (N,) is the log mass of every cell, not normalised. The evidence takes the score as it is: divided by
-    one object's temperature it could not be compared with another object's.
-    """
-    # normalised before it is rounded: a log density is given up to a constant, however large
-    prior = (log_prior - _log_sum_exp(log_prior)).astype(np.float32)
-    joint = score.ravel() * np.float32(1 / calibration.temperature) + prior
-    floor, total, evidence = calibration.floor, _log_sum_exp(joint), _log_sum_exp(score.ravel() + prior)
-    # written out, and in single precision, because numpy's logaddexp takes many times as long
-    joint -= np.float32(total - np.log1p(-floor))
-    prior += np.float32(np.log(floor))
-    probability = np.exp(joint)
-    probability += np.exp(prior)
-    with np.errstate(divide="ignore"):
-        log_prob = np.log(probability).astype(float)
-    tiny = np.flatnonzero((probability < _TINY) & (prior > -np.inf))
-    log_prob[tiny] = np.logaddexp(joint[tiny], prior[tiny], dtype=float)
-    return log_prob, evidence
+    # in single precision and in chunks: a million rows are many megabytes a pass
+    def weigh(part: slice) -> float:
+        np.multiply(score[part], inverse, out=out[part])
+        out[part] += prior[part]
+        return _log_sum_exp(out[part])
+
+    def mix(part: slice) -> None:
+        joint, mine = out[part], prior[part]
+        joint -= np.float32(total)
+        if floor == 0:
+            return
+        mass = np.exp(mine) * np.float32(floor)
+        mass += np.exp(joint) * np.float32(1 - floor)
+        if mass.min() > _TINY:
+            np.log(mass, out=joint)
+            return
+        # a probability too small for single precision is added up as logarithms
+        tiny = np.flatnonzero((mass < _TINY) & (mine > -np.inf))
+        kept = np.logaddexp(joint[tiny] + np.log1p(-floor), mine[tiny] + np.log(floor), dtype=float)
+        with np.errstate(divide="ignore"):
+            np.log(mass, out=joint)
+        joint[tiny] = kept
+
+    parts = [slice(i, i + _CHUNK) for i in range(0, len(out), _CHUNK)]
+    with ThreadPoolExecutor(2 if len(parts) > 1 else 1) as pool:
+        total = float(np.logaddexp.reduce(list(pool.map(weigh, parts))))
+        list(pool.map(mix, parts))
+    return out
 
 
-def _log_sum_exp(x: NDArray[np.floating]) -> float:
-    top = x.max()
-    return float(top + np.log(np.exp(x - top).sum(dtype=np.float64)))
+def normalised(log_mass: NDArray[np.floating]) -> NDArray[np.floating]:
+    """``log_mass`` (N,) less the log of its sum, in its own precision: a log density is given up to a constant, however large."""
+    top = log_mass.max()
+    out: NDArray[np.floating] = log_mass - (top + np.log(np.exp(log_mass - top).sum(dtype=np.float64)))
+    return out
+
+
+def _log_sum_exp(x: NDArray[np.float32]) -> float:
+    top = float(x.max(initial=-np.inf))
+    if top == -np.inf:
+        return top
+    work = x - np.float32(top)
+    np.exp(work, out=work)
+    return top + float(np.log(work.sum()))  # numpy adds up in pairs, which keeps single precision exact enough

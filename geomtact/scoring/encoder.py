@@ -25,21 +25,34 @@ from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.moments import without_specks
 from geomtact.sensing.sensor import Sensor
 
+WEIGHTS = Path(__file__).with_name("encoder.safetensors")  # trained once for all parts, with a card beside it
 SHAPE = (24, 32)  # of what the network sees: the whole window, lying
-MOMENTS = 6
+BESIDE = 8  # numbers beside the pixels: six moments, and two of the grid's cell
 _PIXEL = 2 / SHAPE[1] / float(np.hypot(1, SHAPE[0] / SHAPE[1]))  # in units of the window's half diagonal
 Weights = dict[str, NDArray[np.float32]]
 
 
+@dataclass(frozen=True, eq=False)
 class EncoderScorer(VectorScorer):
-    """Minus the squared distance between the network's vectors of the observed and of every stored contact."""
+    """Minus the squared distance between the network's vectors of the observed and of every stored contact.
+
+    Attributes
+    ----------
+    usual : largest squared distance to the nearest stored contact that is usual for touches of the object. A contact
+        farther from all of them is unlike what the network has learned from, and its scores count for less in proportion.
+    """
+
+    usual: float = np.inf
+
+    def trust(self, best: float) -> np.float32:
+        return np.float32(min(1.0, self.usual / max(-best, 1e-9)))
 
     def seen(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""
         assert isinstance(self.descriptor, Tower)
         image = _lying(without_specks(mask, index.sensor)[None].astype(np.float32))[0]
         small = cv2.resize(image, SHAPE[::-1], interpolation=cv2.INTER_AREA)
-        return vector(self.descriptor.weights, small)
+        return vector(self.descriptor.weights, small, self.descriptor.cell)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +60,7 @@ class Tower:
     """The network's side for stored contacts, as a descriptor."""
 
     weights: Weights
+    cell: NDArray[np.float32]  # see ``cell_size``
     name: str = "encoder"
 
     def __repr__(self) -> str:
@@ -60,12 +74,18 @@ class Tower:
         images = _lying(masks.astype(np.float32))
         n, h, w = images.shape
         blocks = images.reshape(n, SHAPE[0], h // SHAPE[0], SHAPE[1], w // SHAPE[1])
-        return run(self.weights, blocks.mean((2, 4), dtype=np.float32), "stored")
+        return run(self.weights, blocks.mean((2, 4), dtype=np.float32), self.cell, "stored")
 
 
-def vector(weights: Weights, image: NDArray[np.float32]) -> NDArray[np.float32]:
+def cell_size(sensor: Sensor, step: float, swing: float) -> NDArray[np.float32]:
+    """What the network is told of a grid (2,): log of the lattice step and of the ``swing`` [m] by which the next
+    rotation moves the object's surface, in units of the window's half diagonal."""
+    return np.log(np.maximum([step, swing], 1e-6) / np.hypot(*sensor.half_window)).astype(np.float32)
+
+
+def vector(weights: Weights, image: NDArray[np.float32], cell: NDArray[np.float32]) -> NDArray[np.float32]:
     """What ``network.Encoder`` makes of one touch: vector (d,) of an image (24, 32), the share of each pixel in contact."""
-    m = moment_features(image.reshape(1, -1) @ BASIS, np)[0]
+    m = np.concatenate([moment_features(image.reshape(1, -1) @ BASIS, np)[0], cell])
     x = np.concatenate([image.ravel(), m])
     for layer in ("trunk.0", "trunk.2"):
         x = _gelu(weights[f"{layer}.weight"] @ x + weights[f"{layer}.bias"])
@@ -100,6 +120,17 @@ def _basis() -> NDArray[np.float32]:
 BASIS = _basis()  # (768, 6): sums of an image's pixels times 1, x, y and their products
 
 
+def architecture(path: Path) -> str:
+    """What the metadata of a weights file names its network, "" for nothing or an unreadable file."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(str(path), framework="np") as file:
+            return str((file.metadata() or {}).get("architecture", ""))
+    except (OSError, SafetensorError):
+        return ""
+
+
 @lru_cache(maxsize=4)
 def load_weights(path: Path) -> Weights:
     """The encoder's weights from a safetensors file.
@@ -115,7 +146,7 @@ def load_weights(path: Path) -> Weights:
     advice = "give a file that 'geomtact train' wrote"
     try:
         weights = {name: np.asarray(value, np.float32) for name, value in load_file(str(path)).items()}
-        vector(weights, np.zeros(SHAPE, np.float32))
+        vector(weights, np.zeros(SHAPE, np.float32), np.zeros(2, np.float32))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {advice}") from None
     except (OSError, SafetensorError) as error:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,30 +17,77 @@ from geomtact.contact_space.index import Index
 from geomtact.errors import MeshError, UsageError, nearest_name
 from geomtact.files import write_whole
 from geomtact.scoring.calibration import Calibration, Touches, calibrate, simulate_touches
+from geomtact.scoring.cascade import Cascade, Rows
 from geomtact.scoring.descriptors import CLASSICAL
-from geomtact.scoring.encoder import EncoderScorer, Tower, load_weights
+from geomtact.scoring.encoder import WEIGHTS, EncoderScorer, Tower, architecture, cell_size, load_weights
+from geomtact.scoring.likelihood import PixelLikelihood
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.overlap import OVERLAPS
+from geomtact.scoring.product import Comparison, Product, choose
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import Descriptor, VectorScorer, describe_index
+from geomtact.scoring.witness import Witness
 
-FORMAT = 3
+FORMAT = 7
 DESCRIPTORS: dict[str, Descriptor] = {**CLASSICAL}
-SCORERS = (*OVERLAPS, *DESCRIPTORS, "moments")
+PIXELWISE: dict[str, Scorer] = {**OVERLAPS, "likelihood": PixelLikelihood()}
+_ENCODER = "encoder"
+DEFAULT_SCORER = "best"  # of the encoder, the moments and the overlap, those that tell most on an index
+SCORERS = (*PIXELWISE, *DESCRIPTORS, "moments", _ENCODER, DEFAULT_SCORER)
 _WEIGHTS = ".safetensors"
+_COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
+_LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than choosing which
+_USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual
+_LEAST_GAIN = 0.05  # nats that a touch has to tell in the mean
 _FIT, _JUDGE = 300, 200  # touches the moments are learned from, and touches the temperature is chosen on
 
 
 @dataclass(frozen=True)
 class FittedScorer:
-    """A scorer and what its scores are worth on one index."""
+    """A scorer and what its scores are worth on one index.
 
+    Attributes
+    ----------
+    name : as it was asked for
+    scorer, calibration : of the cells
+    witness : tells how likely a touch of the object is at all
+    cascade : of blocks and some cells; None where the score has no coarse form
+    thorough, exact : a scorer that counts the pixels too, and what it is worth; None where the score goes without
+    """
+
+    name: str
     scorer: Scorer
     calibration: Calibration
+    witness: Witness
+    cascade: Cascade | None = None
+    thorough: Scorer | None = None
+    exact: Calibration | None = None
 
-    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Similarity (P, n) of ``mask`` (h, w) to every pose."""
-        return self.scorer.score(index, mask)
+    def rows(self, index: Index, mask: NDArray[np.bool_], resolved: str) -> Rows:
+        """Scores of all cells under the uniform prior.
+
+        ``resolved`` says how: "blocks" alone, "cells" where the mass is and, on a large grid, blocks elsewhere, or "all"
+        cells, the pixels counted too. A score without a coarse form scores all cells.
+        """
+        if self.cascade is not None and resolved == "blocks":
+            return self.cascade.whole(index, mask)
+        if self.cascade is not None and self.cascade.partly is not None and resolved == "cells":
+            return self.cascade.expanded(index, mask)
+        return self.cells(index, mask, None, resolved == "all")
+
+    def cells(self, index: Index, mask: NDArray[np.bool_], log_prior: NDArray[np.floating] | None, exact: bool) -> Rows:
+        """Scores of every single cell that has mass.
+
+        ``log_prior`` (N,) is the log mass of all cells, the uniform's where it is None; ``exact`` scores count the pixels too.
+        """
+        scorer, calibration = self.scorer, self.calibration
+        if exact and self.thorough is not None and self.exact is not None:
+            scorer, calibration = self.thorough, self.exact
+        cells, prior = index.possible, index.log_possible_weight
+        if log_prior is not None:
+            cells = np.flatnonzero(np.isfinite(log_prior))
+            prior = log_prior[cells]
+        return Rows(cells, None, scorer.score(index, mask).reshape(-1)[cells], prior, calibration)
 
 
 def fitted_scorer(
@@ -54,14 +102,22 @@ def fitted_scorer(
     UsageError
         No scorer of that name.
     MeshError
-        The object can hardly be touched, so nothing can be calibrated.
+        The object can hardly be touched, so nothing can be calibrated; or its touches are all alike.
     """
     if name not in SCORERS and not name.endswith(_WEIGHTS):
         raise UsageError(f"no score named {name!r}{nearest_name(name, SCORERS)}")
-    path = None if folder is None else folder / f"{_file_name(name)}.json"
+    descriptor = _descriptor(name, index)
+    label = name if descriptor is None else f"{name.split('/')[-1]}-{_fingerprint(descriptor)}"
+    known: dict[str, Scorer] = dict(PIXELWISE)
+    if descriptor is not None:
+        path = None if folder is None else folder / f"{descriptor.name}-{_fingerprint(descriptor)}.npy"
+        known[_ENCODER if name == DEFAULT_SCORER else name] = _vector_scorer(
+            descriptor, describe_index(index, descriptor, path, progress)
+        )
+    path = None if folder is None else folder / f"{label}.json"
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            return _from_json(name, json.loads(path.read_text("utf-8")), index, folder, progress)
+            return _from_json(name, json.loads(path.read_text("utf-8")), known, index)
     touches = simulate_touches(index, _FIT + _JUDGE, seed=20_200_531, progress=progress)
     if len(touches.ids) < 40:
         raise MeshError(
@@ -69,55 +125,132 @@ def fitted_scorer(
             "check the object's unit and the approach"
         )
     n = len(touches.ids) * _FIT // (_FIT + _JUDGE)
-    if name == "moments":
-        scorer: Scorer = Moments.fit(index, touches.masks[:n], touches.ids[:n])
-    else:
-        scorer = _unfitted(name, index, folder, progress)
-    fitted = FittedScorer(scorer, calibrate(scorer, index, Touches(touches.masks[n:], touches.ids[n:])))
+    learn, judge = (Touches(touches.masks[part], touches.ids[part]) for part in (slice(n), slice(n, None)))
+    data = _fit(name, known, Moments.fit(index, learn.masks, learn.ids), index, judge)
+    if data["calibration"]["gain"] < _LEAST_GAIN and name in ("moments", DEFAULT_SCORER):
+        raise MeshError(_all_alike(index, touches, data["calibration"]["gain"]))
     if path is not None:
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
-            write_whole(path, lambda temporary: temporary.write_text(json.dumps(_to_json(fitted)), "utf-8"))
-    return fitted
+            write_whole(path, lambda temporary: temporary.write_text(json.dumps(data), "utf-8"))
+    return _from_json(name, data, known, index)
 
 
-def _unfitted(name: str, index: Index, folder: Path | None, progress: Progress | None) -> Scorer:
-    """A scorer that learns nothing from touches."""
-    if name in OVERLAPS:
-        return OVERLAPS[name]
-    learned = name.endswith(_WEIGHTS)
-    descriptor = Tower(load_weights(Path(name))) if learned else DESCRIPTORS[name]
-    # what the vectors depend on names their file: its settings, or its weights
-    path = None if folder is None else folder / f"{descriptor.name}-{_fingerprint(descriptor)}.npy"
-    stored = describe_index(index, descriptor, path, progress)
-    return EncoderScorer(descriptor, stored) if learned else VectorScorer(descriptor, stored)
+def _fit(name: str, known: dict[str, Scorer], moments: Moments, index: Index, touches: Touches) -> dict[str, Any]:
+    """All that is fitted, as it stands in the cache."""
+    nearest = {
+        each: float(np.quantile([-scorer.score(index, mask).max() for mask in touches.masks], _USUAL))
+        for each, scorer in known.items()
+        if isinstance(scorer, EncoderScorer)
+    }
+    known = {**_limited(known, nearest), "moments": moments}
+    best = [Witness(moments).hear(index, mask)[1] for mask in touches.masks]
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        "moments": {
+            "bias": moments.bias.tolist(),
+            "covariance": moments.covariance.tolist(),
+            "freedom": moments.freedom,
+        },
+        "usual": float(np.quantile(best, 0.02)),
+        "nearest": nearest,
+        "weights": {name: 1.0},
+    }
+    if name == DEFAULT_SCORER:
+        comparison = Comparison(index, touches)
+        candidates = {each: known[each] for each in (_ENCODER, "moments", "iou")}
+        # on a large grid a further score has to be worth its time
+        data["weights"] = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
+        more = {**candidates, "likelihood": known["likelihood"]}
+        data["exact_weights"] = choose(comparison, more, least=0.02, start=data["weights"])
+        data["exact"] = asdict(calibrate(_weighed(data["exact_weights"], known), index, touches))
+    calibration = calibrate(_weighed(data["weights"], known), index, touches)
+    data["calibration"] = asdict(calibration)
+    vectors = known[_ENCODER if name == DEFAULT_SCORER else name]
+    if isinstance(vectors, VectorScorer):
+        alone = list(data["weights"]) in ([name], [_ENCODER])
+        fine = calibration if alone else calibrate(vectors, index, touches)
+        data["cascade"] = Cascade.fit(vectors, fine, index, touches, alone and len(index) > _LARGE).to_json()
+    return data
 
 
-def _file_name(name: str) -> str:
-    return f"encoder-{_fingerprint(Tower(load_weights(Path(name))))}" if name.endswith(_WEIGHTS) else name
+def _from_json(name: str, data: dict[str, Any], known: dict[str, Scorer], index: Index) -> FittedScorer:
+    if data["format"] != FORMAT:
+        raise ValueError("another format")
+    m = data["moments"]
+    moments = Moments(np.array(m["bias"]), np.array(m["covariance"]), m["freedom"])
+    known = {**_limited(known, data["nearest"]), "moments": moments}
+    vectors = known.get(_ENCODER if name == DEFAULT_SCORER else name)
+    cascade = None
+    if isinstance(vectors, VectorScorer):
+        cascade = Cascade.from_json(data["cascade"], vectors, index)
+    thorough, exact = None, None
+    if "exact" in data:
+        thorough, exact = _weighed(data["exact_weights"], known), Calibration(**data["exact"])
+    return FittedScorer(
+        name,
+        _weighed(data["weights"], known),
+        Calibration(**data["calibration"]),
+        Witness(moments, data["usual"]),
+        cascade,
+        thorough,
+        exact,
+    )
+
+
+def _limited(known: dict[str, Scorer], nearest: dict[str, float]) -> dict[str, Scorer]:
+    """``known`` with what is usual for the touches of an index."""
+    return {
+        name: replace(scorer, usual=nearest[name]) if isinstance(scorer, EncoderScorer) else scorer
+        for name, scorer in known.items()
+    }
+
+
+def _weighed(weights: dict[str, float], known: dict[str, Scorer]) -> Scorer:
+    if len(weights) == 1:
+        return known[next(iter(weights))]
+    return Product([known[name] for name in weights], list(weights.values()))
+
+
+def _all_alike(index: Index, touches: Touches, gain: float) -> str:
+    """Why the object cannot be localized, when its touches tell nothing about its pose."""
+    filled = float(np.mean([mask.mean() > 0.95 for mask in touches.masks]))
+    why = (
+        f"at {100 * filled:.0f} % of its poses the contact fills the window"
+        if filled > 0.5
+        else "its contacts differ by less than a touch's noise"
+    )
+    return (
+        f"{index.mesh.name}: cannot be localized, because its touches on the sensor {index.sensor.name!r} are all alike: "
+        f"{why}, and a touch tells {max(gain, 0):.2f} nats; use a sensor with a larger window, or an approach to where "
+        "the object has edges"
+    )
+
+
+def _descriptor(name: str, index: Index) -> Descriptor | None:
+    """What makes the vectors of a score that compares vectors."""
+    if name in DESCRIPTORS:
+        return DESCRIPTORS[name]
+    if name not in (_ENCODER, DEFAULT_SCORER) and not name.endswith(_WEIGHTS):
+        return None
+    path = Path(name) if name.endswith(_WEIGHTS) else WEIGHTS
+    if architecture(path) == "resnet50":
+        from geomtact.scoring.resnet import load_resnet
+
+        return load_resnet(path)
+    swing = index.angle_step * index.mesh.radius_rms
+    return Tower(load_weights(path), cell_size(index.sensor, index.resolution.step, swing))
+
+
+def _vector_scorer(descriptor: Descriptor, stored: NDArray[np.float32]) -> VectorScorer:
+    if isinstance(descriptor, Tower):
+        return EncoderScorer(descriptor, stored)
+    if descriptor.name == "resnet50":
+        from geomtact.scoring.resnet import CosineScorer
+
+        return CosineScorer(descriptor, stored)
+    return VectorScorer(descriptor, stored)
 
 
 def _fingerprint(descriptor: Descriptor) -> str:
+    """Of what the vectors depend on: the descriptor's settings, or its weights."""
     return hashlib.sha256(repr(descriptor).encode()).hexdigest()[:12]
-
-
-def _to_json(fitted: FittedScorer) -> dict:
-    out = {"format": FORMAT, "name": fitted.scorer.name, "calibration": asdict(fitted.calibration)}
-    if isinstance(fitted.scorer, VectorScorer):
-        out["descriptor"] = _fingerprint(fitted.scorer.descriptor)
-    if isinstance(fitted.scorer, Moments):
-        m = fitted.scorer
-        out["moments"] = {"bias": m.bias.tolist(), "covariance": m.covariance.tolist(), "freedom": m.freedom}
-    return out
-
-
-def _from_json(name: str, data: dict, index: Index, folder: Path | None, progress: Progress | None) -> FittedScorer:
-    if data["format"] != FORMAT:
-        raise ValueError("another format")
-    calibration = Calibration(**data["calibration"])
-    if data["name"] != "moments":
-        scorer = _unfitted(name, index, folder, progress)
-        if isinstance(scorer, VectorScorer) and data["descriptor"] != _fingerprint(scorer.descriptor):
-            raise ValueError("another descriptor")
-        return FittedScorer(scorer, calibration)
-    m = data["moments"]
-    return FittedScorer(Moments(np.array(m["bias"]), np.array(m["covariance"]), m["freedom"]), calibration)

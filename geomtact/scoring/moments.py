@@ -62,6 +62,13 @@ class Moments:
 
     def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Log likelihood (P, n) of the moments of ``mask``."""
+        return self._of(index, mask, index.moments).reshape(index.height.shape)
+
+    def of_drawn(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """As :meth:`score`, at the poses of ``index.drawn_moments`` alone: (m,)."""
+        return self._of(index, mask, index.drawn_moments)
+
+    def _of(self, index: Index, mask: NDArray[np.bool_], stored: NDArray[np.float32]) -> NDArray[np.float32]:
         seen = _seen(index, mask) - self.bias
         W = self._whiten.astype(np.float32)
         target = (W @ seen).astype(np.float32)
@@ -71,14 +78,13 @@ class Moments:
             - gammaln(nu / 2)
             - 0.5 * (d * np.log(nu * np.pi) + np.linalg.slogdet(self.covariance)[1])
         )
-        out = np.zeros(index.height.size, np.float32)
-        stored = index.moments
+        out = np.zeros(stored.shape[1], np.float32)
         for start in range(0, len(out), _CHUNK):
             part = slice(start, start + _CHUNK)
             off = W @ stored[:, part]
             off -= target[:, None]
             out[part] = np.log1p(np.einsum("in,in->n", off, off) / np.float32(nu))
-        return (np.float32(norm) - np.float32((nu + d) / 2) * out).reshape(index.height.shape)
+        return np.float32(norm) - np.float32((nu + d) / 2) * out
 
 
 def _seen(index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from geomtact.scoring.encoder import BASIS, MOMENTS, SHAPE, moment_features
+from geomtact.scoring.encoder import BASIS, BESIDE, SHAPE, moment_features
 
 _BATCH = 8192
 
@@ -17,34 +17,40 @@ class Encoder(nn.Module):
 
     basis: torch.Tensor
 
-    def __init__(self, width: int = 512, dimension: int = 32):
+    def __init__(self, width: int = 512, dimension: int = 16):
         super().__init__()
-        n = SHAPE[0] * SHAPE[1] + MOMENTS
+        n = SHAPE[0] * SHAPE[1] + BESIDE
         self.trunk = nn.Sequential(nn.Linear(n, width), nn.GELU(), nn.Linear(width, width), nn.GELU())
         self.heads = nn.ModuleDict(
             {
-                side: nn.Sequential(nn.Linear(width + MOMENTS, width // 2), nn.GELU(), nn.Linear(width // 2, dimension))
+                side: nn.Sequential(nn.Linear(width + BESIDE, width // 2), nn.GELU(), nn.Linear(width // 2, dimension))
                 for side in ("touch", "stored")
             }
         )
 
         self.register_buffer("basis", torch.from_numpy(BASIS), persistent=False)
 
-    def forward(self, images: torch.Tensor, side: str) -> torch.Tensor:
-        """Vectors (n, d) of images (n, 24, 32), the share of each pixel in contact; ``side`` is "touch" or "stored"."""
+    def forward(self, images: torch.Tensor, cell: torch.Tensor, side: str) -> torch.Tensor:
+        """Vectors (n, d) of images (n, 24, 32), the share of each pixel in contact, on a grid of ``cell`` (2,).
+
+        ``side`` is "touch" or "stored".
+        """
         with torch.autocast("cpu", enabled=False):  # differences of squares need single precision
             sums = images.float().flatten(1) @ self.basis  # (n, 6)
-        m = moment_features(sums, torch)  # (n, 6)
+        m = torch.cat([moment_features(sums, torch), cell.expand(len(images), 2)], 1)  # (n, 8)
         x = self.trunk(torch.cat([images.flatten(1), m], 1))  # (n, width)
         out: torch.Tensor = self.heads[side](torch.cat([x, m], 1))
         return out
 
 
-def run(weights: dict[str, NDArray[np.float32]], images: NDArray[np.float32], side: str) -> NDArray[np.float32]:
-    """Vectors (n, d) of ``images`` (n, 24, 32) under ``weights``, in bfloat16 where the processor has it."""
-    network = with_weights(weights)
+def run(
+    weights: dict[str, NDArray[np.float32]], images: NDArray[np.float32], cell: NDArray[np.float32], side: str
+) -> NDArray[np.float32]:
+    """Vectors (n, d) of ``images`` (n, 24, 32) on a grid of ``cell`` (2,), in bfloat16 where the processor has it."""
+    network, grid = with_weights(weights), torch.from_numpy(cell)
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
-        parts = [network(torch.from_numpy(images[i : i + _BATCH]), side).float() for i in range(0, len(images), _BATCH)]
+        batches = (torch.from_numpy(images[i : i + _BATCH]) for i in range(0, len(images), _BATCH))
+        parts = [network(batch, grid, side).float() for batch in batches]
     return np.asarray(torch.cat(parts).numpy())
 
 

@@ -78,6 +78,13 @@ class Caster:
                 list(pool.map(work, parts))
         return out
 
+    def faces_met(self, sensor: Sensor, T: ArrayLike, shape: tuple[int, int]) -> NDArray[np.int64]:
+        """Which face the camera ray through each pixel (h, w) meets first at pose ``T`` (4, 4); -1 for none."""
+        x, y = sensor.pixel_centres(shape)
+        rays = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        origin, direction, _, _ = self._rays(sensor, np.asarray(T, float)[None], rays)
+        return np.asarray(self._scene.run(origin, direction, query="INTERSECT"), np.int64).reshape(len(y), len(x))
+
     def penetration(self, sensor: Sensor, T: ArrayLike) -> Array:
         """Depth of the object's deepest point inside the window (n,) [m]: > 0 below the membrane.
 
@@ -118,6 +125,18 @@ class Caster:
         return pose, np.column_stack([xy, heights[pose, vertex]])
 
     def _cast(self, sensor: Sensor, T: Array, rays: Array) -> NDArray[np.float32]:
+        origin, direction, start, ray = self._rays(sensor, T, rays)
+        hit = self._scene.run(origin, direction, query="DISTANCE")
+        t = hit.reshape(len(T), len(rays))
+        p = start + t[..., None].astype(float) * ray
+        with np.errstate(over="ignore", invalid="ignore"):
+            depth = -p[..., 2] - sensor.sag(p[..., 0], p[..., 1])
+        return np.where(t < 1e30, depth, -np.inf).astype(np.float32)
+
+    def _rays(
+        self, sensor: Sensor, T: Array, rays: Array
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], Array, Array]:
+        """Origins and directions (n m, 3) of rays in Embree's frame; the same in the sensor's, to be broadcast (n, m, 3)."""
         R = T[:, :3, :3]
         if sensor.camera_distance:
             start = np.broadcast_to([0.0, 0.0, -sensor.camera_distance], (len(T), 1, 3))
@@ -136,12 +155,7 @@ class Caster:
         origin = (start - T[:, None, :3, 3]) @ R - self._centre
         direction = ray @ R
         origin = np.ascontiguousarray(np.broadcast_to(origin, direction.shape), np.float32).reshape(-1, 3)
-        hit = self._scene.run(origin, direction.astype(np.float32).reshape(-1, 3), query="DISTANCE")
-        t = hit.reshape(len(T), len(rays))
-        p = start + t[..., None].astype(float) * ray
-        with np.errstate(over="ignore", invalid="ignore"):
-            depth = -p[..., 2] - sensor.sag(p[..., 0], p[..., 1])
-        return np.where(t < 1e30, depth, -np.inf).astype(np.float32)
+        return origin, direction.astype(np.float32).reshape(-1, 3), start, ray
 
     def _camera_inside(self, sensor: Sensor, T: Array) -> NDArray[np.bool_]:
         if not sensor.camera_distance:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +20,7 @@ def moments(masks: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.float32]:
     Lengths are shares of the window's half diagonal, so that the features have no unit.
     """
     n, h, w = masks.shape
-    scale = float(np.hypot(*sensor.half_window))
-    x, y = (c / scale for c in sensor.pixel_centres((h, w)))
-    X, Y = (c.ravel() for c in np.meshgrid(x, y))
-    pixel = (x[1] - x[0]) * (y[1] - y[0])
-    basis = np.stack([np.ones_like(X), X, Y, X * X, X * Y, Y * Y], 1).astype(np.float32)
+    basis, pixel = _basis(sensor, h, w)
     sums = masks.reshape(n, -1).astype(np.float32) @ basis
     count = np.maximum(sums[:, 0], 1)
     mx, my, xx, xy, yy = (sums[:, 1:] / count[:, None]).T
@@ -37,6 +35,16 @@ def moments(masks: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.float32]:
     angle = np.arctan2(2 * xy, xx - yy)
     columns = (mx, my, np.log(count * pixel), 0.25 * np.log(large * small))
     return np.stack([*columns, stretch * np.cos(angle), stretch * np.sin(angle)], 1).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _basis(sensor: Sensor, h: int, w: int) -> tuple[NDArray[np.float32], float]:
+    """1, x, y and their products at every pixel (h w, 6), and a pixel's area, in units of the window's half diagonal."""
+    scale = float(np.hypot(*sensor.half_window))
+    x, y = (c / scale for c in sensor.pixel_centres((h, w)))
+    X, Y = (c.ravel() for c in np.meshgrid(x, y))
+    basis = np.stack([np.ones_like(X), X, Y, X * X, X * Y, Y * Y], 1).astype(np.float32)
+    return basis, float((x[1] - x[0]) * (y[1] - y[0]))
 
 
 def without_specks(mask: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.bool_]:

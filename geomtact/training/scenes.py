@@ -19,8 +19,9 @@ from geomtact.contact_space.index import pack
 from geomtact.contact_space.resolution import Resolution
 from geomtact.contact_space.touch import MARGIN, elastic_in_window
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.rotations import Directions, approach_of, facing
+from geomtact.geometry.rotations import Directions, approach_of, facing, level_step
 from geomtact.geometry.symmetry import Symmetry
+from geomtact.scoring.encoder import cell_size
 from geomtact.se3 import Array
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
@@ -43,6 +44,7 @@ class Scene:
     rigid, elastic : (m, words) contacts of ``TOUCH_SHAPE`` of the same touches
     true : (m,) the stored contact whose cell holds each touch
     pixel : of ``TOUCH_SHAPE`` [m]
+    cell : (2,) the grid's, as ``scoring.encoder.cell_size`` gives it
     """
 
     stored: NDArray[np.uint64]
@@ -51,6 +53,7 @@ class Scene:
     elastic: NDArray[np.uint64]
     true: NDArray[np.int64]
     pixel: float
+    cell: NDArray[np.float32]
 
 
 def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Generator) -> Scene:
@@ -104,6 +107,7 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
         np.array(elastic, np.uint64),
         np.array(true, np.int64),
         view.pixel,
+        cell_size(sensor, resolution.step, level_step(resolution.level) * mesh.radius_rms),
     )
 
 

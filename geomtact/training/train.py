@@ -44,7 +44,7 @@ class Settings:
     rate: float = 2e-3
     weight_decay: float = 1e-3
     width: int = 512
-    dimension: int = 32
+    dimension: int = 16
     validation: int = 40  # scenes that are never trained on
     seed: int = 0
 
@@ -133,7 +133,8 @@ def scene_gain(
     """Information gained (t,) [nats] about the true cells of some touches of a scene."""
     touches, stored, true, log_w = _batch(scene, settings, rng, flipped)
     with torch.autocast("cpu", torch.bfloat16):
-        f, g = network(touches, "touch"), network(stored, "stored")
+        cell = torch.from_numpy(scene.cell)
+        f, g = network(touches, cell, "touch"), network(stored, cell, "stored")
     f, g = f.float(), g.float()  # (t, d), (t + n, d)
     s = 2 * f @ g.T - (f * f).sum(1)[:, None] - (g * g).sum(1)  # (t, t + n)
     row = torch.arange(len(true))

@@ -1,0 +1,182 @@
+"""Coarse to fine: the blocks of the nested grid are scored first, and only those that carry mass cell by cell.
+
+A block is told by the mean of its cells' vectors and by how they spread about it. Were they normally distributed, with
+variance v_j in component j, the mean of exp(-|f - g|^2 / t) over the block would be
+
+    prod_j (1 + 2 v_j / t)^(-1/2) exp(-(f - mean g)_j^2 / (t + 2 v_j)),
+
+so a block's score stands for all of its cells, and what is left unexpanded keeps its mass. The cost of a touch follows
+its ambiguity and not the size of the grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.index import Index, spelled_out
+from geomtact.scoring.calibration import Calibration, Touches, best_floor, calibrate, posterior_log_prob
+from geomtact.scoring.vectors import VectorScorer
+
+SHARE = 0.98  # of the mass, that is scored cell by cell
+
+
+@dataclass(frozen=True, eq=False)
+class BlockScorer:
+    """Scores of whole blocks, on the scale of the cells' scores.
+
+    Attributes
+    ----------
+    cells : the scorer of the cells
+    narrowing : (P B, d) t / (t + 2 v) of every block at every penetration, t being the cells' temperature
+    narrowed : (P B, d) ``narrowing`` times the mean vector
+    constant : (P B,) the score at a vector of zeros
+    temperature : that the cells' scores are worth as evidence
+    """
+
+    cells: VectorScorer
+    narrowing: NDArray[np.float32]
+    narrowed: NDArray[np.float32]
+    constant: NDArray[np.float32]
+    temperature: float
+    name: str = "blocks"
+
+    @classmethod
+    def make(cls, cells: VectorScorer, index: Index, temperature: float) -> BlockScorer:
+        """Over the blocks of ``index``, each cell weighed by its measure."""
+        first, _ = index.block_runs
+        weight = np.maximum(np.asarray(index.weight).reshape(-1), 1e-30)[:, None]
+        total = np.add.reduceat(weight, first)
+        middle = np.add.reduceat(weight * cells.stored, first) / total
+        spread = np.maximum(np.add.reduceat(weight * cells.stored**2, first) / total - middle**2, 0)
+        narrow = temperature / (temperature + 2 * spread)
+        constant = 0.5 * temperature * np.log(narrow).sum(1) - (narrow * middle**2).sum(1)
+        return cls(cells, _single(narrow), _single(narrow * middle), _single(constant), temperature)
+
+    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Score (P B,) of every block: the temperature times the log of the mean of exp(score / temperature)."""
+        out = self.of(self.cells.seen(index, mask))
+        return out * self.cells.trust(float(out.max()))
+
+    def of(self, seen: NDArray[np.float32]) -> NDArray[np.float32]:
+        """As :meth:`score`, before it is trusted, for the vector (d,) of the observed contact."""
+        return np.asarray(self.constant + self.narrowed @ (2 * seen) - self.narrowing @ seen**2)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Scores of runs of cells that together cover the grid.
+
+    Attributes
+    ----------
+    first, runs : (N,) first pose id, ascending, and number of cells of each run; runs None for single cells
+    score : (N,)
+    log_prior : (N,) log mass of each run
+    calibration : what the scores are worth
+    """
+
+    first: NDArray[np.int64]
+    runs: NDArray[np.int64] | None
+    score: NDArray[np.float32]
+    log_prior: NDArray[np.floating]
+    calibration: Calibration
+
+
+@dataclass(frozen=True, eq=False)
+class Cascade:
+    """A score from coarse to fine, under the uniform prior.
+
+    Attributes
+    ----------
+    blocks : the scorer of blocks
+    coarse : what the blocks' scores are worth by themselves
+    partly : what the scores are worth where cells are scored in some blocks only; None where that is not done
+    """
+
+    blocks: BlockScorer
+    coarse: Calibration
+    partly: Calibration | None
+
+    @classmethod
+    def fit(cls, cells: VectorScorer, fine: Calibration, index: Index, touches: Touches, partly: bool) -> Cascade:
+        """Calibrated on ``touches``; ``fine`` is what the cells' scores are worth where all are scored."""
+        blocks = BlockScorer.make(cells, index, fine.temperature)
+        own = index.block_of(touches.ids)
+        coarse = calibrate(blocks, index, Touches(touches.masks, own), np.exp(index.log_block_weight))
+        if not partly:
+            return cls(blocks, coarse, None)
+        # what is lost where the truth lies in a block that stays whole is made good by a larger floor
+        out = cls(blocks, coarse, replace(fine, floor=0.0))
+        gains = []
+        for mask, true in zip(touches.masks, touches.ids, strict=True):
+            rows = out.expanded(index, mask)
+            row = int(np.searchsorted(rows.first, true, "right")) - 1
+            log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
+            gains.append(log_prob[row] - rows.log_prior[row])
+        floor, gain = best_floor(np.array(gains))
+        return replace(out, partly=replace(fine, floor=floor, gain=gain))
+
+    def to_json(self) -> dict[str, Any]:
+        """What :meth:`from_json` reads."""
+        out = {"temperature": self.blocks.temperature, "coarse": asdict(self.coarse)}
+        return out if self.partly is None else out | {"partly": asdict(self.partly)}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any], cells: VectorScorer, index: Index) -> Cascade:
+        blocks = BlockScorer.make(cells, index, data["temperature"])
+        partly = Calibration(**data["partly"]) if "partly" in data else None
+        return cls(blocks, Calibration(**data["coarse"]), partly)
+
+    def whole(self, index: Index, mask: NDArray[np.bool_]) -> Rows:
+        """The blocks alone."""
+        first, runs = index.block_runs
+        return _possible(Rows(first, runs, self.blocks.score(index, mask), index.log_block_weight, self.coarse))
+
+    def expanded(self, index: Index, mask: NDArray[np.bool_]) -> Rows:
+        """Blocks, and cell by cell those of them that hold ``SHARE`` of the mass."""
+        first, counts = index.block_runs
+        seen = self.blocks.cells.seen(index, mask)
+        score, prior = self.blocks.of(seen), index.log_block_weight
+        log_prob = posterior_log_prob(score, prior, replace(self.coarse, floor=0.0))
+        chosen = heaviest(np.exp(log_prob), SHARE)
+        length = np.where(chosen, counts, 1)
+        ids = spelled_out(first, length)
+        whole = ~chosen
+        at = (np.cumsum(length) - length)[
+            whole
+        ]  # rows of the blocks that stay whole: they are scored as cells at first
+        runs, cell_score, cell_prior = (
+            np.ones(len(ids), np.int64),
+            self.blocks.cells.of(ids, seen),
+            index.log_weight[ids],
+        )
+        runs[at], cell_score[at], cell_prior[at] = counts[whole], score[whole], prior[whole]
+        assert self.partly is not None
+        cell_score *= self.blocks.cells.trust(float(cell_score.max()))
+        return _possible(Rows(ids, runs, cell_score, cell_prior, self.partly))
+
+
+def _possible(rows: Rows) -> Rows:
+    """The rows that have mass."""
+    kept = rows.log_prior > -np.inf
+    if kept.all() or rows.runs is None:
+        return rows
+    return Rows(rows.first[kept], rows.runs[kept], rows.score[kept], rows.log_prior[kept], rows.calibration)
+
+
+def _single(x: NDArray[np.floating]) -> NDArray[np.float32]:
+    return np.ascontiguousarray(x, np.float32)
+
+
+def heaviest(mass: NDArray[np.floating], share: float) -> NDArray[np.bool_]:
+    """The heaviest (n,) that together hold at least ``share`` of ``mass`` (n,), and few more than it takes."""
+    # bins a fiftieth of a nat wide, to 20 nats below the heaviest
+    with np.errstate(divide="ignore"):
+        below = np.log(mass.max()) - np.log(mass)
+    bins = np.minimum(below * 50, 1000).astype(np.int32)
+    held = np.cumsum(np.bincount(bins, mass))
+    return bins <= np.searchsorted(held, share * held[-1])

@@ -1,0 +1,96 @@
+"""How likely the observed pixels are, given how far the object lies below the membrane at each of them.
+
+A pixel is felt when the object reaches below the membrane there by more than a threshold: 0 for a rigid contact, a part
+of the penetration for an elastic gel, which dips beside what presses (Hertz: half of it under a ball). Where exactly
+between felt and not felt the boundary falls is uncertain by its softness. Threshold and softness are unknown for a touch
+and marginalised over; neighbouring pixels are felt together, so that each counts for a part of an observation only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.index import Index
+from geomtact.scoring.overlap import overlaps, to_grid
+from geomtact.se3 import Array
+from geomtact.sensing.moments import without_specks
+
+THRESHOLDS = (0.0, 0.25, 0.5)  # of the penetration
+SOFTNESS = (0.1e-3, 0.4e-3)  # m
+_CORRELATED = 4e-6  # m^2 that are felt or not felt together
+_ODD = 0.02  # share of pixels that say nothing: dust, glare, what no model foresees
+
+
+@dataclass(frozen=True)
+class PixelLikelihood:
+    """Log likelihood of the observed pixels from the stored contacts at all penetrations.
+
+    The contacts of a place at its P penetrations are contour lines of the object's surface there: they tell the height at
+    every pixel to within a penetration bin. So the likelihood of all poses takes P counts of common pixels a place.
+
+    Reads the stored masks and nothing else: 96 bytes a pose at 32 x 24 pixels.
+    """
+
+    name: str = "likelihood"
+
+    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Log likelihood (P, n) of ``mask`` (h, w) at every pose."""
+        return self.of(index, mask, slice(None))
+
+    def of(self, index: Index, mask: NDArray[np.bool_], places: NDArray[np.int64] | slice) -> NDArray[np.float32]:
+        """As :meth:`score`, at some places (m,) alone: (P, m)."""
+        bits, stored = index.bits[:, :, places], index.area[:, places]
+        seen = to_grid(without_specks(mask, index.sensor), index.resolution.mask_shape)
+        depths = np.asarray(index.resolution.penetrations)
+        P, bin_size = len(depths), depths[0] * 2
+        # between two contours the surface lies in the middle; beyond the last ones it lies a bin away
+        below = (
+            depths[:, None] - (np.arange(P + 1) * bin_size)[None]
+        )  # (pose's penetration, contour that holds the pixel)
+        felt = np.diff(overlaps(bits, seen).astype(np.float32), axis=0, prepend=0, append=seen.sum())
+        area = np.diff(stored.astype(np.float32), axis=0, prepend=0, append=seen.size)
+        counts = np.concatenate([felt, np.maximum(area - felt, 0)]).T  # (n, 2 (P + 1))
+        weight = _independent(index, seen.shape)
+        out = np.zeros(stored.shape, np.float32)
+        for p, d in enumerate(depths):
+            yes = np.stack([_felt(below[p] - t * d, s) for t, s in product(THRESHOLDS, SOFTNESS)], 1)
+            logs = weight * np.concatenate([np.log(yes), np.log1p(-yes)]).astype(np.float32)  # (2 (P + 1), K)
+            out[p] = _log_mean_exp(counts @ logs)
+        return out
+
+
+def cast_log_likelihood(depths: NDArray[np.floating], seen: NDArray[np.bool_], area: float) -> Array:
+    """Log likelihood (n,) of the observed ``seen`` (h, w) at poses where the object lies ``depths`` (n, h, w) [m] below
+    the membrane.
+
+    ``area`` is that of a pixel [m^2].
+    """
+    deepest = np.maximum(depths.max((1, 2)), 0)[:, None, None]
+    weight = min(1.0, area / _CORRELATED)
+    each = []
+    for t, s in product(THRESHOLDS, SOFTNESS):
+        yes = _felt(depths - t * deepest, s)
+        each.append(weight * np.where(seen, np.log(yes), np.log1p(-yes)).sum((1, 2)))
+    return np.asarray(_log_mean_exp(np.stack(each, 1)), float)
+
+
+def _felt(below: NDArray[np.floating], softness: float) -> NDArray[np.floating]:
+    """Probability that a pixel is felt at which the object is ``below`` [m] under the threshold."""
+    out: NDArray[np.floating] = _ODD / 2 + (1 - _ODD) / (1 + np.exp(np.clip(-below / softness, -30, 30)))
+    return out
+
+
+def _independent(index: Index, shape: Sequence[int]) -> float:
+    """How much of an observation a pixel is."""
+    return min(1.0, float(4 * index.sensor.half_window.prod() / np.prod(shape)) / _CORRELATED)
+
+
+def _log_mean_exp(x: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Log of the mean over the columns of exp(``x``) (n, K)."""
+    top = x.max(1)
+    return top + np.log(np.exp(x - top[:, None]).mean(1))

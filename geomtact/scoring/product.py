@@ -1,0 +1,100 @@
+"""Several scores taken together, each with the weight that it is worth on one index.
+
+On a coarse grid the network tells all there is; on a fine one, of an object known to lie on one face, moments or pixels tell
+more than it has learned. What adds what is measured on simulated touches, so that no more is computed than the scene needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.index import Index
+from geomtact.scoring.calibration import Calibration, Touches, calibrated
+from geomtact.scoring.protocol import Scorer
+from geomtact.scoring.vectors import VectorScorer
+
+RATIOS = (0.25, 0.5, 1.0)  # of what a further score counts, each score divided by its own temperature
+_PLACES, _TOUCHES = 15_000, 120  # that scores are compared on
+
+
+@dataclass(frozen=True, eq=False)
+class Product:
+    """Sum of log likelihoods, each of ``scorers`` with its weight."""
+
+    scorers: Sequence[Scorer]
+    weights: Sequence[float]
+    name: str = "product"
+
+    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Score (P, n) of ``mask`` (h, w) at every pose."""
+        out = np.float32(self.weights[0]) * self.scorers[0].score(index, mask)
+        for scorer, weight in zip(self.scorers[1:], self.weights[1:], strict=True):
+            out += np.float32(weight) * scorer.score(index, mask)
+        return out
+
+
+class Comparison:
+    """Scores of the same touches at some places of an index, drawn at random, and at the true ones.
+
+    Each drawn place stands for many; the true ones are there to be scored, and carry no mass.
+    """
+
+    def __init__(self, index: Index, touches: Touches, seed: int = 0):
+        rng = np.random.default_rng(seed)
+        some = np.sort(rng.choice(index.places, min(_PLACES, index.places), replace=False))
+        level, true = np.divmod(touches.ids[:_TOUCHES], index.places)
+        places = np.concatenate([some, true])
+        self.masks, self._ids = touches.masks[:_TOUCHES], np.arange(len(index.height))[:, None] * index.places + places
+        self._index = index.at_places(places)
+        weight = self._index.weight.astype(float)
+        weight[:, len(some) :] = 0
+        self._weight = weight.ravel() / weight.sum()
+        self._true = level * len(places) + len(some) + np.arange(len(true))
+
+    def scores(self, scorer: Scorer) -> list[NDArray[np.float32]]:
+        """Scores (m,) of every touch."""
+        if isinstance(scorer, VectorScorer):
+            scorer = replace(scorer, stored=scorer.stored[self._ids.ravel()])
+        return [scorer.score(self._index, mask).ravel() for mask in self.masks]
+
+    def worth(self, scores: Sequence[NDArray[np.float32]]) -> Calibration:
+        return calibrated(lambda i: scores[i], self._true, self._weight)
+
+
+def choose(
+    comparison: Comparison, candidates: Mapping[str, Scorer], least: float, start: Mapping[str, float] | None = None
+) -> dict[str, float]:
+    """The scores that together gain most, and the weight of each: one more is taken while it adds ``least`` nats.
+
+    The first of the candidates is preferred as long as none gains ``least`` more; ``start`` is a choice to go on from.
+    """
+    scores = {name: comparison.scores(scorer) for name, scorer in candidates.items()}
+    alone = {name: comparison.worth(each) for name, each in scores.items()}
+    if start is None:
+        first = next(iter(candidates))
+        best = max(alone, key=lambda name: alone[name].gain)
+        start = {best if alone[best].gain > alone[first].gain + least else first: 1.0}
+    chosen = dict(start)
+
+    def together(weights: Mapping[str, float]) -> Calibration:
+        n = len(comparison.masks)
+        return comparison.worth([sum(w * scores[name][i] for name, w in weights.items()) for i in range(n)])  # type: ignore[misc]
+
+    reached = together(chosen)
+    while len(chosen) < len(candidates):
+        trials = [
+            chosen | {name: ratio * reached.temperature / alone[name].temperature}
+            for name in candidates
+            if name not in chosen
+            for ratio in RATIOS
+        ]
+        worth = [together(trial) for trial in trials]
+        best_trial = int(np.argmax([c.gain for c in worth]))
+        if worth[best_trial].gain < reached.gain + least:
+            break
+        chosen, reached = trials[best_trial], worth[best_trial]
+    return chosen

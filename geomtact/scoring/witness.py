@@ -1,0 +1,48 @@
+"""How likely a touch is at all: the evidence for the object, and whether the object could have made such a contact.
+
+The network's score is worth something within one object only. Between objects, the moments' likelihood is compared: a
+density over what a touch may show, which integrates to one for every object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.index import Index
+from geomtact.scoring.moments import Moments
+
+_SMALL = 60_000  # poses up to which the mean is over all of them
+
+
+@dataclass(frozen=True, eq=False)
+class Witness:
+    """The moments' likelihood under the uniform distribution, or under a prior.
+
+    Attributes
+    ----------
+    moments : fitted to the index
+    usual : the likelihood of the best pose that all but one in fifty touches of the object reach
+    """
+
+    moments: Moments
+    usual: float = -np.inf
+
+    def hear(
+        self, index: Index, mask: NDArray[np.bool_], log_prior: NDArray[np.floating] | None = None
+    ) -> tuple[float, float]:
+        """Log evidence of ``mask`` (h, w), and the log likelihood of the best pose.
+
+        Under the uniform distribution on a large grid the mean is over poses drawn once for all; ``log_prior`` (N,) are
+        log masses.
+        """
+        if log_prior is None and len(index) <= _SMALL:
+            log_prior = index.log_weight
+        if log_prior is None:
+            likelihood = self.moments.of_drawn(index, mask).astype(float)
+            log_mass: NDArray[np.floating] = np.full(len(likelihood), -np.log(len(likelihood)))
+        else:
+            likelihood, log_mass = self.moments.score(index, mask).ravel().astype(float), log_prior
+        return float(np.logaddexp.reduce(likelihood + log_mass)), float(likelihood.max())

@@ -1,0 +1,175 @@
+"""Trains the thesis's network for one part (6.1.4): pairs of simulated contacts, told apart by the distance of their poses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from safetensors.torch import save_file
+from torch import nn
+from torch.optim import Optimizer
+
+from geomtact.contact_space.build import Progress
+from geomtact.contact_space.space import ContactSpace
+from geomtact.errors import GeomtactError
+from geomtact.files import write_whole
+from geomtact.geometry.distance import PoseDistance
+from geomtact.scoring.resnet import ARCHITECTURE, SIDE, encode, make_network
+from geomtact.se3 import Array, exp
+
+NEAR, FAR = 5e-3, 20e-3  # m: pose distance of positive pairs at most, of negative pairs at least
+SLACK = 0.3  # a similarity up to which a negative pair costs nothing
+_CAST = (48, 64)  # pixels of the simulated contacts
+_SAVE_EVERY = 50
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The thesis's own, but for ``side`` [px], of which it says nothing."""
+
+    pairs: int = 100_000
+    epochs: int = 1
+    batch: int = 32
+    rate: float = 0.005
+    momentum: float = 0.3
+    weight_decay: float = 0.001
+    side: int = SIDE
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Contacts ``left``, ``right`` (n, h, w) bool of pairs of poses, and their ``label`` (n,): how alike they are."""
+
+    left: NDArray[np.bool_]
+    right: NDArray[np.bool_]
+    label: NDArray[np.float32]
+
+
+def make_pairs(space: ContactSpace, n: int, seed: int = 0, progress: Progress | None = None) -> Pairs:
+    """``n`` pairs, in turn positive (label 1 to 0.9, by the distance of the poses) and negative (label 0)."""
+    rng = np.random.default_rng(seed)
+    distance = PoseDistance(space.mesh)
+    left: list[NDArray[np.bool_]] = []
+    right: list[NDArray[np.bool_]] = []
+    label: list[float] = []
+    while len(label) < n:
+        A, _ = space.sample(256, rng)
+        near = A[::2] @ _small_motions(len(A[::2]), space.mesh.radius_rms, rng)
+        B = np.empty_like(A)
+        B[::2], B[1::2] = near, rng.permutation(A)[: len(A[1::2])]
+        d = np.array([distance.mean(a, b[None])[0] for a, b in zip(A, B, strict=True)])
+        positive = np.arange(len(A)) % 2 == 0
+        ok = np.where(positive, d < NEAR, d > FAR) & np.isfinite(space.penetration(B))
+        masks = [space.caster.depths(space.sensor, T[ok], _CAST) > 0 for T in (A, B)]
+        left.extend(masks[0])
+        right.extend(masks[1])
+        label.extend(np.where(positive, 1 - 0.1 * d / NEAR, 0)[ok])
+        if progress:
+            progress(min(len(label) / n, 1.0), "simulating pairs")
+    return Pairs(np.stack(left[:n]), np.stack(right[:n]), np.array(label[:n], np.float32))
+
+
+def pair_loss(similarity: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
+    """The thesis's Eq. 1: squared error, but nothing for a negative pair (label 0) up to a similarity of 0.3."""
+    loss = (label - similarity) ** 2
+    return torch.where((label == 0) & (similarity <= SLACK), torch.zeros_like(loss), loss)
+
+
+def train_thesis(
+    space: ContactSpace, settings: Settings, folder: Path, out: Path, progress: Progress | None = None
+) -> None:
+    """Train for the part of ``space`` and write the weights to ``out``, with a card beside it; ``folder`` keeps the state.
+
+    Raises
+    ------
+    GeomtactError
+        The loss is not a number any more.
+    """
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    torch.manual_seed(settings.seed)
+    network = make_network().to(device)
+    optimizer = torch.optim.SGD(
+        network.parameters(), settings.rate, momentum=settings.momentum, weight_decay=settings.weight_decay
+    )
+    pairs = make_pairs(space, settings.pairs, settings.seed, progress)
+    folder.mkdir(parents=True, exist_ok=True)
+    steps = settings.epochs * (settings.pairs // settings.batch)
+    losses: list[float] = []
+    first = _resume(folder / "state.pt", network, optimizer, settings, losses)
+    network.train()
+    for step in range(first, steps):
+        rng = np.random.default_rng([settings.seed, step])
+        some = rng.choice(len(pairs.label), settings.batch, replace=False)
+        images = torch.from_numpy(_resized(np.concatenate([pairs.left[some], pairs.right[some]]), settings.side)).to(
+            device
+        )
+        with torch.autocast(device, torch.bfloat16):
+            vectors = encode(network, images)
+        a, b = vectors.float().chunk(2)
+        similarity = F.cosine_similarity(a, b).clamp(min=0)
+        loss = pair_loss(similarity, torch.from_numpy(pairs.label[some]).to(device)).mean()
+        if not torch.isfinite(loss):
+            raise GeomtactError(f"training: the loss is not a number at step {step}; give a smaller rate")
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+        if (step + 1) % _SAVE_EVERY == 0 or step + 1 == steps:
+            _save(folder / "state.pt", network, optimizer, settings, losses)
+        if progress:
+            progress((step + 1) / steps, f"training ResNet-50, loss {np.mean(losses[-50:]):.4f}")
+    weights = {name: value.detach().cpu().half().contiguous() for name, value in network.state_dict().items()}
+    write_whole(
+        out, lambda temporary: save_file(weights, temporary, {"architecture": ARCHITECTURE, "side": str(settings.side)})
+    )
+    card = {
+        "schema": "geomtact/resnet50/1",
+        "part": space.mesh.name,
+        "sha256": space.mesh.sha256,
+        "sensor": space.sensor.name,
+        "settings": asdict(settings),
+        "device": device,
+        "loss": [float(np.mean(part)) for part in np.array_split(losses, min(50, len(losses)))],
+    }
+    out.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", "utf-8")
+
+
+def _small_motions(n: int, radius: float, rng: np.random.Generator) -> Array:
+    """Motions (n, 4, 4) of the object in its own frame of up to about ``NEAR`` in mean point distance."""
+    xi = rng.normal(size=(n, 6)) * np.repeat([1 / radius, 1.0], 3)
+    size = NEAR * rng.random((n, 1)) / np.sqrt(6)
+    return exp(xi * size)
+
+
+def _resized(masks: NDArray[np.bool_], side: int) -> NDArray[np.float32]:
+    return np.stack([cv2.resize(m.astype(np.float32), (side, side), interpolation=cv2.INTER_LINEAR) for m in masks])
+
+
+def _save(path: Path, network: nn.Module, optimizer: Optimizer, settings: Settings, losses: list[float]) -> None:
+    state = {
+        "network": network.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "settings": asdict(settings),
+        "losses": losses,
+    }
+    write_whole(path, lambda temporary: torch.save(state, temporary))
+
+
+def _resume(path: Path, network: nn.Module, optimizer: Optimizer, settings: Settings, losses: list[float]) -> int:
+    """Bring back what :func:`_save` wrote under the same settings; the step to go on with."""
+    if not path.exists():
+        return 0
+    state = torch.load(path, weights_only=True)
+    if state["settings"] != asdict(settings):
+        return 0
+    network.load_state_dict(state["network"])
+    optimizer.load_state_dict(state["optimizer"])
+    losses.extend(state["losses"])
+    return len(losses)
