@@ -192,13 +192,17 @@ def _overall(parts: Mapping[str, Any]) -> dict[str, Any]:
     from geomtact.evaluation import scores
 
     entries = [part["scores"] for part in parts.values()]
-    names = [name for name in entries[0] if all("figures" in some.get(name, {}) for some in entries)]
     return {
         name: scores.over_parts(
             [some[name] for some in entries], [study_file.outcomes(some[name], scores.Scored) for some in entries]
         )
-        for name in names
+        for name in _on_each(entries)
     }
+
+
+def _on_each(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The scores that have been judged on each part."""
+    return [name for name in entries[0] if all("figures" in some.get(name, {}) for some in entries)]
 
 
 def _by_class(parts: Mapping[str, Any]) -> dict[str, Any]:
@@ -206,10 +210,9 @@ def _by_class(parts: Mapping[str, Any]) -> dict[str, Any]:
     from geomtact.evaluation import scores, study
 
     entries = [part["scores"] for part in parts.values()]
-    names = [name for name in entries[0] if all("figures" in some.get(name, {}) for some in entries)]
     return {
         name: study.by_class([o for some in entries for o in study_file.outcomes(some[name], scores.Scored)])
-        for name in names
+        for name in _on_each(entries)
     }
 
 
@@ -218,8 +221,7 @@ def _print_classes(classes: Mapping[str, Mapping[str, Any]]) -> None:
     rows = []
     for name, kinds in classes.items():
         for kind, f in kinds.items():
-            inside = [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in f["coverage"]]
-            rows.append([name, kind, str(f["n"]), _number(f["gain_mean"], 2), *inside])
+            rows.append([name, kind, str(f["n"]), _number(f["gain_mean"], 2), *_inside(f)])
             masses = [f"in {100 * c['nominal']:.0f} %" for c in f["coverage"]]
     typer.echo("By kind of contact: percentage of truths inside the region of each mass, with 99 % intervals")
     print_table(["score", "contact", "n", "gain [nats]", *masses], rows, ["n", "gain [nats]", *masses])
@@ -265,11 +267,15 @@ def _print_coverage(tables: Mapping[str, Mapping[str, Any]]) -> None:
     rows = []
     for title, entries in tables.items():
         for name, _, f in _groups(entries):
-            inside = [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in f["coverage"]]
-            rows.append([title, name, str(f["n"]), *inside])
+            rows.append([title, name, str(f["n"]), *_inside(f)])
             masses = [f"in {100 * c['nominal']:.0f} %" for c in f["coverage"]]
     typer.echo("Percentage of truths inside the region of each mass, with 95 % intervals")
     print_table(["part", "score", "n", *masses], rows, ["n", *masses])
+
+
+def _inside(figures: Mapping[str, Any]) -> list[str]:
+    """Percentage of truths inside the region of each mass, with its interval."""
+    return [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in figures["coverage"]]
 
 
 def _groups(entries: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:

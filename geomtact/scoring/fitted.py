@@ -111,9 +111,7 @@ def fitted_scorer(
     known: dict[str, Scorer] = dict(PIXELWISE)
     if descriptor is not None:
         path = None if folder is None else folder / f"{descriptor.name}-{_fingerprint(descriptor)}.npy"
-        known[_ENCODER if name == DEFAULT_SCORER else name] = _vector_scorer(
-            descriptor, describe_index(index, descriptor, path, progress)
-        )
+        known[_vectors_name(name)] = _vector_scorer(descriptor, describe_index(index, descriptor, path, progress))
     path = None if folder is None else folder / f"{label}.json"
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
@@ -165,9 +163,9 @@ def _fit(name: str, known: dict[str, Scorer], moments: Moments, index: Index, to
         data["exact"] = asdict(calibrate(_weighed(data["exact_weights"], known), index, touches))
     calibration = calibrate(_weighed(data["weights"], known), index, touches)
     data["calibration"] = asdict(calibration)
-    vectors = known[_ENCODER if name == DEFAULT_SCORER else name]
+    vectors = known[_vectors_name(name)]
     if isinstance(vectors, VectorScorer):
-        alone = list(data["weights"]) in ([name], [_ENCODER])
+        alone = list(data["weights"]) == [_vectors_name(name)]
         fine = calibration if alone else calibrate(vectors, index, touches)
         data["cascade"] = Cascade.fit(vectors, fine, index, touches, alone and len(index) > _LARGE).to_json()
     return data
@@ -179,7 +177,7 @@ def _from_json(name: str, data: dict[str, Any], known: dict[str, Scorer], index:
     m = data["moments"]
     moments = Moments(np.array(m["bias"]), np.array(m["covariance"]), m["freedom"])
     known = {**_limited(known, data["nearest"]), "moments": moments}
-    vectors = known.get(_ENCODER if name == DEFAULT_SCORER else name)
+    vectors = known.get(_vectors_name(name))
     cascade = None
     if isinstance(vectors, VectorScorer):
         cascade = Cascade.from_json(data["cascade"], vectors, index)
@@ -195,6 +193,11 @@ def _from_json(name: str, data: dict[str, Any], known: dict[str, Scorer], index:
         thorough,
         exact,
     )
+
+
+def _vectors_name(name: str) -> str:
+    """Which of the known scores compares vectors for the scorer ``name``, if any does."""
+    return _ENCODER if name == DEFAULT_SCORER else name
 
 
 def _limited(known: dict[str, Scorer], nearest: dict[str, float]) -> dict[str, Scorer]:

@@ -8,7 +8,6 @@ and marginalised over; neighbouring pixels are felt together, so that each count
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -40,23 +39,16 @@ class PixelLikelihood:
 
     def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Log likelihood (P, n) of ``mask`` (h, w) at every pose."""
-        return self.of(index, mask, slice(None))
-
-    def of(self, index: Index, mask: NDArray[np.bool_], places: NDArray[np.int64] | slice) -> NDArray[np.float32]:
-        """As :meth:`score`, at some places (m,) alone: (P, m)."""
-        bits, stored = index.bits[:, :, places], index.area[:, places]
         seen = to_grid(without_specks(mask, index.sensor), index.resolution.mask_shape)
         depths = np.asarray(index.resolution.penetrations)
         P, bin_size = len(depths), depths[0] * 2
         # between two contours the surface lies in the middle; beyond the last ones it lies a bin away
-        below = (
-            depths[:, None] - (np.arange(P + 1) * bin_size)[None]
-        )  # (pose's penetration, contour that holds the pixel)
-        felt = np.diff(overlaps(bits, seen).astype(np.float32), axis=0, prepend=0, append=seen.sum())
-        area = np.diff(stored.astype(np.float32), axis=0, prepend=0, append=seen.size)
+        below = depths[:, None] - np.arange(P + 1) * bin_size  # by the pose's penetration and the pixel's contour
+        felt = np.diff(overlaps(index.bits, seen).astype(np.float32), axis=0, prepend=0, append=seen.sum())
+        area = np.diff(index.area.astype(np.float32), axis=0, prepend=0, append=seen.size)
         counts = np.concatenate([felt, np.maximum(area - felt, 0)]).T  # (n, 2 (P + 1))
-        weight = _independent(index, seen.shape)
-        out = np.zeros(stored.shape, np.float32)
+        weight = _independent(float(4 * index.sensor.half_window.prod() / seen.size))
+        out = np.zeros(index.area.shape, np.float32)
         for p, d in enumerate(depths):
             yes = np.stack([_felt(below[p] - t * d, s) for t, s in product(THRESHOLDS, SOFTNESS)], 1)
             logs = weight * np.concatenate([np.log(yes), np.log1p(-yes)]).astype(np.float32)  # (2 (P + 1), K)
@@ -71,7 +63,7 @@ def cast_log_likelihood(depths: NDArray[np.floating], seen: NDArray[np.bool_], a
     ``area`` is that of a pixel [m^2].
     """
     deepest = np.maximum(depths.max((1, 2)), 0)[:, None, None]
-    weight = min(1.0, area / _CORRELATED)
+    weight = _independent(area)
     each = []
     for t, s in product(THRESHOLDS, SOFTNESS):
         yes = _felt(depths - t * deepest, s)
@@ -85,9 +77,9 @@ def _felt(below: NDArray[np.floating], softness: float) -> NDArray[np.floating]:
     return out
 
 
-def _independent(index: Index, shape: Sequence[int]) -> float:
-    """How much of an observation a pixel is."""
-    return min(1.0, float(4 * index.sensor.half_window.prod() / np.prod(shape)) / _CORRELATED)
+def _independent(area: float) -> float:
+    """How much of an observation a pixel of ``area`` [m^2] is."""
+    return min(1.0, area / _CORRELATED)
 
 
 def _log_mean_exp(x: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -54,12 +54,15 @@ class Comparison:
         weight[:, len(some) :] = 0
         self._weight = weight.ravel() / weight.sum()
         self._true = level * len(places) + len(some) + np.arange(len(true))
+        self._scores: dict[str, list[NDArray[np.float32]]] = {}
 
     def scores(self, scorer: Scorer) -> list[NDArray[np.float32]]:
-        """Scores (m,) of every touch."""
-        if isinstance(scorer, VectorScorer):
-            scorer = replace(scorer, stored=scorer.stored[self._ids.ravel()])
-        return [scorer.score(self._index, mask).ravel() for mask in self.masks]
+        """Scores (m,) of every touch; those of one name are worked out once."""
+        if scorer.name not in self._scores:
+            if isinstance(scorer, VectorScorer):
+                scorer = replace(scorer, stored=scorer.stored[self._ids.ravel()])
+            self._scores[scorer.name] = [scorer.score(self._index, mask).ravel() for mask in self.masks]
+        return self._scores[scorer.name]
 
     def worth(self, scores: Sequence[NDArray[np.float32]]) -> Calibration:
         return calibrated(lambda i: scores[i], self._true, self._weight)
