@@ -52,10 +52,7 @@ def evaluate(
     sensor: Annotated[str, typer.Option(help="Name (see 'geomtact sensors') or TOML file.")] = "gelslim",
     touches: Annotated[int, typer.Option(min=1, help="How many touches of each part.")] = 200,
     noise: Annotated[NoiseName, typer.Option(help="How strongly the masks are spoilt.")] = NoiseName.moderate,
-    effort: Annotated[
-        Effort | None,
-        typer.Option(help="How much to compute; balanced by default, fast for scores.", show_default=False),
-    ] = None,
+    effort: Annotated[Effort, typer.Option(help="How much to compute.")] = Effort.balanced,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 1,
     out: Annotated[
         Path | None, typer.Option(help="JSON file for all figures; a study that it holds in part is resumed.")
@@ -104,7 +101,7 @@ def evaluate(
             noise_name=str(noise),
             noise=_noise(noise),
             felt=str(felt or FeltName.elastic),
-            effort=str(effort or Effort.balanced),
+            effort=str(effort),
             seed=seed,
             max_poses=max_poses or MAX_POSES,
         )
@@ -118,7 +115,7 @@ def evaluate(
     if what is What.touches:
         print_touches(parts, unit, sensor, touches, noise, seed)
     else:
-        judge(parts, unit, sensor, touches, noise, effort or Effort.balanced, seed, out, cache_dir)
+        judge(parts, unit, sensor, touches, noise, effort, seed, out, cache_dir)
 
 
 def judge(

@@ -31,13 +31,16 @@ def load(out: Path | None, schema: str) -> dict[str, Any]:
 
 def earlier(entry: dict[str, Any] | None, settings: dict[str, Any], kind: Callable[..., Any]) -> list:
     """The outcomes, each a ``kind``, of an earlier run with the very same settings."""
+    return outcomes(entry, kind) if entry is not None and same(entry, settings) else []
+
+
+def same(entry: dict[str, Any], settings: dict[str, Any]) -> bool:
+    """Whether an entry was made with ``settings``."""
     import json
 
     from geomtact.report.result import plain
 
-    if entry is None or entry["settings"] != json.loads(json.dumps(plain(settings))):
-        return []
-    return outcomes(entry, kind)
+    return bool(entry["settings"] == json.loads(json.dumps(plain(settings))))
 
 
 def outcomes(entry: dict[str, Any], kind: Callable[..., Any]) -> list:

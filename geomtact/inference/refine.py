@@ -22,7 +22,6 @@ from geomtact.sensing.moments import moments, without_specks
 
 _SURFACE_POINTS, _FEWER_POINTS = 30_000, 12_000  # of the object, in a thorough refinement and in a quick one
 _LEAST_TURN = 0.02  # rad
-_HURRY = 0.4  # narrowing of the filter in a refinement that is not thorough
 _RIM = 120  # points of the contact's outline, at most; half of them unless the refinement is to be thorough
 _SHAPE = (36, 48)  # of the casts that judge a refinement
 
@@ -51,7 +50,7 @@ class Refinery:
         rotation, step = max(index.angle_step, _LEAST_TURN), index.resolution.step
         spread = Spread(rotation / np.sqrt(12), step / np.sqrt(12))
         if not thorough:
-            return [FilterReg(self._sparse_surface, spread, _HURRY)]
+            return [Icp(self._sparse_surface, spread)]
         return [FilterReg(self._surface, spread), Icp(self._surface, spread)]
 
     def refine(
