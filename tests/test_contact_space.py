@@ -16,8 +16,8 @@ from geomtact.contact_space.resolution import choose
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache, open_index
 from geomtact.errors import CacheError, UsageError
+from geomtact.geometry.approach import allowed, approach_of
 from geomtact.geometry.mesh import load_mesh
-from geomtact.geometry.rotations import allowed, approach_of
 from geomtact.se3 import exp, random_rotations, transform
 from geomtact.sensing.sensor import Sensor
 

@@ -12,7 +12,7 @@ from geomtact import Localizer, load_mesh
 from geomtact.cli import app, study_file
 from geomtact.evaluation import scores, study
 from geomtact.report.score_plot import draw_scores
-from geomtact.scoring import fitted
+from geomtact.scoring import catalogue, fitted
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.sensor import Sensor
 
@@ -243,7 +243,7 @@ def test_words_are_told_apart_and_wrong_ones_named(evaluate):
 def test_by_default_all_scores_are_judged_on_the_thesis_parts():
     from geomtact.cli.evaluate_scores import sort_words
 
-    names = [*(name for name in fitted.SCORERS if name != fitted.DEFAULT_SCORER), "fast", "balanced", "exact"]
+    names = [*(name for name in catalogue.SCORERS if name != catalogue.DEFAULT_SCORER), "fast", "balanced", "exact"]
     assert sort_words([], []) == (["pin", "damping_pin", "head", "elbow_pipe"], names)
     assert sort_words([], ["mine.safetensors"])[1] == ["mine.safetensors"]
     assert sort_words(["iou", "head"], ["l1"]) == (["head"], ["l1", "iou"])

@@ -8,9 +8,9 @@ from scipy.stats import binom
 
 from geomtact import InputError, Localizer, PoseError, Sensor, UsageError
 from geomtact.evaluation.touches import random_touches
+from geomtact.geometry.approach import approach_of
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import load_mesh
-from geomtact.geometry.rotations import approach_of
 from geomtact.inference.posterior import Posterior
 from geomtact.se3 import exp, transform
 
@@ -45,15 +45,16 @@ def test_the_nut_on_its_flat_is_found_by_its_hole(flat_nut, uniform_poses):
     assert np.median(error) < 0.5 * MM
 
 
-def test_one_of_the_first_modes_predicts_the_contact_that_is_seen(curved, flat_nut, ball, uniform_poses):
+def test_the_first_modes_predict_the_contact_that_is_seen(curved, flat_nut, ball, uniform_poses):
     for localizer in (curved, flat_nut, ball):
         T, _ = uniform_poses(localizer)
         iou = []
         for pose in T[:7]:
             seen = pressed(localizer, pose)
             predicted = [pressed(localizer, mode.T) for mode in localizer.localize(seen).modes(5)]
-            iou.append(max((seen & p).sum() / (seen | p).sum() for p in predicted))
-        assert np.median(iou) > 0.75
+            iou.append([(seen & p).sum() / (seen | p).sum() for p in predicted])
+        first, best = np.median([i[0] for i in iou]), np.median([max(i) for i in iou])
+        assert first > 0.75 and best > 0.8
 
 
 def test_the_same_seed_gives_the_same_result(localizer, a_touch):

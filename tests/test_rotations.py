@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest, chi2, kstest
 
 from geomtact.errors import UsageError
-from geomtact.geometry.rotations import Directions, allowed, approach_of, check_approach, facing
+from geomtact.geometry.approach import allowed, approach_of, check_approach, facing
+from geomtact.geometry.rotations import Directions
 from geomtact.geometry.symmetry import Symmetry, about, group_of
 from geomtact.se3 import random_rotations, transform
 

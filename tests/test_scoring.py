@@ -5,19 +5,23 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.stats import multivariate_t
 
 from geomtact.contact_space.index import pack
-from geomtact.errors import UsageError
+from geomtact.errors import MeshError, UsageError
+from geomtact.geometry.mesh import load_mesh
 from geomtact.scoring.calibration import (
     FLOORS,
     Calibration,
+    Touches,
     calibrate,
     normalised,
     posterior_log_prob,
     simulate_touches,
 )
-from geomtact.scoring.fitted import SCORERS, FittedScorer, fitted_scorer
+from geomtact.scoring.catalogue import SCORERS
+from geomtact.scoring.fitted import FittedScorer, fitted_scorer
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.overlap import OVERLAPS, IoU, PixelL1, overlaps, to_grid
 from geomtact.sensing.moments import moments, without_specks
@@ -291,6 +295,13 @@ def test_simulated_touches_are_of_the_cells_they_say(plug):
     assert (w[touches.ids] > 0).all()
 
 
+def test_touches_are_kept_and_read_back(plug, tmp_path):
+    touches = simulate_touches(plug.index, 5, seed=7)
+    touches.save(tmp_path / "touches.npz")
+    again = Touches.load(tmp_path / "touches.npz")
+    assert (touches.ids == again.ids).all() and (np.array(touches.masks) == np.array(again.masks)).all()
+
+
 def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
     monkeypatch.setattr("geomtact.scoring.fitted._FIT", 40)
     monkeypatch.setattr("geomtact.scoring.fitted._JUDGE", 20)
@@ -301,6 +312,7 @@ def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
         assert isinstance(first, FittedScorer) and first.name == first.scorer.name == name
     assert {p.stem.split("-")[0] for p in tmp_path.glob("*.json")} == set(names)
     assert [p.name.split("-")[0] for p in tmp_path.glob("*.npy")] == ["fourier"]
+    assert len(list(tmp_path.glob("*.npz"))) == 1  # the touches are simulated once for all scores
     monkeypatch.setattr("geomtact.scoring.fitted.simulate_touches", lambda *_, **__: pytest.fail("fitted again"))
     mask = ball.index.masks([5])[0]
     again = fitted_scorer("moments", ball.index, tmp_path)
@@ -320,3 +332,16 @@ def test_a_damaged_fit_is_made_anew(ball, tmp_path, monkeypatch, damage):
 def test_an_unknown_score_names_the_nearest(ball):
     with pytest.raises(UsageError, match="no score named 'moment'; did you mean 'moments'"):
         fitted_scorer("moment", ball.index)
+
+
+def test_a_part_whose_touches_are_all_alike_is_refused(make_localizer, monkeypatch, tmp_path):
+    """A slab known to lie on its face fills the window nearly everywhere: only its rim tells anything."""
+    trimesh.creation.box((200, 200, 20)).export(tmp_path / "slab.stl")
+    slab = load_mesh(tmp_path / "slab.stl", "mm")
+    monkeypatch.setattr("geomtact.scoring.fitted._LEAST_GAIN", 1.5)  # its rim tells more than the usual limit
+    with pytest.raises(
+        MeshError, match="^slab: cannot be localized.* all alike: at [5-9]. % .* fills the window"
+    ) as error:
+        make_localizer(slab, "gelsight-mini", approach=[((0, 0, 1), 0.0)], max_poses=5_000, cache_dir=tmp_path)
+    assert "a larger window" in str(error.value) and "\n" not in str(error.value)
+    assert not list(tmp_path.glob("*/best*.json"))

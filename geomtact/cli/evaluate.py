@@ -91,7 +91,8 @@ def evaluate(
     from geomtact.errors import UsageError
 
     if what is What.scores:
-        from geomtact.cli.evaluate_scores import MAX_POSES, Options, judge_scores, sort_words
+        from geomtact.cli.evaluate_scores import Options, judge_scores, sort_words
+        from geomtact.contact_space.resolution import MAX_POSES
         from geomtact.sensing.sensor import Sensor
 
         chosen, names = sort_words(parts or [], scores or [])

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from geomtact.sensing.sensor import Sensor
 
 SCHEMA = "geomtact/scores/2"
-MAX_POSES = 1_200_000
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], 
     from geomtact.evaluation.scores import THESIS_PARTS
     from geomtact.geometry.catalogue import catalogue
     from geomtact.inference.localizer import EFFORTS
-    from geomtact.scoring.fitted import DEFAULT_SCORER, SCORERS
+    from geomtact.scoring.catalogue import DEFAULT_SCORER, SCORERS
 
     known = (*SCORERS, *EFFORTS)
     for name in scores:
@@ -143,7 +142,7 @@ def _judge(
     from geomtact.evaluation import scores, study
     from geomtact.inference.localizer import EFFORTS
     from geomtact.report.result import plain
-    from geomtact.scoring.fitted import DEFAULT_SCORER
+    from geomtact.scoring.catalogue import DEFAULT_SCORER
 
     # the name of an effort stands for the default score at that effort
     scorer, effort = (DEFAULT_SCORER, name) if name in EFFORTS else (name, options.effort)

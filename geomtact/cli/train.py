@@ -68,13 +68,14 @@ def train(
         else:
             from dataclasses import replace
 
+            from geomtact.contact_space.resolution import MAX_POSES
             from geomtact.geometry.mesh import load_mesh
             from geomtact.sensing.sensor import Sensor
 
             gel = Sensor.load(sensor)
             mesh = load_mesh(object_name, unit, sensor=gel)
             n = scenes or 80
-            made = dataset.part_scenes(work / "scenes", mesh, gel, 1_200_000, n, seed, progress)
+            made = dataset.part_scenes(work / "scenes", mesh, gel, MAX_POSES, n, seed, progress)
             data = {"part": mesh.name, "sha256": mesh.sha256, "sensor": gel.name}
             settings = replace(settings, steps=steps or 600, rate=_TUNING_RATE, validation=max(n // 8, 5))
             start = start or WEIGHTS

@@ -13,10 +13,11 @@ from scipy.ndimage import distance_transform_edt
 from geomtact.contact_space import resolution as res
 from geomtact.contact_space.heightmap import CELL_PIXELS, NOTHING, Frame, HeightMap, Window, allowed
 from geomtact.contact_space.index import pack
-from geomtact.contact_space.resolution import Resolution
+from geomtact.contact_space.resolution import MAX_POSES, Resolution
 from geomtact.errors import MeshError
+from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.rotations import Approach, Directions
+from geomtact.geometry.rotations import Directions
 from geomtact.se3 import Array, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.moments import moments
@@ -91,7 +92,7 @@ def build(
 
 
 def choose_resolution(
-    mesh: Mesh, sensor: Sensor, approach: Approach | None = None, max_poses: int = 1_200_000
+    mesh: Mesh, sensor: Sensor, approach: Approach | None = None, max_poses: int = MAX_POSES
 ) -> Resolution:
     """The finest grid that ``max_poses`` affords for this object (see ``resolution.choose``)."""
     assert mesh.symmetry is not None

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.resolution import PIXELS_PER_MASK_PIXEL
-from geomtact.geometry.rotations import facing
+from geomtact.geometry.approach import facing
 from geomtact.se3 import Array, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
 
 NOTHING = -1e3  # height [m] where the object is not
 CELL_PIXELS = 5  # pixels of a lattice cell, along each side: odd, so that its centre is one
+_RAYS = 2e6  # cast at a time, at most
 _VERTICAL = Sensor("orthographic", (8, 8), (1.0, 1.0), 0.0, 1.0)
 
 
@@ -46,9 +47,11 @@ class HeightMap:
         """Seen along approach ``a``; ``reach`` [m] holds the object, ``margin`` [m] is left free around it."""
         half = int(np.ceil(reach / pixel))
         s = np.arange(-half, half + 1) * pixel
-        rays = np.stack(np.meshgrid(s, s), -1).reshape(-1, 2)
         R = facing(a)
-        depth = caster.ray_depths(_VERTICAL, transform(R, -R @ centre)[None], rays)[0]
+        T = transform(R, -R @ centre)[None]
+        bands = np.array_split(s, np.ceil(len(s) ** 2 / _RAYS))  # a ray takes a hundred times the memory of its height
+        rays = (np.stack(np.meshgrid(s, band), -1).reshape(-1, 2) for band in bands)
+        depth = np.concatenate([caster.ray_depths(_VERTICAL, T, some)[0] for some in rays])
         heights = np.where(np.isfinite(depth), depth, NOTHING).astype(np.float32).reshape(len(s), len(s))
         # the deepest points of a part are its corners, which fall between the rays
         corners = (caster.vertices - centre) @ R.T

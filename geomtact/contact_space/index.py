@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.resolution import Resolution
+from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.rotations import Approach, Directions, level_step
+from geomtact.geometry.rotations import Directions, level_step
 from geomtact.se3 import Array, hat, transform
 from geomtact.sensing.sensor import Sensor
 

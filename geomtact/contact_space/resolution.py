@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from geomtact.errors import UsageError
-from geomtact.geometry.rotations import Approach, Directions, level_step
+from geomtact.geometry.approach import Approach
+from geomtact.geometry.rotations import Directions, level_step
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
+MAX_POSES = 1_200_000  # by default
 LEVELS = (1, 2, 3, 4)
 PIXELS_PER_MASK_PIXEL = 3  # of the height maps, along each side
 _BYTES_FOR_FINE_MASKS = 120e6
@@ -55,7 +57,7 @@ def choose(
     symmetry: Symmetry,
     sensor: Sensor,
     approach: Approach | None = None,
-    max_poses: int = 1_200_000,
+    max_poses: int = MAX_POSES,
 ) -> Resolution:
     """The resolution whose cells are smallest, in mean point distance, at no more than about ``max_poses`` poses.
 
@@ -66,7 +68,7 @@ def choose(
     """
     if max_poses < 1000:
         raise UsageError(f"max_poses: expected at least 1000, got {max_poses}")
-    coarse, fine = _mask_shape(sensor, 32), _mask_shape(sensor, 64)
+    coarse, fine = sensor.along((24, 32)), sensor.along((48, 64))
     finest = float(_mask_pitch(sensor, fine).max())
     bins, best = 4, None
     # a level on which the symmetry or the approach leaves only points is the same at every level
@@ -108,12 +110,6 @@ def _lattice_step(footprint: float, cells: float) -> float:
     """
     width_in_steps = 0.5 * (np.sqrt(_BORDER**2 + 4 * cells) - _BORDER)
     return float(np.sqrt(footprint) / width_in_steps)
-
-
-def _mask_shape(sensor: Sensor, long_side: int) -> tuple[int, int]:
-    short_side = long_side * 3 // 4
-    width, height = sensor.half_window
-    return (short_side, long_side) if width >= height else (long_side, short_side)
 
 
 def _mask_pitch(sensor: Sensor, shape: tuple[int, int]) -> Array:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import MeshError
+from geomtact.geometry.approach import Approach, allowed, approach_of, check_approach, facing, in_cones
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.rotations import Approach, allowed, approach_of, check_approach, facing, in_cones
 from geomtact.se3 import Array, random_rotations, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor

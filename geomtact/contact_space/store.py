@@ -19,10 +19,10 @@ import numpy as np
 
 from geomtact.contact_space.build import Progress, build, choose_resolution
 from geomtact.contact_space.index import Index
-from geomtact.contact_space.resolution import Resolution
+from geomtact.contact_space.resolution import MAX_POSES, Resolution
 from geomtact.errors import CacheError
+from geomtact.geometry.approach import Approach, check_approach
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.rotations import Approach, check_approach
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.sensing.sensor import Sensor
 
@@ -57,7 +57,7 @@ def open_index(
     mesh: Mesh,
     sensor: Sensor,
     approach: Approach | None = None,
-    max_poses: int = 1_200_000,
+    max_poses: int = MAX_POSES,
     cache_dir: str | Path | None = None,
     progress: Progress | None = None,
     key: str | None = None,

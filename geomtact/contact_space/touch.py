@@ -12,6 +12,7 @@ from geomtact.sensing.elastic import elastic_mask
 from geomtact.sensing.noise import Noise, perturb
 
 CALIBRATION_NOISE = Noise(outline_rms=0.5e-3, correlation=(0.5e-3, 4e-3), specks=5, missing_probability=0.2)
+LEAST_CONTACT = 1e-6  # m^2: touches of less are not simulated
 MARGIN = 0.25  # of the window, on each side: the gel is dragged along by what presses beside the window
 
 

@@ -17,7 +17,7 @@ from geomtact.evaluation import study
 from geomtact.evaluation.touches import Touch
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
-from geomtact.scoring.fitted import PIXELWISE
+from geomtact.scoring.catalogue import PIXELWISE
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.product import Product
 from geomtact.scoring.protocol import Scorer

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import felt_mask, spoilt
+from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
 from geomtact.se3 import Array
 from geomtact.sensing.noise import MODERATE, Noise
 
 PENETRATION = (0.3e-3, 1.5e-3)
-LEAST_CONTACT = 1e-6  # m^2
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.store import open_index
 from geomtact.errors import InputError
 from geomtact.files import write_whole
@@ -111,7 +112,7 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(f"{path}: not a posterior that geomtact saved ({error}); give a posterior.npz") from None
     settings = meta["settings"]
-    max_poses, key = settings.get("max_poses", 1_200_000), str(data["index_key"])
+    max_poses, key = settings.get("max_poses", MAX_POSES), str(data["index_key"])
     index = open_index(mesh, sensor, meta["approach"], max_poses, cache_dir, key=key)
     if poses != len(index):
         raise InputError(f"{path}: its poses are not those of this version's grid; localize again")

@@ -13,16 +13,18 @@ from typing import Any
 import numpy as np
 
 from geomtact.contact_space.index import Index
+from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import default_cache_dir, open_index
 from geomtact.errors import UsageError, nearest_name
+from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh, load_mesh
-from geomtact.geometry.rotations import Approach
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.scoring.calibration import posterior_log_prob
-from geomtact.scoring.fitted import DEFAULT_SCORER, FittedScorer, fitted_scorer
+from geomtact.scoring.catalogue import DEFAULT_SCORER
+from geomtact.scoring.fitted import FittedScorer, fitted_scorer
 from geomtact.se3 import check_transforms
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.reading import read_observation
@@ -62,7 +64,7 @@ class Localizer:
 
     index: Index
     scorer: FittedScorer
-    max_poses: int = 1_200_000
+    max_poses: int = MAX_POSES
     cache_dir: str | Path | None = None
 
     @classmethod
@@ -74,7 +76,7 @@ class Localizer:
         approach: Approach | None = None,
         *,
         scorer: str = DEFAULT_SCORER,
-        max_poses: int = 1_200_000,
+        max_poses: int = MAX_POSES,
         cache_dir: str | Path | None = None,
         progress: Progress | None = None,
     ) -> Localizer:
@@ -87,7 +89,7 @@ class Localizer:
         sensor : name of a bundled sensor, path of a TOML file, or a Sensor
         approach : [(direction (3,), half angle)]: only touches whose direction from the object towards the sensor, in
             the object frame, lies within the angle [rad] of one of these; 0 means exactly that face
-        scorer : how contacts are compared, one of ``geomtact.scoring.fitted.SCORERS``, or weights (.safetensors)
+        scorer : how contacts are compared, one of ``geomtact.scoring.catalogue.SCORERS``, or weights (.safetensors)
         max_poses : about how many poses the grid may have
         cache_dir : folder of the index cache; by default ``$GEOMTACT_CACHE`` or the user's cache folder
         progress : called with the share done (0 to 1) and what is being done

@@ -42,8 +42,7 @@ class Refinery:
 
     @property
     def _shape(self) -> tuple[int, int]:
-        width, height = self.space.sensor.half_window
-        return _SHAPE if width >= height else _SHAPE[::-1]
+        return self.space.sensor.along(_SHAPE)
 
     def _refiners(self, index: Index, thorough: bool) -> list[Refiner]:
         # where symmetry leaves no rotation to search, registration is still free to turn a little

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import CALIBRATION_NOISE, draw_noise, felt_mask, spoilt
+from geomtact.contact_space.touch import CALIBRATION_NOISE, LEAST_CONTACT, draw_noise, felt_mask, spoilt
 from geomtact.scoring.protocol import Scorer
 from geomtact.se3 import Array
 
@@ -28,8 +29,7 @@ _CHUNK = 1 << 18  # rows worked on at a time
 _TINY = 1e-30  # probabilities below it are added up as logarithms: single precision ends near 1e-38
 _SPREAD_TOUCHES = 10  # that the spread of the scores is taken from
 FLOORS = np.geomspace(1e-3, 0.5, 16)
-_SHAPE = {True: (72, 96), False: (96, 72)}  # of the simulated touches, for wide and for tall windows
-_LEAST_CONTACT = 1e-6  # m^2
+_SHAPE = (72, 96)  # of the simulated touches
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,17 @@ class Touches:
 
     masks: list[NDArray[np.bool_]]
     ids: NDArray[np.int64]
+
+    def save(self, path: Path) -> None:
+        masks = np.array(self.masks)
+        np.savez(path, masks=np.packbits(masks), shape=masks.shape, ids=self.ids)
+
+    @classmethod
+    def load(cls, path: Path) -> Touches:
+        with np.load(path, allow_pickle=False) as data:
+            shape = tuple(data["shape"])
+            masks = np.unpackbits(data["masks"], count=int(np.prod(shape))).astype(bool)
+            return cls(list(masks.reshape(shape)), data["ids"])
 
 
 @dataclass(frozen=True)
@@ -59,8 +70,7 @@ def simulate_touches(index: Index, n: int, seed: int, progress: Callable[[float,
     """
     rng = np.random.default_rng(seed)
     space = ContactSpace(index.mesh, index.sensor, index.approach)
-    wide = bool(index.sensor.half_window[0] >= index.sensor.half_window[1])
-    shape = _SHAPE[wide]
+    shape = index.sensor.along(_SHAPE)
     pixel = float(4 * index.sensor.half_window.prod() / np.prod(shape))
     weight = index.weight.ravel().astype(float)
     total = np.cumsum(weight)
@@ -72,7 +82,7 @@ def simulate_touches(index: Index, n: int, seed: int, progress: Callable[[float,
         T, _, found = draw_within(index, space, cells, rng, tries=5)
         for pose, i in zip(T[found], cells[found], strict=True):
             mask = felt_mask(space, pose, elastic=len(masks) % 2 == 1, shape=shape)
-            if mask.sum() * pixel < min(_LEAST_CONTACT, 12 * pixel):
+            if mask.sum() * pixel < min(LEAST_CONTACT, 12 * pixel):
                 continue
             masks.append(spoilt(mask, space, draw_noise(CALIBRATION_NOISE, rng), rng))
             ids.append(int(i))
@@ -99,11 +109,12 @@ def calibrated(
 ) -> Calibration:
     """As :func:`calibrate`: ``score_of(i)`` gives the scores (N,) of touch i, whose true row is ``ids[i]``, and rows have
     measures ``weight`` (N,)."""
-    spread = float(np.median([score_of(i).std() for i in range(min(_SPREAD_TOUCHES, len(ids)))]))
+    first = [score_of(i) for i in range(min(_SPREAD_TOUCHES, len(ids)))]
+    spread = float(np.median([score.std() for score in first]))
     temperatures = TEMPERATURES * max(spread, 1e-9)
     ratio = np.zeros((len(temperatures), len(ids)))
     for i, true in enumerate(ids):
-        score = score_of(i)
+        score = first[i] if i < len(first) else score_of(i)
         top = score.max()
         below, mass = _histogram(top - score, weight)
         # the likelihood at the true pose over its mean, for all temperatures from one pass over the scores

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
+import zipfile
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,27 +14,27 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.build import Progress
 from geomtact.contact_space.index import Index
-from geomtact.errors import MeshError, UsageError, nearest_name
+from geomtact.errors import MeshError
 from geomtact.files import write_whole
 from geomtact.scoring.calibration import Calibration, Touches, calibrate, simulate_touches
 from geomtact.scoring.cascade import Cascade, Rows
-from geomtact.scoring.descriptors import CLASSICAL
-from geomtact.scoring.encoder import WEIGHTS, EncoderScorer, Tower, architecture, cell_size, load_weights
-from geomtact.scoring.likelihood import PixelLikelihood
+from geomtact.scoring.catalogue import (
+    DEFAULT_SCORER,
+    ENCODER,
+    PIXELWISE,
+    check_name,
+    descriptor_of,
+    fingerprint,
+    vectors_name,
+)
+from geomtact.scoring.encoder import EncoderScorer
 from geomtact.scoring.moments import Moments
-from geomtact.scoring.overlap import OVERLAPS
 from geomtact.scoring.product import Comparison, Product, choose
 from geomtact.scoring.protocol import Scorer
-from geomtact.scoring.vectors import Descriptor, VectorScorer, describe_index
+from geomtact.scoring.vectors import VectorScorer, describe_index
 from geomtact.scoring.witness import Witness
 
 FORMAT = 7
-DESCRIPTORS: dict[str, Descriptor] = {**CLASSICAL}
-PIXELWISE: dict[str, Scorer] = {**OVERLAPS, "likelihood": PixelLikelihood()}
-_ENCODER = "encoder"
-DEFAULT_SCORER = "best"  # of the encoder, the moments and the overlap, those that tell most on an index
-SCORERS = (*PIXELWISE, *DESCRIPTORS, "moments", _ENCODER, DEFAULT_SCORER)
-_WEIGHTS = ".safetensors"
 _COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
 _LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than choosing which
 _USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual
@@ -104,19 +104,19 @@ def fitted_scorer(
     MeshError
         The object can hardly be touched, so nothing can be calibrated; or its touches are all alike.
     """
-    if name not in SCORERS and not name.endswith(_WEIGHTS):
-        raise UsageError(f"no score named {name!r}{nearest_name(name, SCORERS)}")
-    descriptor = _descriptor(name, index)
-    label = name if descriptor is None else f"{name.split('/')[-1]}-{_fingerprint(descriptor)}"
+    check_name(name)
     known: dict[str, Scorer] = dict(PIXELWISE)
-    if descriptor is not None:
-        path = None if folder is None else folder / f"{descriptor.name}-{_fingerprint(descriptor)}.npy"
-        known[_vectors_name(name)] = _vector_scorer(descriptor, describe_index(index, descriptor, path, progress))
+    label, found = name, descriptor_of(name, index)
+    if found is not None:
+        descriptor, compared = found
+        label = f"{Path(name).name}-{fingerprint(descriptor)}"
+        path = None if folder is None else folder / f"{descriptor.name}-{fingerprint(descriptor)}.npy"
+        known[vectors_name(name)] = compared(descriptor, describe_index(index, descriptor, path, progress))
     path = None if folder is None else folder / f"{label}.json"
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             return _from_json(name, json.loads(path.read_text("utf-8")), known, index)
-    touches = simulate_touches(index, _FIT + _JUDGE, seed=20_200_531, progress=progress)
+    touches = _simulated(index, None if folder is None else folder / f"touches-{_FIT + _JUDGE}.npz", progress)
     if len(touches.ids) < 40:
         raise MeshError(
             f"{index.mesh.name}: hardly any pose makes a contact that the sensor {index.sensor.name!r} can resolve; "
@@ -131,6 +131,18 @@ def fitted_scorer(
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
             write_whole(path, lambda temporary: temporary.write_text(json.dumps(data), "utf-8"))
     return _from_json(name, data, known, index)
+
+
+def _simulated(index: Index, path: Path | None, progress: Progress | None) -> Touches:
+    """The touches that every score on ``index`` is fitted on, read from ``path`` where they were simulated before."""
+    if path is not None:
+        with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return Touches.load(path)
+    touches = simulate_touches(index, _FIT + _JUDGE, seed=20_200_531, progress=progress)
+    if path is not None:
+        with contextlib.suppress(OSError):
+            write_whole(path, touches.save)
+    return touches
 
 
 def _fit(name: str, known: dict[str, Scorer], moments: Moments, index: Index, touches: Touches) -> dict[str, Any]:
@@ -155,7 +167,7 @@ def _fit(name: str, known: dict[str, Scorer], moments: Moments, index: Index, to
     }
     if name == DEFAULT_SCORER:
         comparison = Comparison(index, touches)
-        candidates = {each: known[each] for each in (_ENCODER, "moments", "iou")}
+        candidates = {each: known[each] for each in (ENCODER, "moments", "iou")}
         # on a large grid a further score has to be worth its time
         data["weights"] = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
         more = {**candidates, "likelihood": known["likelihood"]}
@@ -163,9 +175,9 @@ def _fit(name: str, known: dict[str, Scorer], moments: Moments, index: Index, to
         data["exact"] = asdict(calibrate(_weighed(data["exact_weights"], known), index, touches))
     calibration = calibrate(_weighed(data["weights"], known), index, touches)
     data["calibration"] = asdict(calibration)
-    vectors = known[_vectors_name(name)]
+    vectors = known[vectors_name(name)]
     if isinstance(vectors, VectorScorer):
-        alone = list(data["weights"]) == [_vectors_name(name)]
+        alone = list(data["weights"]) == [vectors_name(name)]
         fine = calibration if alone else calibrate(vectors, index, touches)
         data["cascade"] = Cascade.fit(vectors, fine, index, touches, alone and len(index) > _LARGE).to_json()
     return data
@@ -177,7 +189,7 @@ def _from_json(name: str, data: dict[str, Any], known: dict[str, Scorer], index:
     m = data["moments"]
     moments = Moments(np.array(m["bias"]), np.array(m["covariance"]), m["freedom"])
     known = {**_limited(known, data["nearest"]), "moments": moments}
-    vectors = known.get(_vectors_name(name))
+    vectors = known.get(vectors_name(name))
     cascade = None
     if isinstance(vectors, VectorScorer):
         cascade = Cascade.from_json(data["cascade"], vectors, index)
@@ -193,11 +205,6 @@ def _from_json(name: str, data: dict[str, Any], known: dict[str, Scorer], index:
         thorough,
         exact,
     )
-
-
-def _vectors_name(name: str) -> str:
-    """Which of the known scores compares vectors for the scorer ``name``, if any does."""
-    return _ENCODER if name == DEFAULT_SCORER else name
 
 
 def _limited(known: dict[str, Scorer], nearest: dict[str, float]) -> dict[str, Scorer]:
@@ -227,33 +234,3 @@ def _all_alike(index: Index, touches: Touches, gain: float) -> str:
         f"{why}, and a touch tells {max(gain, 0):.2f} nats; use a sensor with a larger window, or an approach to where "
         "the object has edges"
     )
-
-
-def _descriptor(name: str, index: Index) -> Descriptor | None:
-    """What makes the vectors of a score that compares vectors."""
-    if name in DESCRIPTORS:
-        return DESCRIPTORS[name]
-    if name not in (_ENCODER, DEFAULT_SCORER) and not name.endswith(_WEIGHTS):
-        return None
-    path = Path(name) if name.endswith(_WEIGHTS) else WEIGHTS
-    if architecture(path) == "resnet50":
-        from geomtact.scoring.resnet import load_resnet
-
-        return load_resnet(path)
-    swing = index.angle_step * index.mesh.radius_rms
-    return Tower(load_weights(path), cell_size(index.sensor, index.resolution.step, swing))
-
-
-def _vector_scorer(descriptor: Descriptor, stored: NDArray[np.float32]) -> VectorScorer:
-    if isinstance(descriptor, Tower):
-        return EncoderScorer(descriptor, stored)
-    if descriptor.name == "resnet50":
-        from geomtact.scoring.resnet import CosineScorer
-
-        return CosineScorer(descriptor, stored)
-    return VectorScorer(descriptor, stored)
-
-
-def _fingerprint(descriptor: Descriptor) -> str:
-    """Of what the vectors depend on: the descriptor's settings, or its weights."""
-    return hashlib.sha256(repr(descriptor).encode()).hexdigest()[:12]

@@ -176,6 +176,15 @@ class Sensor:
         """Half width and half height (2,) of the window on the membrane [m]."""
         return 0.5 * np.asarray(self.image_size_px) * np.asarray(self.pixel_pitch)
 
+    @property
+    def tall(self) -> bool:
+        """Whether the window is higher than wide."""
+        return bool(self.half_window[1] > self.half_window[0])
+
+    def along(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """``shape`` = (short, long) of a grid over the window as (h, w): the long side along the window's."""
+        return shape[::-1] if self.tall else shape
+
     def sag(self, x: ArrayLike, y: ArrayLike) -> Array:
         """How far the membrane lies below its apex at (x, y) [m]: z_membrane = -sag."""
         x, y = np.asarray(x, float), np.asarray(y, float)

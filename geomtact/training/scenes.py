@@ -17,9 +17,10 @@ from geomtact.contact_space.build import choose_resolution, places
 from geomtact.contact_space.heightmap import NOTHING, Frame, HeightMap, Window
 from geomtact.contact_space.index import pack
 from geomtact.contact_space.resolution import Resolution
-from geomtact.contact_space.touch import MARGIN, elastic_in_window
+from geomtact.contact_space.touch import LEAST_CONTACT, MARGIN, elastic_in_window
+from geomtact.geometry.approach import approach_of, facing
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.rotations import Directions, approach_of, facing, level_step
+from geomtact.geometry.rotations import Directions, level_step
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.scoring.encoder import cell_size
 from geomtact.se3 import Array
@@ -30,7 +31,6 @@ DIRECTIONS, TURNS, TILTS = 12, 4, 4  # drawn of a part; turns and tilted views o
 TOUCHES = 6  # of each tilted view
 _PLACES = 120  # of a rotation at most
 KEY_SHAPE, TOUCH_SHAPE = (24, 32), (48, 64)
-_LEAST_CONTACT = 1e-6  # m^2
 
 
 @dataclass(frozen=True)
@@ -60,12 +60,11 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
     """A scene of ``mesh`` on ``sensor``, with the grid that ``max_poses`` affords."""
     symmetry = Symmetry("none", np.eye(4)[None], None, np.zeros(3))
     mesh = replace(mesh, symmetry=symmetry)
-    tall = sensor.half_window[1] > sensor.half_window[0]
-    shape = KEY_SHAPE[::-1] if tall else KEY_SHAPE
+    shape = sensor.along(KEY_SHAPE)
     resolution = replace(choose_resolution(mesh, sensor, None, max_poses), mask_shape=shape)
     resolution = replace(resolution, pixel=float((2 * sensor.half_window / shape[::-1]).min() / 3))
     directions = Directions.make(symmetry, None, resolution.level)
-    view = _View(mesh, sensor, resolution, tall)
+    view = _View(mesh, sensor, resolution)
     stored, weight, rigid, elastic, true = [], [], [], [], []
     total = 0
     for k in rng.choice(len(directions.vectors), DIRECTIONS, replace=False):
@@ -92,7 +91,7 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
                 if depth is None:
                     continue
                 a, b = view.felt(depth)
-                if b.sum() * view.pixel**2 < _LEAST_CONTACT:
+                if b.sum() * view.pixel**2 < LEAST_CONTACT:
                     continue
                 rigid.append(pack(view.lying(a[None]).reshape(1, -1))[0])
                 elastic.append(pack(view.lying(b[None]).reshape(1, -1))[0])
@@ -114,14 +113,14 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
 class _View:
     """One part over one sensor: height maps of it, and touches cut from them."""
 
-    def __init__(self, mesh: Mesh, sensor: Sensor, resolution: Resolution, tall: bool):
-        self.mesh, self.sensor, self.resolution, self.tall = mesh, sensor, resolution, tall
+    def __init__(self, mesh: Mesh, sensor: Sensor, resolution: Resolution):
+        self.mesh, self.sensor, self.resolution = mesh, sensor, resolution
         self.caster = Caster(mesh.vertices, mesh.faces)
         self.reach = float(np.linalg.norm(mesh.vertices - mesh.centre, axis=1).max())
         self.frame = Frame.make(self.reach, sensor, resolution.step)
         self.window = Window(sensor, resolution.mask_shape, resolution.penetrations)
         self.margin = 2.1 * float(np.hypot(*sensor.half_window)) * (1 + 2 * MARGIN) + 2 * resolution.step
-        h, w = TOUCH_SHAPE[::-1] if tall else TOUCH_SHAPE
+        h, w = sensor.along(TOUCH_SHAPE)
         self.pitch = 2 * sensor.half_window / (w, h)
         self.pixel = float(np.sqrt(self.pitch.prod()))
         self.my, self.mx = round(MARGIN * h), round(MARGIN * w)
@@ -171,7 +170,7 @@ class _View:
         """Flat masks (..., h w), or masks (n, h, w), of a tall window turned by 90 degrees; others as they are."""
         if masks.shape[-1] == np.prod(self.resolution.mask_shape):
             masks = masks.reshape(*masks.shape[:-1], *self.resolution.mask_shape)
-        if self.tall:
+        if self.sensor.tall:
             masks = np.swapaxes(masks, -1, -2)
         return np.ascontiguousarray(masks).reshape(*masks.shape[:-2], -1)
 

@@ -1,0 +1,63 @@
+"""Every score by its name."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from geomtact.contact_space.index import Index
+from geomtact.errors import UsageError, nearest_name
+from geomtact.scoring.descriptors import CLASSICAL
+from geomtact.scoring.encoder import WEIGHTS, EncoderScorer, Tower, architecture, cell_size, load_weights
+from geomtact.scoring.likelihood import PixelLikelihood
+from geomtact.scoring.overlap import OVERLAPS
+from geomtact.scoring.protocol import Scorer
+from geomtact.scoring.vectors import Descriptor, VectorScorer
+
+PIXELWISE: dict[str, Scorer] = {**OVERLAPS, "likelihood": PixelLikelihood()}
+ENCODER = "encoder"
+DEFAULT_SCORER = "best"  # of the encoder, the moments and the overlap, those that tell most on an index
+SCORERS = (*PIXELWISE, *CLASSICAL, "moments", ENCODER, DEFAULT_SCORER)
+_WEIGHTS_FILE = ".safetensors"
+
+
+def check_name(name: str) -> None:
+    """
+    Raises
+    ------
+    UsageError
+        ``name`` is neither one of ``SCORERS`` nor a weights file (.safetensors).
+    """
+    if name not in SCORERS and not name.endswith(_WEIGHTS_FILE):
+        raise UsageError(f"no score named {name!r}{nearest_name(name, SCORERS)}")
+
+
+def vectors_name(name: str) -> str:
+    """The score among those of ``name`` that compares vectors, where one does."""
+    return ENCODER if name == DEFAULT_SCORER else name
+
+
+def descriptor_of(name: str, index: Index) -> tuple[Descriptor, type[VectorScorer]] | None:
+    """What makes the vectors of the score ``name`` on ``index``, and what compares them; None if it compares none.
+
+    Raises
+    ------
+    InputError
+        The weights file cannot be read, or holds those of another network.
+    """
+    if name in CLASSICAL:
+        return CLASSICAL[name], VectorScorer
+    if not name.endswith(_WEIGHTS_FILE) and vectors_name(name) != ENCODER:
+        return None
+    path = Path(name) if name.endswith(_WEIGHTS_FILE) else WEIGHTS
+    if architecture(path) == "resnet50":
+        from geomtact.scoring.resnet import CosineScorer, load_resnet  # it needs torch, a touch by the encoder does not
+
+        return load_resnet(path), CosineScorer
+    swing = index.angle_step * index.mesh.radius_rms
+    return Tower(load_weights(path), cell_size(index.sensor, index.resolution.step, swing)), EncoderScorer
+
+
+def fingerprint(descriptor: Descriptor) -> str:
+    """Of what a descriptor's vectors depend on: its settings, or its weights."""
+    return hashlib.sha256(repr(descriptor).encode()).hexdigest()[:12]
