@@ -9,7 +9,7 @@ from geomtact.inference.posterior import Posterior
 from geomtact.scoring import fitted
 from geomtact.scoring.calibration import posterior_log_prob
 from geomtact.scoring.cascade import BlockScorer, heaviest
-from geomtact.scoring.vectors import VectorScorer
+from geomtact.scoring.encoder import EncoderScorer
 from geomtact.se3 import transform
 
 
@@ -17,7 +17,7 @@ from geomtact.se3 import transform
 def localizer(make_localizer):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitted, "_LARGE", 0)
-        return make_localizer("bracket", "gelslim", scorer="fourier")
+        return make_localizer("bracket", "gelslim", scorer="encoder")
 
 
 def posterior_of(localizer, rows):
@@ -81,7 +81,7 @@ def test_a_blocks_score_is_the_mean_likelihood_of_normal_vectors(localizer, rng)
     spread = np.repeat(rng.uniform(0, 0.4, len(first)), counts)
     stored = (middle + np.sqrt(spread)[:, None] * rng.normal(size=(n, d))).astype(np.float32)
 
-    class Given(VectorScorer):
+    class Given(EncoderScorer):
         def seen(self, index, mask):
             return np.array([0.3, -0.2, 0.5], np.float32)
 

@@ -17,7 +17,7 @@ from geomtact.evaluation import study
 from geomtact.evaluation.touches import Touch
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
-from geomtact.scoring.catalogue import PIXELWISE
+from geomtact.scoring.catalogue import PIXELWISE, descriptor_of
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.product import Product
 from geomtact.scoring.protocol import Scorer
@@ -74,11 +74,11 @@ def prepare(
         mesh, sensor=sensor, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir, progress=watch
     )
     described = watch.of("describing")
-    stores = localizer.scorer.cascade is not None
+    stores = descriptor_of(scorer, localizer.index) is not None
     return localizer, {
         "index": index_s,
         "describe": None if stores and not described else described,
-        "calibrate": watch.total() - described if watch.of("simulating") else None,
+        "calibrate": watch.of("simulating") + watch.of("calibrating") if watch.of("calibrating") else None,
     }
 
 

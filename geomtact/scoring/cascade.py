@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index, spelled_out
 from geomtact.scoring.calibration import Calibration, Touches, best_floor, calibrate, posterior_log_prob
-from geomtact.scoring.vectors import VectorScorer
+from geomtact.scoring.encoder import EncoderScorer
 
 SHARE = 0.98  # of the mass, that is scored cell by cell
 
@@ -38,7 +38,7 @@ class BlockScorer:
     temperature : that the cells' scores are worth as evidence
     """
 
-    cells: VectorScorer
+    cells: EncoderScorer
     narrowing: NDArray[np.float32]
     narrowed: NDArray[np.float32]
     constant: NDArray[np.float32]
@@ -46,7 +46,7 @@ class BlockScorer:
     name: str = "blocks"
 
     @classmethod
-    def make(cls, cells: VectorScorer, index: Index, temperature: float) -> BlockScorer:
+    def make(cls, cells: EncoderScorer, index: Index, temperature: float) -> BlockScorer:
         """Over the blocks of ``index``, each cell weighed by its measure."""
         first, _ = index.block_runs
         weight = np.maximum(np.asarray(index.weight).reshape(-1), 1e-30)[:, None]
@@ -102,7 +102,7 @@ class Cascade:
     partly: Calibration | None
 
     @classmethod
-    def fit(cls, cells: VectorScorer, fine: Calibration, index: Index, touches: Touches, partly: bool) -> Cascade:
+    def fit(cls, cells: EncoderScorer, fine: Calibration, index: Index, touches: Touches, partly: bool) -> Cascade:
         """Calibrated on ``touches``; ``fine`` is what the cells' scores are worth where all are scored."""
         blocks = BlockScorer.make(cells, index, fine.temperature)
         own = index.block_of(touches.ids)
@@ -126,7 +126,7 @@ class Cascade:
         return out if self.partly is None else out | {"partly": asdict(self.partly)}
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any], cells: VectorScorer, index: Index) -> Cascade:
+    def from_json(cls, data: Mapping[str, Any], cells: EncoderScorer, index: Index) -> Cascade:
         blocks = BlockScorer.make(cells, index, data["temperature"])
         partly = Calibration(**data["partly"]) if "partly" in data else None
         return cls(blocks, Calibration(**data["coarse"]), partly)

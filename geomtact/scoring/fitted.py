@@ -31,7 +31,7 @@ from geomtact.scoring.encoder import EncoderScorer
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.product import Comparison, Product, choose
 from geomtact.scoring.protocol import Scorer
-from geomtact.scoring.vectors import VectorScorer, describe_index
+from geomtact.scoring.vectors import describe_index
 from geomtact.scoring.witness import Witness
 
 FORMAT = 7
@@ -51,7 +51,7 @@ class FittedScorer:
     name : as it was asked for
     scorer, calibration : of the cells
     witness : tells how likely a touch of the object is at all
-    cascade : of blocks and some cells; None where the score has no coarse form
+    cascade : of blocks and some cells, by the encoder; None for a score that has no part in it
     thorough, exact : a scorer that counts the pixels too, and what it is worth; None where the score goes without
     """
 
@@ -116,7 +116,7 @@ def fitted_scorer(
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             return _from_json(name, json.loads(path.read_text("utf-8")), known, index)
-    touches = _simulated(index, None if folder is None else folder / f"touches-{_FIT + _JUDGE}.npz", progress)
+    touches = _simulated(index, None if folder is None else folder / f"touches-{FORMAT}-{_FIT + _JUDGE}.npz", progress)
     if len(touches.ids) < 40:
         raise MeshError(
             f"{index.mesh.name}: hardly any pose makes a contact that the sensor {index.sensor.name!r} can resolve; "
@@ -125,6 +125,8 @@ def fitted_scorer(
     n = len(touches.ids) * _FIT // (_FIT + _JUDGE)
     learn, judge = (Touches(touches.masks[part], touches.ids[part]) for part in (slice(n), slice(n, None)))
     data = _fit(name, known, Moments.fit(index, learn.masks, learn.ids), index, judge)
+    if progress:
+        progress(1.0, "calibrating the score")
     if data["calibration"]["gain"] < _LEAST_GAIN and name in ("moments", DEFAULT_SCORER):
         raise MeshError(_all_alike(index, touches, data["calibration"]["gain"]))
     if path is not None:
@@ -176,7 +178,7 @@ def _fit(name: str, known: dict[str, Scorer], moments: Moments, index: Index, to
     calibration = calibrate(_weighed(data["weights"], known), index, touches)
     data["calibration"] = asdict(calibration)
     vectors = known[vectors_name(name)]
-    if isinstance(vectors, VectorScorer):
+    if isinstance(vectors, EncoderScorer):
         alone = list(data["weights"]) == [vectors_name(name)]
         fine = calibration if alone else calibrate(vectors, index, touches)
         data["cascade"] = Cascade.fit(vectors, fine, index, touches, alone and len(index) > _LARGE).to_json()
@@ -191,7 +193,7 @@ def _from_json(name: str, data: dict[str, Any], known: dict[str, Scorer], index:
     known = {**_limited(known, data["nearest"]), "moments": moments}
     vectors = known.get(vectors_name(name))
     cascade = None
-    if isinstance(vectors, VectorScorer):
+    if isinstance(vectors, EncoderScorer):
         cascade = Cascade.from_json(data["cascade"], vectors, index)
     thorough, exact = None, None
     if "exact" in data:

@@ -20,7 +20,6 @@ from geomtact.sensing.moments import without_specks
 from geomtact.sensing.sensor import Sensor
 
 _BATCH = 4096  # contacts described at a time
-_CHUNK = 1 << 13  # of which vectors are compared at a time
 
 
 class Descriptor(Protocol):
@@ -64,25 +63,7 @@ class VectorScorer:
         out = self.stored @ (2 * seen)
         out -= self._squared
         out -= np.float32(seen @ seen)
-        out *= self.trust(float(out.max()))
         return out.reshape(index.height.shape)
-
-    def trust(self, best: float) -> np.float32:
-        """What scores are to be multiplied by, of which the ``best`` is given; 1 as a rule."""
-        return np.float32(1)
-
-    def of(self, ids: NDArray[np.int64], seen: NDArray[np.float32]) -> NDArray[np.float32]:
-        """As :meth:`score`, before :meth:`trust`, of poses ``ids`` (n,), for the vector ``seen`` (d,) of the contact: (n,)."""
-        out = np.empty(len(ids), np.float32)
-        vectors = np.empty((_CHUNK, self.stored.shape[1]), self.stored.dtype)
-        for start in range(0, len(ids), _CHUNK):
-            some = ids[start : start + _CHUNK]
-            # into the same memory each time, which stays in the processor's cache
-            np.take(self.stored, some, 0, out=vectors[: len(some)], mode="clip")
-            np.matmul(vectors[: len(some)], 2 * seen, out=out[start : start + len(some)])
-        out -= self._squared[ids]
-        out -= np.float32(seen @ seen)
-        return out
 
     def seen(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""
