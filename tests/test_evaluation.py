@@ -157,7 +157,7 @@ def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tm
     assert done.exit_code == 0, done.output
     whole = json.loads(out.read_text())
     part = whole["parts"]["ball"]
-    assert whole["schema"] == "geomtact/study/1" and whole["versions"]["numpy"] == np.__version__
+    assert whole["schema"] == "geomtact/study/2" and whole["versions"]["numpy"] == np.__version__
     assert part["settings"]["object_sha256"] == localizer.mesh.sha256 and part["settings"]["seed"] == 1
     assert len(part["outcomes"]) == 6 and part["figures"]["all"]["n"] == 6
 

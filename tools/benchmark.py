@@ -53,7 +53,7 @@ def main() -> None:
 
 def machine() -> dict[str, Any]:
     """Facts that the figures depend on."""
-    from geomtact.report.result import versions
+    from geomtact.versions import versions
 
     model = platform.processor()
     cpuinfo = Path("/proc/cpuinfo")

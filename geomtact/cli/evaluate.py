@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from geomtact.evaluation.study import Felt
     from geomtact.sensing.noise import Noise
 
-SCHEMA = "geomtact/study/1"
+SCHEMA = "geomtact/study/2"
 _SCORES_ONLY = "Only for scores"
 
 

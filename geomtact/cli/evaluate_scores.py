@@ -160,7 +160,7 @@ def _judge(
     def keep(outcomes: list) -> None:
         entry = {
             "settings": described,
-            "bytes_per_pose": scores.bytes_per_pose(localizer.scorer.scorer, localizer.index),
+            "bytes_per_pose": scores.bytes_read(localizer, effort),
             "prepare_s": seconds,
             "outcomes": [asdict(o) for o in outcomes],
         }
@@ -222,7 +222,7 @@ def _print_classes(classes: Mapping[str, Mapping[str, Any]]) -> None:
     for name, kinds in classes.items():
         for kind, f in kinds.items():
             rows.append([name, kind, str(f["n"]), _number(f["gain_mean"], 2), *_inside(f)])
-            masses = [f"in {100 * c['nominal']:.0f} %" for c in f["coverage"]]
+    masses = _masses()
     typer.echo("By kind of contact: percentage of truths inside the region of each mass, with 99 % intervals")
     print_table(["score", "contact", "n", "gain [nats]", *masses], rows, ["n", "gain [nats]", *masses])
 
@@ -268,9 +268,15 @@ def _print_coverage(tables: Mapping[str, Mapping[str, Any]]) -> None:
     for title, entries in tables.items():
         for name, _, f in _groups(entries):
             rows.append([title, name, str(f["n"]), *_inside(f)])
-            masses = [f"in {100 * c['nominal']:.0f} %" for c in f["coverage"]]
     typer.echo("Percentage of truths inside the region of each mass, with 95 % intervals")
+    masses = _masses()
     print_table(["part", "score", "n", *masses], rows, ["n", *masses])
+
+
+def _masses() -> list[str]:
+    from geomtact.evaluation.study import NOMINAL
+
+    return [f"in {100 * mass:.0f} %" for mass in NOMINAL]
 
 
 def _inside(figures: Mapping[str, Any]) -> list[str]:

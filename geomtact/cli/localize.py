@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from geomtact.cli.library import CacheDir
-from geomtact.cli.prepare import SensorName, Unit, open_localizer
+from geomtact.cli.prepare import ScorerName, SensorName, Unit, open_localizer
 from geomtact.cli.shell import NO_CONTACT, check_folder, print_table, tell
 from geomtact.errors import InputError, UsageError, nearest_name
 
@@ -43,6 +43,7 @@ def localize(
         str | None,
         typer.Option(metavar="|".join(Effort), help="How much to compute; balanced by default.", show_default=False),
     ] = None,
+    scorer: ScorerName = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for result.json, posterior.npz, report.html and report.png.")
@@ -81,7 +82,7 @@ def localize(
     if values["sensor"] is not None:
         # a bad image is told before minutes go into an index
         read_observation(image, values["sensor"], kind, values["background"])
-    localizer = open_localizer(values, sources, cache_dir)
+    localizer = open_localizer(values, sources, scorer, cache_dir)
     prepared = time.perf_counter()
     posterior = localizer.localize(
         str(image), kind=kind, background=values["background"], prior=prior, effort=chosen, seed=seed

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
 
 Unit = Annotated[str | None, typer.Option("--unit", help="Unit of a mesh file without one: mm, cm, m or inch.")]
+ScorerName = Annotated[
+    str | None, typer.Option("--scorer", help="How contacts are compared: a score by name, or weights (.safetensors).")
+]
 SensorName = Annotated[str | None, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
 
 
@@ -23,6 +26,7 @@ def prepare(
     ] = None,
     unit: Unit = None,
     sensor: SensorName = None,
+    scorer: ScorerName = None,
     cache_dir: CacheDir = None,
 ) -> None:
     """Build the index of a part on a sensor and cache it, so that 'localize' starts at once."""
@@ -32,11 +36,11 @@ def prepare(
 
     values, sources = resolve({"object": object_name, "unit": unit, "sensor": sensor})
     began = time.perf_counter()
-    localizer = open_localizer(values, sources, cache_dir)
+    localizer = open_localizer(values, sources, scorer, cache_dir)
     typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
 
 
-def open_localizer(values: dict, sources: dict, cache_dir: Path | None) -> Localizer:
+def open_localizer(values: dict, sources: dict, scorer: str | None, cache_dir: Path | None) -> Localizer:
     """The localizer for resolved options, with a progress bar where its index has to be built first."""
     from geomtact.cli.project import require
     from geomtact.geometry.catalogue import catalogue
@@ -48,8 +52,11 @@ def open_localizer(values: dict, sources: dict, cache_dir: Path | None) -> Local
         tell(f"{key}: {values[key]} (from {source})")
 
     from geomtact.inference.localizer import Localizer
+    from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
 
+    scorer = scorer or DEFAULT_SCORER
+    check_name(scorer)  # a wrong name is told before minutes go into an index
     with progress_bar("preparing") as progress:
         return Localizer.prepare(
-            object_name, unit=values["unit"], sensor=sensor, cache_dir=cache_dir, progress=progress
+            object_name, unit=values["unit"], sensor=sensor, scorer=scorer, cache_dir=cache_dir, progress=progress
         )

@@ -69,7 +69,8 @@ def collect(done: list, more: Iterable, total: int, title: str, keep: Callable[[
 def save(out: Path | None, content: dict[str, Any]) -> None:
     """Write ``content``, with the versions of what made it, if there is a file to write."""
     from geomtact.files import write_whole
-    from geomtact.report.result import to_text, versions
+    from geomtact.report.result import to_text
+    from geomtact.versions import versions
 
     content["versions"] = versions()
     if out is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,7 @@ import typer
 
 from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import progress_bar, tell
-from geomtact.errors import UsageError
+from geomtact.errors import InputError, UsageError
 
 _TUNING_RATE = 3e-4  # a step of fine-tuning must not undo what many parts taught
 
@@ -33,6 +34,7 @@ def train(
     ] = "encoder",
     pairs: Annotated[int, typer.Option(min=32, help="Pairs of contacts that a resnet50 learns from.")] = 100_000,
     side: Annotated[int, typer.Option(min=32, help="Pixels along the side of a resnet50's images.")] = 224,
+    rate: Annotated[float | None, typer.Option(min=1e-9, help="Learning rate, where the usual one diverges.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     work: Annotated[
         Path | None, typer.Option(help="Folder for scenes and state; by default one named after --out.")
@@ -45,29 +47,31 @@ def train(
     """
     if out.suffix != ".safetensors":
         raise UsageError(f"--out {out}: expected a name that ends in .safetensors")
-    if architecture not in ("encoder", "resnet50"):
-        raise UsageError(f"--architecture {architecture}: expected encoder or resnet50")
+    from geomtact.scoring.encoder import ARCHITECTURE, THESIS, WEIGHTS
+
+    if architecture not in (ARCHITECTURE, THESIS):
+        raise UsageError(f"--architecture {architecture}: expected {ARCHITECTURE} or {THESIS}")
     work = work or out.with_name(f"{out.stem}.training")
-    if architecture == "resnet50":
+    if architecture == THESIS:
         if object_name is None:
-            raise UsageError("--architecture resnet50: the thesis's network is trained for one part; give --object")
-        _train_resnet(out, work, object_name, unit, sensor, pairs, side, seed)
+            raise UsageError(f"--architecture {THESIS}: the thesis's network is trained for one part; give --object")
+        _train_thesis(out, work, object_name, unit, sensor, pairs, side, rate, seed)
         return
-    from geomtact.scoring.encoder import WEIGHTS
     from geomtact.training import dataset
     from geomtact.training.card import read_weights, write_encoder
+    from geomtact.training.state import claim
     from geomtact.training.train import Settings
     from geomtact.training.train import train as run
 
     settings = Settings(steps=steps or 4000, seed=seed)
+    recipe = {"architecture": ARCHITECTURE, "seed": seed}
     with progress_bar("training") as progress:
         if object_name is None:
             n = scenes or 600
+            claim(work, recipe | {"start": _sha256(start)})
             made = dataset.shared_scenes(work / "scenes", n, seed, progress)
             data = {"parts": "procedural", "sensors": dataset.SENSORS, "sizes": dataset.SIZES, "poses": dataset.POSES}
         else:
-            from dataclasses import replace
-
             from geomtact.contact_space.resolution import MAX_POSES
             from geomtact.geometry.mesh import load_mesh
             from geomtact.sensing.sensor import Sensor
@@ -75,10 +79,13 @@ def train(
             gel = Sensor.load(sensor)
             mesh = load_mesh(object_name, unit, sensor=gel)
             n = scenes or 80
-            made = dataset.part_scenes(work / "scenes", mesh, gel, MAX_POSES, n, seed, progress)
-            data = {"part": mesh.name, "sha256": mesh.sha256, "sensor": gel.name}
-            settings = replace(settings, steps=steps or 600, rate=_TUNING_RATE, validation=max(n // 8, 5))
             start = start or WEIGHTS
+            claim(work, recipe | {"part": mesh.sha256, "sensor": gel.sha256, "start": _sha256(start)})
+            made = dataset.part_scenes(work / "scenes", mesh, gel, MAX_POSES, n, seed, progress)
+            data = {"part": mesh.name, "part_sha256": mesh.sha256, "sensor": gel.name, "sensor_sha256": gel.sha256}
+            settings = replace(settings, steps=steps or 600, rate=_TUNING_RATE, validation=max(n // 8, 5))
+        if rate is not None:
+            settings = replace(settings, rate=rate)
         if start is not None:
             data["start"] = start.name
         network, curve = run(made, settings, work, progress, start=read_weights(start) if start is not None else None)
@@ -87,17 +94,43 @@ def train(
     typer.echo(f"written: {out}, {out.with_suffix('.json').name} and {out.with_suffix('.png').name}")
 
 
-def _train_resnet(
-    out: Path, work: Path, object_name: str, unit: str | None, sensor: str, pairs: int, side: int, seed: int
+def _sha256(path: Path | None) -> str | None:
+    """Of the weights to start from."""
+    import hashlib
+
+    if path is None:
+        return None
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        raise InputError(f"--start {path}: no such file; give a file that 'geomtact train' wrote") from None
+
+
+def _train_thesis(
+    out: Path,
+    work: Path,
+    object_name: str,
+    unit: str | None,
+    sensor: str,
+    pairs: int,
+    side: int,
+    rate: float | None,
+    seed: int,
 ) -> None:
     """The thesis's network for one part."""
     from geomtact.contact_space.space import ContactSpace
     from geomtact.geometry.mesh import load_mesh
+    from geomtact.scoring.encoder import THESIS
     from geomtact.sensing.sensor import Sensor
+    from geomtact.training.state import claim
     from geomtact.training.thesis import Settings, train_thesis
 
     gel = Sensor.load(sensor)
     mesh = load_mesh(object_name, unit, sensor=gel).with_symmetry()
+    settings = Settings(pairs=pairs, side=side, seed=seed)
+    if rate is not None:
+        settings = replace(settings, rate=rate)
+    claim(work, {"architecture": THESIS, "seed": seed, "part": mesh.sha256, "sensor": gel.sha256})
     with progress_bar("training") as progress:
-        train_thesis(ContactSpace(mesh, gel), Settings(pairs=pairs, side=side, seed=seed), work, out, progress)
+        train_thesis(ContactSpace(mesh, gel), settings, work, out, progress)
     typer.echo(f"written: {out} and {out.with_suffix('.json').name}")

@@ -82,6 +82,16 @@ def prepare(
     }
 
 
+def bytes_read(localizer: Localizer, effort: str) -> float:
+    """Bytes a pose that the localizer's score reads for a touch at ``effort``."""
+    fitted, index = localizer.scorer, localizer.index
+    if effort == "fast" and fitted.cascade is not None:
+        blocks = fitted.cascade.blocks
+        return (blocks.narrowing.nbytes + blocks.narrowed.nbytes + blocks.constant.nbytes) / len(index)
+    scorer = fitted.thorough if effort == "exact" and fitted.thorough is not None else fitted.scorer
+    return bytes_per_pose(scorer, index)
+
+
 def bytes_per_pose(scorer: Scorer, index: Index) -> float:
     """Bytes that ``scorer`` reads of every pose to compare a touch with it; all that is stored, for one unknown here."""
     if isinstance(scorer, Product):

@@ -22,7 +22,7 @@ from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
-from geomtact.scoring.calibration import posterior_log_prob
+from geomtact.scoring.calibration import Calibration, posterior_log_prob
 from geomtact.scoring.catalogue import DEFAULT_SCORER
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
 from geomtact.se3 import check_transforms
@@ -37,7 +37,8 @@ class Effort:
 
     Attributes
     ----------
-    resolved : what is scored: "blocks" of about 20 cells, "cells" where the mass is, or "all" cells
+    resolved : what is scored: "blocks" of about 20 cells, "cells" (on a large grid those where the mass is), or "all"
+        cells, their pixels counted too
     modes : that are refined
     thorough : whether each is refined by all registrations, from the whole outline, or by one from half of its points
     """
@@ -123,8 +124,8 @@ class Localizer:
         background : a reading without contact, for readings
         T_world_sensor : (4, 4), or [(4, 4)] for one image: the posterior is then in the world frame
         prior : None, a Posterior, its path, a pair (poses, log weights) or a log density (see ``inference.prior``)
-        effort : "fast" (the grid's blocks, nothing refined), "balanced" (cells where the mass is, five refined modes) or
-            "exact" (every cell, twenty-five refined modes)
+        effort : "fast" (the grid's blocks, nothing refined), "balanced" (its cells, five refined modes) or "exact" (every
+            cell, the pixels counted too where that tells more, twenty-five refined modes)
         seed : of the random choices made where credible levels tie
 
         Raises
@@ -159,6 +160,7 @@ class Localizer:
                 log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame, self.cache_dir)
                 rows = self.scorer.cells(self.index, mask, log_prior, EFFORTS[effort].resolved == "all")
         with _timed(timing, "posterior"):
+            common["settings"] |= _worth(rows.by, rows.calibration)
             log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
             evidence, likeliest = self.scorer.witness.hear(self.index, mask, log_prior)
             posterior = Posterior(self.index, rows.first, log_prob, runs=rows.runs, log_evidence=evidence, **common)
@@ -201,8 +203,6 @@ class Localizer:
             "effort": effort,
             "seed": seed,
             "scorer": self.scorer.name,
-            "temperature": self.scorer.calibration.temperature,
-            "floor": self.scorer.calibration.floor,
             "max_poses": self.max_poses,
             "poses": len(self.index),
             "grid": self.index.resolution.to_json(),
@@ -210,6 +210,10 @@ class Localizer:
             if self.index.approach is None
             else [(np.asarray(v, float).tolist(), float(a)) for v, a in self.index.approach],
         }
+
+
+def _worth(scored_by: str, calibration: Calibration) -> dict[str, Any]:
+    return {"scored_by": scored_by, "temperature": calibration.temperature, "floor": calibration.floor}
 
 
 def _frame(image: Any, T_world_sensor: Any) -> tuple[str, Any, Any]:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-import platform
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from geomtact.se3 import quat_xyzw
+from geomtact.versions import versions
 
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Mode, Posterior
 
 SCHEMA = "geomtact/localization/1"
-PACKAGES = ("geomtact", "numpy", "scipy", "open3d", "torch", "embreex", "trimesh")
 
 
 def result(
@@ -67,17 +65,6 @@ def to_text(content: Mapping[str, Any]) -> str:
     """JSON text, one key of the outermost level a line."""
     lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
     return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def versions() -> dict[str, str]:
-    """Versions of geomtact, of what computes for it, and of Python; "none" for what is not installed."""
-    found = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "none"
-    return found
 
 
 def plain(value: Any) -> Any:

@@ -43,7 +43,7 @@ class BlockScorer:
     narrowed: NDArray[np.float32]
     constant: NDArray[np.float32]
     temperature: float
-    name: str = "blocks"
+    name: str = "blocks of encoder"
 
     @classmethod
     def make(cls, cells: EncoderScorer, index: Index, temperature: float) -> BlockScorer:
@@ -77,6 +77,7 @@ class Rows:
     score : (N,)
     log_prior : (N,) log mass of each run
     calibration : what the scores are worth
+    by : name of what was scored by
     """
 
     first: NDArray[np.int64]
@@ -84,6 +85,7 @@ class Rows:
     score: NDArray[np.float32]
     log_prior: NDArray[np.floating]
     calibration: Calibration
+    by: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +136,8 @@ class Cascade:
     def whole(self, index: Index, mask: NDArray[np.bool_]) -> Rows:
         """The blocks alone."""
         first, runs = index.block_runs
-        return _possible(Rows(first, runs, self.blocks.score(index, mask), index.log_block_weight, self.coarse))
+        score = self.blocks.score(index, mask)
+        return _possible(Rows(first, runs, score, index.log_block_weight, self.coarse, self.blocks.name))
 
     def expanded(self, index: Index, mask: NDArray[np.bool_]) -> Rows:
         """Blocks, and cell by cell those of them that hold ``SHARE`` of the mass."""
@@ -145,19 +148,14 @@ class Cascade:
         chosen = heaviest(np.exp(log_prob), SHARE)
         length = np.where(chosen, counts, 1)
         ids = spelled_out(first, length)
-        whole = ~chosen
-        at = (np.cumsum(length) - length)[
-            whole
-        ]  # rows of the blocks that stay whole: they are scored as cells at first
-        runs, cell_score, cell_prior = (
-            np.ones(len(ids), np.int64),
-            self.blocks.cells.of(ids, seen),
-            index.log_weight[ids],
-        )
+        runs = np.ones(len(ids), np.int64)
+        cell_score, cell_prior = self.blocks.cells.of(ids, seen), index.log_weight[ids]
+        # the blocks that stay whole were scored as the cells that they begin with
+        at, whole = (np.cumsum(length) - length)[~chosen], ~chosen
         runs[at], cell_score[at], cell_prior[at] = counts[whole], score[whole], prior[whole]
         assert self.partly is not None
         cell_score *= self.blocks.cells.trust(float(cell_score.max()))
-        return _possible(Rows(ids, runs, cell_score, cell_prior, self.partly))
+        return _possible(Rows(ids, runs, cell_score, cell_prior, self.partly, self.blocks.cells.name))
 
 
 def _possible(rows: Rows) -> Rows:
@@ -165,7 +163,9 @@ def _possible(rows: Rows) -> Rows:
     kept = rows.log_prior > -np.inf
     if kept.all() or rows.runs is None:
         return rows
-    return Rows(rows.first[kept], rows.runs[kept], rows.score[kept], rows.log_prior[kept], rows.calibration)
+    return replace(
+        rows, first=rows.first[kept], runs=rows.runs[kept], score=rows.score[kept], log_prior=rows.log_prior[kept]
+    )
 
 
 def _single(x: NDArray[np.floating]) -> NDArray[np.float32]:

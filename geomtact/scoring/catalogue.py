@@ -6,9 +6,9 @@ import hashlib
 from pathlib import Path
 
 from geomtact.contact_space.index import Index
-from geomtact.errors import UsageError, nearest_name
+from geomtact.errors import InputError, UsageError, nearest_name
 from geomtact.scoring.descriptors import CLASSICAL
-from geomtact.scoring.encoder import WEIGHTS, EncoderScorer, Tower, architecture, cell_size, load_weights
+from geomtact.scoring.encoder import THESIS, WEIGHTS, EncoderScorer, Tower, about, cell_size, load_weights
 from geomtact.scoring.likelihood import PixelLikelihood
 from geomtact.scoring.overlap import OVERLAPS
 from geomtact.scoring.protocol import Scorer
@@ -22,7 +22,8 @@ _WEIGHTS_FILE = ".safetensors"
 
 
 def check_name(name: str) -> None:
-    """
+    """Refuse what names no score.
+
     Raises
     ------
     UsageError
@@ -43,19 +44,30 @@ def descriptor_of(name: str, index: Index) -> tuple[Descriptor, type[VectorScore
     Raises
     ------
     InputError
-        The weights file cannot be read, or holds those of another network.
+        The weights file cannot be read, or holds those of another network, or for another object or sensor.
     """
     if name in CLASSICAL:
         return CLASSICAL[name], VectorScorer
     if not name.endswith(_WEIGHTS_FILE) and vectors_name(name) != ENCODER:
         return None
     path = Path(name) if name.endswith(_WEIGHTS_FILE) else WEIGHTS
-    if architecture(path) == "resnet50":
+    _check_whose(path, index)
+    if about(path).get("architecture") == THESIS:
         from geomtact.scoring.resnet import CosineScorer, load_resnet  # it needs torch, a touch by the encoder does not
 
         return load_resnet(path), CosineScorer
     swing = index.angle_step * index.mesh.radius_rms
     return Tower(load_weights(path), cell_size(index.sensor, index.resolution.step, swing)), EncoderScorer
+
+
+def _check_whose(path: Path, index: Index) -> None:
+    said = about(path)
+    for what, given in (("part", index.mesh), ("sensor", index.sensor)):
+        if said.get(f"{what}_sha256", given.sha256) != given.sha256:
+            raise InputError(
+                f"{path}: trained for the {what} {said[what]!r}, not for {given.name!r}; train weights for it, or use the "
+                f"score {ENCODER!r}, which serves all"
+            )
 
 
 def fingerprint(descriptor: Descriptor) -> str:

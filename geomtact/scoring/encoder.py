@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from geomtact.sensing.moments import without_specks
 from geomtact.sensing.sensor import Sensor
 
 WEIGHTS = Path(__file__).with_name("encoder.safetensors")  # trained once for all parts, with a card beside it
+ARCHITECTURE, THESIS = "encoder", "resnet50"  # as the metadata of weights name them
 SHAPE = (24, 32)  # of what the network sees: the whole window, lying
 BESIDE = 8  # numbers beside the pixels: six moments, and two of the grid's cell
 _PIXEL = 2 / SHAPE[1] / float(np.hypot(1, SHAPE[0] / SHAPE[1]))  # in units of the window's half diagonal
@@ -105,14 +105,16 @@ def cell_size(sensor: Sensor, step: float, swing: float) -> NDArray[np.float32]:
     return np.log(np.maximum([step, swing], 1e-6) / np.hypot(*sensor.half_window)).astype(np.float32)
 
 
-def vector(weights: Weights, image: NDArray[np.float32], cell: NDArray[np.float32]) -> NDArray[np.float32]:
+def vector(
+    weights: Weights, image: NDArray[np.float32], cell: NDArray[np.float32], head: str = "touch"
+) -> NDArray[np.float32]:
     """What ``network.Encoder`` makes of one touch: vector (d,) of an image (24, 32), the share of each pixel in contact."""
     m = np.concatenate([moment_features(image.reshape(1, -1) @ BASIS, np)[0], cell])
     x = np.concatenate([image.ravel(), m])
     for layer in ("trunk.0", "trunk.2"):
         x = _gelu(weights[f"{layer}.weight"] @ x + weights[f"{layer}.bias"])
-    x = _gelu(weights["heads.touch.0.weight"] @ np.concatenate([x, m]) + weights["heads.touch.0.bias"])
-    return np.asarray(weights["heads.touch.2.weight"] @ x + weights["heads.touch.2.bias"], np.float32)
+    x = _gelu(weights[f"heads.{head}.0.weight"] @ np.concatenate([x, m]) + weights[f"heads.{head}.0.bias"])
+    return np.asarray(weights[f"heads.{head}.2.weight"] @ x + weights[f"heads.{head}.2.bias"], np.float32)
 
 
 def moment_features(sums: Any, xp: Any) -> Any:
@@ -142,18 +144,18 @@ def _basis() -> NDArray[np.float32]:
 BASIS = _basis()  # (768, 6): sums of an image's pixels times 1, x, y and their products
 
 
-def architecture(path: Path) -> str:
-    """What the metadata of a weights file names its network, "" for nothing or an unreadable file."""
+def about(path: Path) -> dict[str, str]:
+    """What a weights file says of itself: ``architecture``, and ``part`` and ``sensor`` where it is for one alone; nothing
+    of a file that cannot be read."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(str(path), framework="np") as file:
-            return str((file.metadata() or {}).get("architecture", ""))
+            return dict(file.metadata() or {})
     except (OSError, SafetensorError):
-        return ""
+        return {}
 
 
-@lru_cache(maxsize=4)
 def load_weights(path: Path) -> Weights:
     """The encoder's weights from a safetensors file.
 
@@ -168,7 +170,8 @@ def load_weights(path: Path) -> Weights:
     advice = "give a file that 'geomtact train' wrote"
     try:
         weights = {name: np.asarray(value, np.float32) for name, value in load_file(str(path)).items()}
-        vector(weights, np.zeros(SHAPE, np.float32), np.zeros(2, np.float32))
+        for head in ("touch", "stored"):
+            vector(weights, np.zeros(SHAPE, np.float32), np.zeros(2, np.float32), head)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {advice}") from None
     except (OSError, SafetensorError) as error:

@@ -87,7 +87,8 @@ class FittedScorer:
         if log_prior is not None:
             cells = np.flatnonzero(np.isfinite(log_prior))
             prior = log_prior[cells]
-        return Rows(cells, None, scorer.score(index, mask).reshape(-1)[cells], prior, calibration)
+        score = scorer.score(index, mask).reshape(-1)[cells]
+        return Rows(cells, None, score, prior, calibration, scorer.name)
 
 
 def fitted_scorer(

@@ -27,7 +27,11 @@ class Product:
 
     scorers: Sequence[Scorer]
     weights: Sequence[float]
-    name: str = "product"
+
+    @property
+    def name(self) -> str:
+        """Such as "1 encoder + 0.25 iou"."""
+        return " + ".join(f"{w:.3g} {s.name}" for w, s in zip(self.weights, self.scorers, strict=True))
 
     def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Score (P, n) of ``mask`` (h, w) at every pose."""

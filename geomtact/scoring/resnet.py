@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from torch import nn
 
 from geomtact.errors import InputError
+from geomtact.scoring.encoder import THESIS
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.sensor import Sensor
 
 SIDE, NUMBERS = 224, 1000
-ARCHITECTURE = "resnet50"  # as the metadata of its weights names it
 _BLOCKS = (3, 4, 6, 3)  # of each stage
 _BATCH = 64
 
@@ -33,7 +33,7 @@ class Resnet:
     network: nn.Module
     side: int
     digest: str
-    name: str = ARCHITECTURE
+    name: str = THESIS
 
     def __repr__(self) -> str:
         return f"Resnet({self.side}, {self.digest})"

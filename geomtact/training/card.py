@@ -12,10 +12,12 @@ import torch
 from safetensors.torch import save_file
 
 from geomtact.files import write_whole
+from geomtact.scoring.encoder import ARCHITECTURE
 from geomtact.scoring.network import Encoder
 from geomtact.training.augment import AUGMENTATIONS
 from geomtact.training.scenes import Scene
 from geomtact.training.train import Curve, Settings
+from geomtact.versions import versions
 
 SCHEMA = "geomtact/encoder/1"
 
@@ -25,11 +27,13 @@ def write_encoder(
 ) -> None:
     """Write ``path`` (safetensors, half precision), and beside it the card (.json) and the curves (.png).
 
-    ``data`` says where the scenes come from.
+    ``data`` says where the scenes come from; weights for one ``part`` on one ``sensor`` say so in their metadata too.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     weights = {name: value.half().contiguous() for name, value in network.state_dict().items()}
-    write_whole(path, lambda temporary: save_file(weights, temporary))
+    known = ("part", "part_sha256", "sensor", "sensor_sha256")
+    meta = {"architecture": ARCHITECTURE} | {key: str(data[key]) for key in known if key in data}
+    write_whole(path, lambda temporary: save_file(weights, temporary, meta))
     card = {
         "schema": SCHEMA,
         "parameters": sum(p.numel() for p in network.parameters()),
@@ -43,7 +47,7 @@ def write_encoder(
         "settings": asdict(settings),
         "augmentations": [{"name": a.name, "range": a.range, "reason": a.reason} for a in AUGMENTATIONS],
         "curve": asdict(curve),
-        "versions": _versions(),
+        "versions": versions("kornia", "manifold3d"),
     }
     path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", "utf-8")
     draw_curve(curve, path.with_suffix(".png"))
@@ -57,17 +61,11 @@ def draw_curve(curve: Curve, path: Path) -> None:
     axes = figure.add_subplot(
         xlabel="step", ylabel="gain [nats]", title="Information gained about the cell that holds a touch"
     )
-    axes.plot(curve.step, curve.training, color="#E69F00", label="parts that it learns from")
-    axes.plot(curve.step, curve.validation, color="#0072B2", label="parts that it never saw")
+    axes.plot(curve.step, curve.training, color="#E69F00", label="touches that it learns from")
+    axes.plot(curve.step, curve.validation, color="#0072B2", label="scenes that it never saw")
     axes.legend(frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=120)
-
-
-def _versions() -> dict[str, str]:
-    from importlib.metadata import version
-
-    return {name: version(name) for name in ("geomtact", "torch", "kornia", "numpy", "manifold3d")}
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:

@@ -12,21 +12,22 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from safetensors.torch import save_file
-from torch import nn
-from torch.optim import Optimizer
 
 from geomtact.contact_space.build import Progress
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError
 from geomtact.files import write_whole
 from geomtact.geometry.distance import PoseDistance
-from geomtact.scoring.resnet import ARCHITECTURE, SIDE, encode, make_network
+from geomtact.scoring.encoder import THESIS
+from geomtact.scoring.resnet import SIDE, encode, make_network
 from geomtact.se3 import Array, exp
+from geomtact.training.state import not_a_number, resume, save_state
 
 NEAR, FAR = 5e-3, 20e-3  # m: pose distance of positive pairs at most, of negative pairs at least
 SLACK = 0.3  # a similarity up to which a negative pair costs nothing
 _CAST = (48, 64)  # pixels of the simulated contacts
 _SAVE_EVERY = 50
+_PURPOSE = 6_1_4  # beside the seed: an evaluation with the same seed draws other poses
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,6 @@ class Settings:
     """The thesis's own, but for ``side`` [px], of which it says nothing."""
 
     pairs: int = 100_000
-    epochs: int = 1
     batch: int = 32
     rate: float = 0.005
     momentum: float = 0.3
@@ -54,7 +54,7 @@ class Pairs:
 
 def make_pairs(space: ContactSpace, n: int, seed: int = 0, progress: Progress | None = None) -> Pairs:
     """``n`` pairs, in turn positive (label 1 to 0.9, by the distance of the poses) and negative (label 0)."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([_PURPOSE, seed])
     distance = PoseDistance(space.mesh)
     left: list[NDArray[np.bool_]] = []
     right: list[NDArray[np.bool_]] = []
@@ -67,10 +67,11 @@ def make_pairs(space: ContactSpace, n: int, seed: int = 0, progress: Progress | 
         d = np.array([distance.mean(a, b[None])[0] for a, b in zip(A, B, strict=True)])
         positive = np.arange(len(A)) % 2 == 0
         ok = np.where(positive, d < NEAR, d > FAR) & np.isfinite(space.penetration(B))
-        masks = [space.caster.depths(space.sensor, T[ok], _CAST) > 0 for T in (A, B)]
-        left.extend(masks[0])
-        right.extend(masks[1])
-        label.extend(np.where(positive, 1 - 0.1 * d / NEAR, 0)[ok])
+        both = np.flatnonzero(ok & positive), np.flatnonzero(ok & ~positive)
+        kept = np.stack([some[: min(map(len, both))] for some in both], 1).ravel()
+        left.extend(space.caster.depths(space.sensor, A[kept], _CAST) > 0)
+        right.extend(space.caster.depths(space.sensor, B[kept], _CAST) > 0)
+        label.extend(np.where(positive, 1 - 0.1 * d / NEAR, 0)[kept])
         if progress:
             progress(min(len(label) / n, 1.0), "simulating pairs")
     return Pairs(np.stack(left[:n]), np.stack(right[:n]), np.array(label[:n], np.float32))
@@ -99,41 +100,43 @@ def train_thesis(
         network.parameters(), settings.rate, momentum=settings.momentum, weight_decay=settings.weight_decay
     )
     pairs = make_pairs(space, settings.pairs, settings.seed, progress)
-    folder.mkdir(parents=True, exist_ok=True)
-    steps = settings.epochs * (settings.pairs // settings.batch)
-    losses: list[float] = []
-    first = _resume(folder / "state.pt", network, optimizer, settings, losses)
+    steps = settings.pairs // settings.batch
+    order = np.random.default_rng(settings.seed).permutation(settings.pairs)
+    first, curve = resume(folder, network, optimizer, asdict(settings))
+    losses: list[float] = [] if curve is None else curve["loss"]
     network.train()
     for step in range(first, steps):
-        rng = np.random.default_rng([settings.seed, step])
-        some = rng.choice(len(pairs.label), settings.batch, replace=False)
-        images = torch.from_numpy(_resized(np.concatenate([pairs.left[some], pairs.right[some]]), settings.side)).to(
-            device
-        )
+        some = order[step * settings.batch :][: settings.batch]
+        masks = np.concatenate([pairs.left[some], pairs.right[some]])
+        images = torch.from_numpy(_resized(masks, settings.side)).to(device)
         with torch.autocast(device, torch.bfloat16):
             vectors = encode(network, images)
         a, b = vectors.float().chunk(2)
         similarity = F.cosine_similarity(a, b).clamp(min=0)
         loss = pair_loss(similarity, torch.from_numpy(pairs.label[some]).to(device)).mean()
         if not torch.isfinite(loss):
-            raise GeomtactError(f"training: the loss is not a number at step {step}; give a smaller rate")
+            raise GeomtactError(not_a_number(folder, step))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         losses.append(float(loss.detach()))
         if (step + 1) % _SAVE_EVERY == 0 or step + 1 == steps:
-            _save(folder / "state.pt", network, optimizer, settings, losses)
+            save_state(folder, network, optimizer, asdict(settings), step + 1, {"loss": losses})
         if progress:
             progress((step + 1) / steps, f"training ResNet-50, loss {np.mean(losses[-50:]):.4f}")
     weights = {name: value.detach().cpu().half().contiguous() for name, value in network.state_dict().items()}
-    write_whole(
-        out, lambda temporary: save_file(weights, temporary, {"architecture": ARCHITECTURE, "side": str(settings.side)})
-    )
+    meta = {
+        "architecture": THESIS,
+        "side": str(settings.side),
+        "part": space.mesh.name,
+        "part_sha256": space.mesh.sha256,
+        "sensor": space.sensor.name,
+        "sensor_sha256": space.sensor.sha256,
+    }
+    write_whole(out, lambda temporary: save_file(weights, temporary, meta))
     card = {
         "schema": "geomtact/resnet50/1",
-        "part": space.mesh.name,
-        "sha256": space.mesh.sha256,
-        "sensor": space.sensor.name,
+        **meta,
         "settings": asdict(settings),
         "device": device,
         "loss": [float(np.mean(part)) for part in np.array_split(losses, min(50, len(losses)))],
@@ -150,26 +153,3 @@ def _small_motions(n: int, radius: float, rng: np.random.Generator) -> Array:
 
 def _resized(masks: NDArray[np.bool_], side: int) -> NDArray[np.float32]:
     return np.stack([cv2.resize(m.astype(np.float32), (side, side), interpolation=cv2.INTER_LINEAR) for m in masks])
-
-
-def _save(path: Path, network: nn.Module, optimizer: Optimizer, settings: Settings, losses: list[float]) -> None:
-    state = {
-        "network": network.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "settings": asdict(settings),
-        "losses": losses,
-    }
-    write_whole(path, lambda temporary: torch.save(state, temporary))
-
-
-def _resume(path: Path, network: nn.Module, optimizer: Optimizer, settings: Settings, losses: list[float]) -> int:
-    """Bring back what :func:`_save` wrote under the same settings; the step to go on with."""
-    if not path.exists():
-        return 0
-    state = torch.load(path, weights_only=True)
-    if state["settings"] != asdict(settings):
-        return 0
-    network.load_state_dict(state["network"])
-    optimizer.load_state_dict(state["optimizer"])
-    losses.extend(state["losses"])
-    return len(losses)

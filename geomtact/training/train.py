@@ -11,7 +11,6 @@ that a posterior needs, for contacts that differ by as much as a grid cell lets 
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,16 +19,15 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
 
 from geomtact.contact_space.build import Progress
 from geomtact.contact_space.index import unpack
 from geomtact.errors import GeomtactError, InputError
-from geomtact.files import write_whole
 from geomtact.scoring.encoder import SHAPE
 from geomtact.scoring.network import Encoder
 from geomtact.training.augment import augmented
 from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, Scene
+from geomtact.training.state import not_a_number, resume, save_state
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ def train(
     Raises
     ------
     InputError
-        Too few scenes.
+        Too few scenes, or weights of another architecture to start from.
     GeomtactError
         The loss is not a number any more; the last good state stays in ``folder``.
     """
@@ -83,10 +81,17 @@ def train(
     torch.manual_seed(settings.seed)
     network = Encoder(settings.width, settings.dimension)
     if start is not None:
-        network.load_state_dict(start)
+        try:
+            network.load_state_dict(start)
+        except RuntimeError:
+            raise InputError(
+                "--start: the weights of another network; give a file that 'geomtact train' wrote"
+            ) from None
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay)
     curve = Curve([], [], [])
-    first = _resume(folder, network, optimizer, settings, curve)
+    first, earlier = resume(folder, network, optimizer, asdict(settings))
+    if earlier is not None:
+        curve = Curve(**earlier)  # type: ignore[arg-type]
     gains: list[float] = []
     for step in range(first, settings.steps):
         # every step has a seed of its own, so that a resumed run draws what an uninterrupted one does
@@ -100,21 +105,18 @@ def train(
             # one hopeless touch shall not steer the step
             (-gain.clamp(min=-8).mean() / settings.scenes_a_step).backward()
             gains.append(float(gain.detach().mean()))
-        if not math.isfinite(gains[-1]):
-            raise GeomtactError(
-                f"training: the loss is not a number at step {step}; the state of step {_kept(folder)} is kept in "
-                f"{folder}; go on with a smaller rate"
-            )
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        norm = float(torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0))
+        if not math.isfinite(norm) or not np.isfinite(gains[-settings.scenes_a_step :]).all():
+            raise GeomtactError(not_a_number(folder, step))
         optimizer.step()
         if (step + 1) % check_every == 0 or step + 1 == settings.steps:
             curve.step.append(step + 1)
             curve.training.append(float(np.mean(gains)))
             curve.validation.append(validate(network, judged, settings))
             gains = []
-            _save(folder, network, optimizer, settings, step + 1, curve)
+            save_state(folder, network, optimizer, asdict(settings), step + 1, asdict(curve))
         if progress:
-            known = f", {curve.validation[-1]:.2f} nats on unseen parts" if curve.validation else ""
+            known = f", {curve.validation[-1]:.2f} nats on unseen scenes" if curve.validation else ""
             progress((step + 1) / settings.steps, f"training the encoder{known}")
     return network.eval(), curve
 
@@ -169,49 +171,3 @@ def _unpacked(words: NDArray[np.uint64], shape: tuple[int, int]) -> torch.Tensor
 def _schedule(step: int, steps: int) -> float:
     """A short rise, then half a cosine."""
     return min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
-
-
-def _save(
-    folder: Path, network: Encoder, optimizer: torch.optim.Optimizer, settings: Settings, step: int, curve: Curve
-) -> None:
-    """All that :func:`_resume` needs, in one file that is whole or absent."""
-    folder.mkdir(parents=True, exist_ok=True)
-    tensors = {f"network.{k}": v.contiguous() for k, v in network.state_dict().items()}
-    for i, state in optimizer.state_dict()["state"].items():
-        tensors |= {f"optimizer.{i}.{k}": v.clone() for k, v in state.items()}
-    meta = {"step": str(step), "settings": json.dumps(asdict(settings)), "curve": json.dumps(asdict(curve))}
-    write_whole(folder / "state.safetensors", lambda temporary: save_file(tensors, temporary, meta))
-
-
-def _resume(folder: Path, network: Encoder, optimizer: torch.optim.Optimizer, settings: Settings, curve: Curve) -> int:
-    """Bring back what :func:`_save` wrote under the same settings; the step to go on with."""
-    path = folder / "state.safetensors"
-    meta = _meta(path)
-    if meta is None or json.loads(meta["settings"]) != asdict(settings):
-        return 0
-    tensors = load_file(path)
-    network.load_state_dict({k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")})
-    states: dict[int, dict[str, torch.Tensor]] = {}
-    for name, value in tensors.items():
-        if name.startswith("optimizer."):
-            _, i, k = name.split(".")
-            states.setdefault(int(i), {})[k] = value
-    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
-    for name, values in json.loads(meta["curve"]).items():
-        getattr(curve, name).extend(values)
-    return int(meta["step"])
-
-
-def _kept(folder: Path) -> str:
-    meta = _meta(folder / "state.safetensors")
-    return meta["step"] if meta else "0"
-
-
-def _meta(path: Path) -> dict[str, str] | None:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            return dict(file.metadata())
-    except (OSError, SafetensorError):
-        return None

@@ -1,0 +1,94 @@
+"""The state of a training that goes on after a kill, and whose it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import nn
+from torch.optim import Optimizer
+
+from geomtact.errors import InputError
+from geomtact.files import write_whole
+
+Curve = dict[str, list[float]]
+_FILE, _RECIPE = "state.safetensors", "recipe.json"
+_FREE = ("rate",)  # a setting that a resumed run may change
+
+
+def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
+    """Keep ``folder`` for the training that ``recipe`` describes, so that nothing of another one is taken for it.
+
+    Raises
+    ------
+    InputError
+        It holds another training.
+    """
+    path, wanted = folder / _RECIPE, json.loads(json.dumps(recipe))
+    if path.exists():
+        held = json.loads(path.read_text("utf-8"))
+        if held != wanted:
+            other = ", ".join(key for key in wanted if held.get(key) != wanted[key]) or "what it learns from"
+            raise InputError(
+                f"{folder}: holds another training ({other} differs); give another folder with --work, or remove this one"
+            )
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(path, lambda temporary: temporary.write_text(json.dumps(wanted, indent=1) + "\n", "utf-8"))
+
+
+def save_state(
+    folder: Path, network: nn.Module, optimizer: Optimizer, settings: Mapping[str, Any], step: int, curve: Curve
+) -> None:
+    """All that :func:`resume` needs, in one file that is whole or absent."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {f"network.{k}": v.contiguous() for k, v in network.state_dict().items()}
+    for i, state in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{i}.{k}": v.clone() for k, v in state.items() if v is not None}
+    meta = {"step": str(step), "settings": json.dumps(settings), "curve": json.dumps(curve)}
+    write_whole(folder / _FILE, lambda temporary: save_file(tensors, temporary, meta))
+
+
+def resume(
+    folder: Path, network: nn.Module, optimizer: Optimizer, settings: Mapping[str, Any]
+) -> tuple[int, Curve | None]:
+    """Bring back what :func:`save_state` wrote under the same settings: the step to go on with, 0 for none, and the curve.
+
+    Another learning rate is no hindrance: it is what a run that failed may have to change.
+    """
+    meta = _meta(folder / _FILE)
+    if meta is None or _fixed(json.loads(meta["settings"])) != _fixed(settings):
+        return 0, None
+    tensors = load_file(folder / _FILE)
+    network.load_state_dict({k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")})
+    states: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimizer."):
+            _, i, k = name.split(".")
+            states.setdefault(int(i), {})[k] = value
+    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+    return int(meta["step"]), json.loads(meta["curve"])
+
+
+def not_a_number(folder: Path, step: int) -> str:
+    """What a training says whose loss is not a number at ``step``."""
+    meta = _meta(folder / _FILE)
+    kept = f"the state of step {meta['step']} is kept in {folder}" if meta else "no state is kept yet"
+    return f"training: the loss is not a number at step {step}; {kept}; go on with a smaller --rate"
+
+
+def _fixed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if key not in _FREE}
+
+
+def _meta(path: Path) -> dict[str, str] | None:
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            return dict(file.metadata())
+    except (OSError, SafetensorError):
+        return None
