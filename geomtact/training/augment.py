@@ -2,7 +2,8 @@
 
 Every augmentation takes masks (n, 1, h, w), 0 or 1, the pixel [m] and a generator, and draws its strength anew for every
 mask; only how far the outline's warp is correlated is drawn once a batch, and the blur is cut off at four pixels. The
-elastic shrink, the unknown penetration and the shifts, turns and tilts below the grid's step are not here: they come with the scenes, as touches solved with an elastic gel at poses drawn within the cells.
+elastic shrink, the unknown penetration and the shifts, turns and tilts below the grid's step are not here: they come
+with the scenes, as touches solved with an elastic gel at poses drawn within the cells.
 """
 
 from __future__ import annotations
