@@ -7,6 +7,7 @@ from safetensors.numpy import load_file, save_file
 
 from geomtact.errors import GeomtactError, InputError
 from geomtact.geometry.mesh import load_mesh
+from geomtact.scoring.catalogue import descriptor_of
 from geomtact.scoring.encoder import BASIS, SHAPE, Tower, load_weights, moment_features, vector
 from geomtact.scoring.network import Encoder, run
 from geomtact.sensing.moments import moments
@@ -17,6 +18,7 @@ from geomtact.training.card import write_encoder
 from geomtact.training.dataset import part_scenes
 from geomtact.training.parts import random_part
 from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, make_scene
+from geomtact.training.state import claim, resume, save_state
 from geomtact.training.train import Settings, scene_gain, train
 
 TINY = Settings(steps=6, scenes_a_step=2, touches=20, stored=200, width=32, dimension=8, validation=1)
@@ -164,6 +166,55 @@ def test_nan_stops_training_and_names_what_is_kept(scenes, tmp_path, monkeypatch
         train(scenes[:1], TINY, tmp_path)
 
 
+def test_a_gradient_that_is_no_number_stops_training_before_it_is_taken(scenes, tmp_path, monkeypatch):
+    """Also where another scene of the same step has a loss that is one."""
+    calls = []
+
+    def some_gain(network, *_, **__):
+        calls.append(1)
+        return network.heads["touch"][2].bias.sum() * (torch.nan if len(calls) == 3 else 1.0)
+
+    monkeypatch.setattr("geomtact.training.train.scene_gain", some_gain)
+    with pytest.raises(
+        GeomtactError, match="not a number at step 1; no state is kept yet; go on with a smaller --rate"
+    ):
+        train(scenes, TINY, tmp_path)
+
+
+def test_a_folder_of_another_training_is_refused(tmp_path):
+    claim(tmp_path, {"part": "a", "seed": 0})
+    claim(tmp_path, {"part": "a", "seed": 0})
+    with pytest.raises(InputError, match="holds another training .part differs.; give another folder with --work"):
+        claim(tmp_path, {"part": "b", "seed": 0})
+
+
+def test_a_resumed_run_may_have_another_rate_and_nothing_else(tmp_path):
+    network = torch.nn.Linear(2, 1)
+    optimizer = torch.optim.SGD(network.parameters(), 0.1, momentum=0.5)
+    network(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    save_state(tmp_path, network, optimizer, {"rate": 0.1, "seed": 1}, 7, {"loss": [0.5]})
+    other = torch.nn.Linear(2, 1)
+    fresh = torch.optim.SGD(other.parameters(), 0.1, momentum=0.5)
+    assert resume(tmp_path, other, fresh, {"rate": 0.1, "seed": 2}) == (0, None)
+    assert resume(tmp_path, other, fresh, {"rate": 0.05, "seed": 1}) == (7, {"loss": [0.5]})
+    assert torch.equal(other.weight, network.weight)
+    assert torch.equal(fresh.state[other.weight]["momentum_buffer"], optimizer.state[network.weight]["momentum_buffer"])
+
+
+def test_weights_for_one_part_serve_no_other(weights, tmp_path, ball):
+    own = {"part": "ball", "part_sha256": ball.mesh.sha256, "sensor": "digit", "sensor_sha256": "0"}
+    path = tmp_path / "mine.safetensors"
+    save_file(weights, path, own | {"sensor_sha256": ball.sensor.sha256})
+    assert descriptor_of(str(path), ball.index) is not None
+    save_file(weights, path, own)
+    with pytest.raises(InputError, match="trained for the sensor 'digit', not for 'gelsight-mini'"):
+        descriptor_of(str(path), ball.index)
+    save_file(weights, path, {"part": "gear", "part_sha256": "1"})
+    with pytest.raises(InputError, match="trained for the part 'gear', not for 'ball'; train weights for it, or use"):
+        descriptor_of(str(path), ball.index)
+
+
 def test_scenes_are_made_once_and_repeat(tmp_path, monkeypatch):
     mesh, sensor = load_mesh("hex_nut"), Sensor.load("gelsight-mini")
     first = part_scenes(tmp_path, mesh, sensor, 100_000, 2, seed=4, processes=1)
@@ -193,6 +244,10 @@ def test_weights_are_written_read_and_refused(scenes, tmp_path):
     save_file(other, tmp_path / "other.safetensors")
     with pytest.raises(InputError, match="the weights of another network"):
         load_weights(tmp_path / "other.safetensors")
+    half = {name: value for name, value in load_file(path).items() if "stored" not in name}
+    save_file(half, tmp_path / "half.safetensors")
+    with pytest.raises(InputError, match="the weights of another network"):
+        load_weights(tmp_path / "half.safetensors")
     with pytest.raises(InputError, match="no such file"):
         load_weights(tmp_path / "none.safetensors")
 
