@@ -14,7 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # A module imports only from its own stage and from stages above it in this list; one line, one height.
 STAGES = [
-    ["errors", "files", "se3", "versions"],
+    ["errors", "files", "progress", "se3", "versions"],
     ["geometry"],
     ["sensing"],
     ["contact_space"],

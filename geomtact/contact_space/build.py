@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -18,12 +17,11 @@ from geomtact.errors import MeshError
 from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Directions
+from geomtact.progress import Progress
 from geomtact.se3 import Array, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.moments import moments
 from geomtact.sensing.sensor import Sensor
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ def build(
     assert mesh.symmetry is not None
     directions = Directions.make(mesh.symmetry, approach, resolution.level, resolution.turn_step)
     caster = Caster(mesh.vertices, mesh.faces)
-    reach = _reach(mesh)
+    reach = mesh.reach
     frame = Frame.make(reach, sensor, resolution.step)
     window = Window(sensor, resolution.mask_shape, resolution.penetrations)
     margin = 2.1 * float(np.hypot(*sensor.half_window)) + resolution.step
@@ -97,7 +95,7 @@ def choose_resolution(
     """The finest grid that ``max_poses`` affords for this object (see ``resolution.choose``)."""
     assert mesh.symmetry is not None
     directions = Directions.make(mesh.symmetry, approach, 1, 0.5)
-    caster, reach = Caster(mesh.vertices, mesh.faces), _reach(mesh)
+    caster, reach = Caster(mesh.vertices, mesh.faces), mesh.reach
     frame = Frame.make(reach, sensor, step=float(sensor.half_window.min()))
     area = 0.0
     for k, weight in enumerate(directions.weights):
@@ -193,8 +191,3 @@ def _fill(table: NDArray[np.int64]) -> NDArray[np.int64]:
     """Empty cells (-1) given the place of the nearest cell that has one."""
     nearest = distance_transform_edt(table < 0, return_distances=False, return_indices=True)
     return table[tuple(nearest)]
-
-
-def _reach(mesh: Mesh) -> float:
-    """Largest distance of the surface from the object's centre [m]."""
-    return float(np.linalg.norm(mesh.vertices - mesh.centre, axis=1).max())

@@ -104,8 +104,7 @@ class ContactSpace:
             Hardly any pose touches as the approach and the housing allow.
         """
         low, high = depths or (0.0, self.sensor.max_penetration)
-        reach = float(np.linalg.norm(self.mesh.vertices - self.mesh.centre, axis=1).max())
-        half = reach + self.sensor.half_window
+        half = self.mesh.reach + self.sensor.half_window
         found: list[Array] = []
         pressed: list[Array] = []
         for _ in range(200 + 20 * n // batch):

@@ -17,13 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from geomtact.contact_space.build import Progress, build, choose_resolution
+from geomtact.contact_space.build import build, choose_resolution
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.resolution import MAX_POSES, Resolution
 from geomtact.errors import CacheError
 from geomtact.geometry.approach import Approach, check_approach
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
+from geomtact.progress import Progress
 from geomtact.sensing.sensor import Sensor
 
 FORMAT = 5  # raise whenever a built index would differ

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from geomtact.contact_space.build import Progress
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.store import open_index
 from geomtact.evaluation import study
 from geomtact.evaluation.touches import Touch
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
+from geomtact.progress import Progress
 from geomtact.scoring.catalogue import PIXELWISE, descriptor_of
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.product import Product

@@ -101,6 +101,11 @@ class Mesh:
         return float(np.sqrt(np.average(mean_square, weights=self.areas)))
 
     @cached_property
+    def reach(self) -> float:
+        """Largest distance of the surface from :attr:`centre` [m]."""
+        return float(np.linalg.norm(self.vertices - self.centre, axis=1).max())
+
+    @cached_property
     def areas(self) -> Array:
         """(F,) area of each face [m^2]."""
         return 0.5 * np.linalg.norm(self._crosses, axis=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,6 +21,7 @@ from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
+from geomtact.progress import Progress
 from geomtact.scoring.calibration import Calibration, posterior_log_prob
 from geomtact.scoring.catalogue import DEFAULT_SCORER
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
@@ -49,7 +49,6 @@ class Effort:
 
 
 EFFORTS = {"fast": Effort("blocks", 0), "balanced": Effort("cells", 5, thorough=False), "exact": Effort("all", 25)}
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)

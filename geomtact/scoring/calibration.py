@@ -20,6 +20,7 @@ from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import CALIBRATION_NOISE, LEAST_CONTACT, draw_noise, felt_mask, spoilt
+from geomtact.progress import Progress
 from geomtact.scoring.protocol import Scorer
 from geomtact.se3 import Array
 
@@ -63,7 +64,7 @@ class Calibration:
     gain: float
 
 
-def simulate_touches(index: Index, n: int, seed: int, progress: Callable[[float, str], None] | None = None) -> Touches:
+def simulate_touches(index: Index, n: int, seed: int, progress: Progress | None = None) -> Touches:
     """``n`` touches uniform over the contact pose space, half elastic, with noise of any strength up to heavy.
 
     Poses are drawn within the cells, not at their centres: the score has to bridge what lies between.

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.build import Progress
 from geomtact.contact_space.index import Index
 from geomtact.errors import MeshError
 from geomtact.files import write_whole
+from geomtact.progress import Progress
 from geomtact.scoring.calibration import Calibration, Touches, calibrate, simulate_touches
 from geomtact.scoring.cascade import Cascade, Rows
 from geomtact.scoring.catalogue import (

@@ -12,9 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.build import Progress
 from geomtact.contact_space.index import Index
 from geomtact.files import write_whole
+from geomtact.progress import Progress
 from geomtact.scoring.overlap import to_grid
 from geomtact.sensing.moments import without_specks
 from geomtact.sensing.sensor import Sensor

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from geomtact.contact_space.build import Progress
 from geomtact.errors import MeshError
 from geomtact.files import write_whole
 from geomtact.geometry.mesh import Mesh
+from geomtact.progress import Progress
 from geomtact.sensing.sensor import Sensor
 from geomtact.training.parts import random_part
 from geomtact.training.scenes import Scene, make_scene

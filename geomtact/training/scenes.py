@@ -116,7 +116,7 @@ class _View:
     def __init__(self, mesh: Mesh, sensor: Sensor, resolution: Resolution):
         self.mesh, self.sensor, self.resolution = mesh, sensor, resolution
         self.caster = Caster(mesh.vertices, mesh.faces)
-        self.reach = float(np.linalg.norm(mesh.vertices - mesh.centre, axis=1).max())
+        self.reach = mesh.reach
         self.frame = Frame.make(self.reach, sensor, resolution.step)
         self.window = Window(sensor, resolution.mask_shape, resolution.penetrations)
         self.margin = 2.1 * float(np.hypot(*sensor.half_window)) * (1 + 2 * MARGIN) + 2 * resolution.step

@@ -13,11 +13,11 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 
-from geomtact.contact_space.build import Progress
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError
 from geomtact.files import write_whole
 from geomtact.geometry.distance import PoseDistance
+from geomtact.progress import Progress
 from geomtact.scoring.encoder import THESIS
 from geomtact.scoring.resnet import SIDE, encode, make_network
 from geomtact.se3 import Array, exp

@@ -20,9 +20,9 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from geomtact.contact_space.build import Progress
 from geomtact.contact_space.index import unpack
 from geomtact.errors import GeomtactError, InputError
+from geomtact.progress import Progress
 from geomtact.scoring.encoder import SHAPE
 from geomtact.scoring.network import Encoder
 from geomtact.training.augment import augmented
