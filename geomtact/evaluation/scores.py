@@ -88,8 +88,8 @@ def bytes_read(localizer: Localizer, effort: str) -> float:
     if effort == "fast" and fitted.cascade is not None:
         blocks = fitted.cascade.blocks
         return (blocks.narrowing.nbytes + blocks.narrowed.nbytes + blocks.constant.nbytes) / len(index)
-    scorer = fitted.thorough if effort == "exact" and fitted.thorough is not None else fitted.scorer
-    return bytes_per_pose(scorer, index)
+    exact = fitted.exact_scorer if effort == "exact" else None
+    return bytes_per_pose(exact or fitted.scorer, index)
 
 
 def bytes_per_pose(scorer: Scorer, index: Index) -> float:

@@ -37,6 +37,8 @@ Weights = dict[str, NDArray[np.float32]]
 class EncoderScorer(VectorScorer):
     """Minus the squared distance between the network's vectors of the observed and of every stored contact.
 
+    16 numbers: 64 bytes per pose, 16 multiplications to compare, 8 microseconds to describe on two cores.
+
     Attributes
     ----------
     usual : largest squared distance to the nearest stored contact that is usual for touches of the object. A contact

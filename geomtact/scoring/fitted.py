@@ -52,7 +52,7 @@ class FittedScorer:
     scorer, calibration : of the cells
     witness : tells how likely a touch of the object is at all
     cascade : of blocks and some cells, by the encoder; None for a score that has no part in it
-    thorough, exact : a scorer that counts the pixels too, and what it is worth; None where the score goes without
+    exact_scorer, exact_calibration : of one that counts the pixels too; None where the score goes without
     """
 
     name: str
@@ -60,8 +60,8 @@ class FittedScorer:
     calibration: Calibration
     witness: Witness
     cascade: Cascade | None = None
-    thorough: Scorer | None = None
-    exact: Calibration | None = None
+    exact_scorer: Scorer | None = None
+    exact_calibration: Calibration | None = None
 
     def rows(self, index: Index, mask: NDArray[np.bool_], resolved: str) -> Rows:
         """Scores of all cells under the uniform prior.
@@ -81,8 +81,8 @@ class FittedScorer:
         ``log_prior`` (N,) is the log mass of all cells, the uniform's where it is None; ``exact`` scores count the pixels too.
         """
         scorer, calibration = self.scorer, self.calibration
-        if exact and self.thorough is not None and self.exact is not None:
-            scorer, calibration = self.thorough, self.exact
+        if exact and self.exact_scorer is not None and self.exact_calibration is not None:
+            scorer, calibration = self.exact_scorer, self.exact_calibration
         cells, prior = index.possible, index.log_possible_weight
         if log_prior is not None:
             cells = np.flatnonzero(np.isfinite(log_prior))
@@ -196,17 +196,18 @@ def _from_json(name: str, data: dict[str, Any], known: dict[str, Scorer], index:
     cascade = None
     if isinstance(vectors, EncoderScorer):
         cascade = Cascade.from_json(data["cascade"], vectors, index)
-    thorough, exact = None, None
+    exact_scorer, exact_calibration = None, None
     if "exact" in data:
-        thorough, exact = _weighed(data["exact_weights"], known), Calibration(**data["exact"])
+        exact_scorer = _weighed(data["exact_weights"], known)
+        exact_calibration = Calibration(**data["exact"])
     return FittedScorer(
         name,
         _weighed(data["weights"], known),
         Calibration(**data["calibration"]),
         Witness(moments, data["usual"]),
         cascade,
-        thorough,
-        exact,
+        exact_scorer,
+        exact_calibration,
     )
 
 

@@ -26,6 +26,8 @@ _CHUNK = 1 << 15
 class Moments:
     """Student t likelihood of the observed contact's moments, given those stored for a pose.
 
+    6 numbers: 24 bytes per pose, 42 multiplications to compare.
+
     Attributes
     ----------
     bias : (6,) mean of observed minus stored

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index, pack
 
+_THREADS = 2
 _CHUNK = 1 << 15  # poses a step: the words of one chunk stay in the processor's cache
 
 
-def overlaps(bits: NDArray[np.uint64], mask: NDArray[np.bool_], threads: int = 2) -> NDArray[np.int32]:
+def overlaps(bits: NDArray[np.uint64], mask: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Number of pixels (P, n) that each of the packed masks ``bits`` (P, words, n) shares with ``mask`` (h, w)."""
     words = pack(mask.ravel())
     levels, n_words, n = bits.shape
@@ -30,14 +31,17 @@ def overlaps(bits: NDArray[np.uint64], mask: NDArray[np.bool_], threads: int = 2
                 count += np.bitwise_count(part[w] & words[w])
         out[level, start : start + _CHUNK] = count
 
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(work, [(level, start) for level in range(levels) for start in range(0, n, _CHUNK)]))
     return out
 
 
 @dataclass(frozen=True)
 class PixelL1:
-    """Share of pixels on which two masks agree: one minus the thesis's pixel distance (its baseline that fails, Fig. 8)."""
+    """Share of pixels on which two masks agree: one minus the thesis's pixel distance (its baseline that fails, Fig. 8).
+
+    The stored masks and their areas: 98 bytes per pose at 32 x 24 pixels, 386 at 64 x 48; a count of bits a word to compare.
+    """
 
     name: str = "l1"
 
@@ -50,7 +54,10 @@ class PixelL1:
 
 @dataclass(frozen=True)
 class IoU:
-    """Intersection over union."""
+    """Intersection over union.
+
+    The stored masks and their areas: 98 bytes per pose at 32 x 24 pixels, 386 at 64 x 48; a count of bits a word to compare.
+    """
 
     name: str = "iou"
 
