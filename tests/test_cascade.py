@@ -101,6 +101,38 @@ def test_a_blocks_score_is_the_mean_likelihood_of_normal_vectors(localizer, rng)
     assert same.score(index, None) == pytest.approx(one, rel=1e-3, abs=1e-3)
 
 
+def test_scores_that_are_trusted_less_are_those_of_nearer_vectors(localizer, rng):
+    """A factor a on squared distances is a factor sqrt(a) on vectors, in a block too."""
+    index, by = localizer.index, np.float32(0.3)
+    stored = rng.normal(size=(len(index), 4)).astype(np.float32)
+    seen = rng.normal(size=4).astype(np.float32)
+
+    class Far(EncoderScorer):
+        def trust(self, best):
+            return by
+
+    class Near(EncoderScorer):
+        def trust(self, best):
+            return np.float32(1)
+
+    score, trust = BlockScorer.make(Far(None, stored), index, 0.7).trusted(index, seen)
+    scaled = BlockScorer.make(Near(None, np.sqrt(by) * stored), index, 0.7)
+    assert trust == by
+    assert score == pytest.approx(scaled.trusted(index, np.sqrt(by) * seen)[0], rel=1e-3, abs=1e-3)
+
+
+def test_blocks_are_as_many_poses_as_their_cells(localizer, rng):
+    mask, _ = some_mask(localizer, rng)
+    blocks = posterior_of(localizer, localizer.scorer.rows(localizer.index, mask, "blocks"))
+    cells = spelled_out(blocks.cells, blocks.runs)
+    w = np.asarray(localizer.index.weight, float).ravel()[cells]
+    each = np.repeat(np.exp(blocks.log_prob.astype(float)), blocks.runs)
+    total = np.repeat(localizer.index.mass(blocks.cells, blocks.runs), blocks.runs)
+    p = each * w / total
+    p = p[p > 0]
+    assert blocks.effective_poses == pytest.approx(np.exp(-(p * np.log(p)).sum()), rel=1e-4)
+
+
 def test_the_heaviest_hold_their_share_and_hardly_more(rng):
     mass = np.exp(rng.normal(0, 3, 5000)).astype(np.float32)
     for share in (0.1, 0.5, 0.9, 0.99):

@@ -12,6 +12,7 @@ from geomtact.geometry.approach import approach_of
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import load_mesh
 from geomtact.inference.posterior import Posterior
+from geomtact.inference.prior import prior_log_mass
 from geomtact.se3 import exp, transform
 
 MM = 1e-3
@@ -428,3 +429,13 @@ def test_no_contact_restricts_the_prior_to_poses_that_do_not_touch(plug, uniform
         assert posterior.log_density(away)[:1] == pytest.approx(expected[:1])
     with pytest.raises(UsageError, match="expected a Posterior"):
         plug.localize(nothing, prior=3)
+
+
+def test_a_uniform_prior_of_another_grid_rules_nothing_out(plug, make_localizer):
+    """Although some stored poses lie a little off the contact pose space."""
+    index = make_localizer("connector_plug", "gelslim", max_poses=6_000).index
+    uniform = Posterior(index, index.possible, index.log_possible_weight)
+    mass = prior_log_mass(plug.index, uniform, np.eye(4), "sensor")
+    held = plug.index.possible
+    assert np.isfinite(mass[held]).all()
+    assert np.abs(mass - plug.index.log_weight)[held].max() < 0.01

@@ -47,11 +47,10 @@ def packed(masks, levels=2):
     return pack(masks[: n * levels].reshape(levels, n, -1)).swapaxes(1, 2).copy()
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_overlaps_are_what_counting_pixels_gives(rng, threads):
+def test_overlaps_are_what_counting_pixels_gives(rng):
     masks, seen = random_masks(40, rng), random_masks(5, rng)[4]
     expected = (masks & seen).sum((1, 2)).reshape(2, 20)
-    assert (overlaps(packed(masks), seen, threads) == expected).all()
+    assert (overlaps(packed(masks), seen) == expected).all()
 
 
 def test_overlaps_of_many_poses_are_each_their_own(rng):

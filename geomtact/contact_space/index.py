@@ -219,6 +219,18 @@ class Index:
         # the difference of sums has an error of its own, which a single cell need not have
         return np.where(counts == 1, one, self._mass_before[first + counts] - self._mass_before[first])
 
+    def log_share(self, first: ArrayLike, counts: ArrayLike) -> Array:
+        """Mean log (n,) of the share that a pose has of its run's measure, weighed by that measure; 0 for a single pose."""
+        first = np.asarray(first, np.int64)
+        weight = np.asarray(self.weight).reshape(-1).astype(float)
+        before = np.concatenate(
+            [[0.0], np.cumsum(np.where(weight > 0, weight * np.log(np.maximum(weight, 1e-300)), 0))]
+        )
+        mass = self.mass(first, counts)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mean = (before[first + counts] - before[first]) / mass - np.log(mass)
+        return np.where((np.asarray(counts) > 1) & (mass > 0), mean, 0.0)
+
     def within_runs(self, first: ArrayLike, counts: ArrayLike, share: ArrayLike) -> NDArray[np.int64]:
         """The pose id (n,) up to which a run of poses holds ``share`` (n,), 0 to 1, of the run's measure."""
         first = np.asarray(first, np.int64)

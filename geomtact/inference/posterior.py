@@ -140,7 +140,7 @@ class Posterior:
     def effective_poses(self) -> float:
         """How many equally likely cells would be as uncertain: exp of the discrete entropy."""
         p = self._probability
-        each = self.log_prob if self.runs is None else self.log_prob - np.log(self.runs)
+        each = self.log_prob if self.runs is None else self.log_prob + self.index.log_share(self.cells, self.runs)
         return float(np.exp(-(p @ np.where(p > 0, each, 0.0)))) if len(p) else 0.0
 
     def modes(self, k: int = 5) -> list[Mode]:

@@ -123,7 +123,7 @@ def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: 
             raise InputError("prior: it says that the object does not touch the sensor, but this image shows a contact")
         return prior.cell_log_density(np.arange(len(index)))
     # the prior's own sensor saw the object at some depth: casting it there decides what was ruled out
-    return _by_chunks(index, lambda T: prior.log_density(T_frame_sensor @ T))
+    return _by_chunks(index, lambda T: prior.log_density(T_frame_sensor @ T), settled=True)
 
 
 def _of_poses(index: Index, poses: Any, log_masses: Any, T_frame_sensor: Array) -> Array:
@@ -175,10 +175,23 @@ def _over_images(index: Index, density: LogDensity) -> Array:
     return _by_chunks(index, density if len(images) == 1 else mean)
 
 
-def _by_chunks(index: Index, density: LogDensity) -> Array:
-    """``density`` at the pose of every cell (N,)."""
+def _by_chunks(index: Index, density: LogDensity, settled: bool = False) -> Array:
+    """``density`` at the pose of every cell (N,).
+
+    With ``settled``, where it is -inf at a pose that lies a little off the contact pose space, that pose brought to the
+    penetration of its cell counts.
+    """
+    space, depths = ContactSpace(index.mesh, index.sensor, index.approach), np.array(index.resolution.penetrations)
     out = np.zeros(len(index))
     for start in range(0, len(index), _CHUNK):
         ids = np.arange(start, min(start + _CHUNK, len(index)))
-        out[ids] = density(index.poses(ids))
+        T = index.poses(ids)
+        out[ids] = density(T)
+        if settled:
+            off = np.flatnonzero(out[ids] == -np.inf)
+            if not len(off):
+                continue
+            off = off[~np.isfinite(space.penetration(T[off]))]
+            moved, ok = space.settle(T[off], depths[ids[off] // index.places])
+            out[ids[off[ok]]] = density(moved[ok])
     return out

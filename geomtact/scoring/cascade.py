@@ -23,6 +23,7 @@ from geomtact.scoring.calibration import Calibration, Touches, best_floor, calib
 from geomtact.scoring.encoder import EncoderScorer
 
 SHARE = 0.98  # of the mass, that is scored cell by cell
+_LEADING = 64  # blocks among whose cells the best is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +59,23 @@ class BlockScorer:
         return cls(cells, _single(narrow), _single(narrow * middle), _single(constant), temperature)
 
     def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Score (P B,) of every block: the temperature times the log of the mean of exp(score / temperature)."""
-        out = self.of(self.cells.seen(index, mask))
-        return out * self.cells.trust(float(out.max()))
+        """Score (P B,) of every block: under the normal model, the temperature times the log of the mean of
+        exp(score / temperature) over its cells."""
+        return self.trusted(index, self.cells.seen(index, mask))[0]
 
-    def of(self, seen: NDArray[np.float32]) -> NDArray[np.float32]:
-        """As :meth:`score`, before it is trusted, for the vector (d,) of the observed contact."""
-        return np.asarray(self.constant + self.narrowed @ (2 * seen) - self.narrowing @ seen**2)
+    def trusted(self, index: Index, seen: NDArray[np.float32]) -> tuple[NDArray[np.float32], np.float32]:
+        """As :meth:`score`, for the vector ``seen`` (d,) of the observed contact, and how far the scores are trusted."""
+        out = np.asarray(self.constant + self.narrowed @ (2 * seen) - self.narrowing @ seen**2)
+        first, counts = index.block_runs
+        leading = np.sort(np.argpartition(-out, min(_LEADING, len(out) - 1))[:_LEADING])
+        trust = self.cells.trust(float(self.cells.of(spelled_out(first[leading], counts[leading]), seen).max()))
+        return (out, trust) if trust == 1 else (self._scaled(seen, trust), trust)
+
+    def _scaled(self, seen: NDArray[np.float32], by: np.float32) -> NDArray[np.float32]:
+        """The scores (P B,) of the blocks when those of the cells are multiplied ``by`` a factor."""
+        narrow = self.narrowing / (self.narrowing + by * (1 - self.narrowing))
+        off = seen - self.narrowed / self.narrowing
+        return np.asarray(0.5 * self.temperature * np.log(narrow).sum(1) - by * (narrow * off**2).sum(1))
 
 
 @dataclass(frozen=True)
@@ -143,18 +154,18 @@ class Cascade:
         """Blocks, and cell by cell those of them that hold ``SHARE`` of the mass."""
         first, counts = index.block_runs
         seen = self.blocks.cells.seen(index, mask)
-        score, prior = self.blocks.of(seen), index.log_block_weight
+        score, trust = self.blocks.trusted(index, seen)
+        prior = index.log_block_weight
         log_prob = posterior_log_prob(score, prior, replace(self.coarse, floor=0.0))
         chosen = heaviest(np.exp(log_prob), SHARE)
         length = np.where(chosen, counts, 1)
         ids = spelled_out(first, length)
         runs = np.ones(len(ids), np.int64)
-        cell_score, cell_prior = self.blocks.cells.of(ids, seen), index.log_weight[ids]
+        cell_score, cell_prior = trust * self.blocks.cells.of(ids, seen), index.log_weight[ids]
         # the blocks that stay whole were scored as the cells that they begin with
         at, whole = (np.cumsum(length) - length)[~chosen], ~chosen
         runs[at], cell_score[at], cell_prior[at] = counts[whole], score[whole], prior[whole]
         assert self.partly is not None
-        cell_score *= self.blocks.cells.trust(float(cell_score.max()))
         return _possible(Rows(ids, runs, cell_score, cell_prior, self.partly, self.blocks.cells.name))
 
 

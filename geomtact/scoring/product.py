@@ -44,7 +44,8 @@ class Product:
 class Comparison:
     """Scores of the same touches at some places of an index, drawn at random, and at the true ones.
 
-    Each drawn place stands for many; the true ones are there to be scored, and carry no mass.
+    Each drawn place stands for many, each true one for itself: however much a score tells, it cannot gain more than the
+    truth's own mass leaves.
     """
 
     def __init__(self, index: Index, touches: Touches, seed: int = 0):
@@ -55,8 +56,9 @@ class Comparison:
         self.masks, self._ids = touches.masks[:_TOUCHES], np.arange(len(index.height))[:, None] * index.places + places
         self._index = index.at_places(places)
         weight = self._index.weight.astype(float)
-        weight[:, len(some) :] = 0
-        self._weight = weight.ravel() / weight.sum()
+        drawn = weight[:, : len(some)]
+        drawn *= (1 - weight[:, len(some) :].sum()) / drawn.sum()
+        self._weight = weight.ravel()
         self._true = level * len(places) + len(some) + np.arange(len(true))
         self._scores: dict[str, list[NDArray[np.float32]]] = {}
 
