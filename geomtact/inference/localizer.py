@@ -166,8 +166,8 @@ class Localizer:
         if prior is None and likeliest < self.scorer.witness.usual:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
         with _timed(timing, "refine"):
-            refined = self._refinery.refine(posterior, mask, EFFORTS[effort].modes, EFFORTS[effort].thorough)
-        return replace(posterior, refined=refined, warnings=warnings)
+            posterior = self._refinery.refine(posterior, mask, EFFORTS[effort].modes, EFFORTS[effort].thorough)
+        return replace(posterior, warnings=warnings)
 
     def simulate(self, T_sensor_object: Any) -> Contact:
         """What the sensor would see at a pose (4, 4), without noise (thesis 6.1.3)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -153,6 +153,16 @@ class Posterior:
         """Pose ids (m,) of the index at the heart of the ``k`` leading modes, weighed by the most probable cells alone."""
         found = self._grown(k, full=False) if self.contact and k > 0 else []
         return np.array([cell for cell, _ in found], np.int64)
+
+    def shared_anew(self, cells: NDArray[np.int64], log_likelihood: ArrayLike) -> Posterior:
+        """The posterior in which what the runs that hold ``cells`` (n,) have together is shared out among them again, each
+        getting what it had times exp(``log_likelihood``) (n,), up to a constant."""
+        row, first = np.unique(self._rows_of(cells)[0], return_index=True)
+        before = self.log_prob[row].astype(float)
+        after = before + np.asarray(log_likelihood, float)[first]
+        log_prob = self.log_prob.copy()
+        log_prob[row] = after + np.logaddexp.reduce(before) - np.logaddexp.reduce(after)
+        return replace(self, log_prob=log_prob)
 
     def log_density(self, T: ArrayLike) -> Any:
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.

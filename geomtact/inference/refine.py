@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Refiner, Surface
 from geomtact.registration.rim import make_problem
+from geomtact.scoring.likelihood import cast_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array
 from geomtact.sensing.moments import moments, without_specks
@@ -23,6 +24,7 @@ from geomtact.sensing.moments import moments, without_specks
 _SURFACE_POINTS, _FEWER_POINTS = 30_000, 12_000  # of the object, in a thorough refinement and in a quick one
 _LEAST_TURN = 0.02  # rad
 _RIM = 120  # points of the contact's outline, at most; half of them unless the refinement is to be thorough
+_TRUST = 0.5  # of a likelihood at one pose, in weighing the cells around several
 _SHAPE = (36, 48)  # of the casts that judge a refinement
 
 
@@ -52,18 +54,17 @@ class Refinery:
             return [Icp(self._sparse_surface, spread)]
         return [FilterReg(self._surface, spread), Icp(self._surface, spread)]
 
-    def refine(
-        self, posterior: Posterior, mask: NDArray[np.bool_], k: int, thorough: bool = True
-    ) -> dict[int, Refined]:
-        """The ``k`` leading modes of ``posterior`` refined against the observed ``mask`` (h, w), by pose id.
+    def refine(self, posterior: Posterior, mask: NDArray[np.bool_], k: int, thorough: bool = True) -> Posterior:
+        """``posterior`` with its ``k`` leading modes refined against the observed ``mask`` (h, w), and weighed anew.
 
         Of the cell's own pose, the same with the contact's centroid moved onto the observed one, and what each
-        registration makes of that, the pose that agrees best with the observed contact is kept: a refinement that
-        does not raise a mode's agreement is dropped.
+        registration makes of that, the pose at which the observed contact is most likely is kept: a refinement that
+        does not raise it is dropped. What the cells of these modes hold together is then shared out among them by how
+        likely the contact is at each.
         """
         cells = posterior.leading_cells(k)
         if not len(cells):
-            return {}
+            return posterior
         index, sensor = posterior.index, self.space.sensor
         contact = without_specks(mask, sensor)
         problem = make_problem(contact, sensor, max_points=_RIM if thorough else _RIM // 2)
@@ -71,8 +72,8 @@ class Refinery:
         candidates = [start, self._centred(posterior, contact, cells, start)]
         refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index, thorough)]
         poses = np.stack([*candidates, *(r.T for r in refinements)])
-        winner = self._best(contact, poses)
-        out = {}
+        winner, likelihood = self._best(contact, poses)
+        refined = {}
         for i, cell in enumerate(cells):
             best = int(winner[i])
             T = poses[best, i]
@@ -80,38 +81,30 @@ class Refinery:
             if best >= len(candidates):
                 found = refinements[best - len(candidates)]
                 covariance, observable = found.covariance[i], found.observable[i]
-            out[int(cell)] = Refined(T, covariance, observable, problem.length, best > 0)
-        return out
+            refined[int(cell)] = Refined(T, covariance, observable, problem.length, best > 0)
+        return replace(posterior.shared_anew(cells, _TRUST * likelihood), refined=refined)
 
-    def _best(self, mask: NDArray[np.bool_], poses: Array) -> NDArray[np.int64]:
-        """Which of the poses (c, n, 4, 4) agrees best with ``mask``, for each of n modes; the first where none touches."""
+    def _best(self, mask: NDArray[np.bool_], poses: Array) -> tuple[NDArray[np.int64], Array]:
+        """At which of the poses (c, n, 4, 4) ``mask`` is most likely, for each of n modes, the first where none touches;
+        and how likely (n,)."""
         # a rejected refinement is its own start: each pose is cast once
         different, which = np.unique(poses.reshape(-1, 16), axis=0, return_inverse=True)
-        merit = self.agreement(mask, different.reshape(-1, 4, 4))[which.ravel()].reshape(poses.shape[:2])
+        merit = self.log_likelihood(mask, different.reshape(-1, 4, 4))[which.ravel()].reshape(poses.shape[:2])
         todo = np.arange(poses.shape[1])
         while len(todo):  # only winners are asked whether they touch, which costs more
             best = merit[:, todo].argmax(0)
             off = ~np.isfinite(self.space.penetration(poses[best, todo])) & np.isfinite(merit[best, todo])
             merit[best[off], todo[off]] = -np.inf
             todo = todo[off]
-        return np.asarray(merit.argmax(0))
+        best = merit.argmax(0)
+        return best, merit[best, np.arange(len(best))]
 
-    def agreement(self, mask: NDArray[np.bool_], T: ArrayLike) -> Array:
-        """How well the contact cast at poses ``T`` (n, 4, 4) agrees with ``mask``, 0 to 1.
-
-        Intersection over union, at the depth of contour that agrees best: an elastic gel touches less than the part
-        of the object below the membrane, by an unknown depth.
-        """
-        T = np.asarray(T, float)
+    def log_likelihood(self, mask: NDArray[np.bool_], T: ArrayLike) -> Array:
+        """Log likelihood (n,) of ``mask`` given the contact cast at poses ``T`` (n, 4, 4)."""
         sensor = self.space.sensor
-        seen = to_grid(mask, self._shape).ravel()
-        depth = self.space.caster.depths(sensor, T, self._shape).reshape(len(T), -1)
-        out = np.zeros(len(T))
-        for share in (0.0, 0.25, 0.5):
-            felt = depth > np.maximum(depth.max(1, keepdims=True), 0) * share
-            union = (felt | seen).sum(1)
-            out = np.maximum(out, (felt & seen).sum(1) / np.maximum(union, 1))
-        return out
+        seen = to_grid(mask, self._shape)
+        depths = self.space.caster.depths(sensor, np.asarray(T, float), self._shape)
+        return cast_log_likelihood(depths, seen, float(4 * sensor.half_window.prod() / seen.size))
 
     def _centred(self, posterior: Posterior, contact: NDArray[np.bool_], cells: NDArray[np.int64], T: Array) -> Array:
         """``T`` shifted in the membrane's plane, by at most a lattice step, towards the observed centroid."""
