@@ -127,7 +127,7 @@ def test_a_constant_prior_is_none(localizer, a_touch):
     mask = a_touch(localizer)[1]
     none = localizer.localize(mask)
     for c in (0.0, 7.0):
-        constant = localizer.localize(mask, effort="fast", prior=lambda T, c=c: np.full(len(T), c))
+        constant = localizer.localize(mask, prior=lambda T, c=c: np.full(len(T), c))
         assert (constant.cells == none.cells).all()
         assert constant.log_prob == pytest.approx(none.log_prob, abs=1e-4)
         assert constant.log_evidence == pytest.approx(none.log_evidence, abs=1e-4)

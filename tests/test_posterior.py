@@ -387,3 +387,21 @@ def test_a_truncated_posterior_is_refused(plug, posteriors, tmp_path):
     (tmp_path / "p.npz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="not a posterior that geomtact saved"):
         Posterior.load(tmp_path / "p.npz")
+
+
+def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_touch):
+    """In cells and in blocks; all others keep what they have."""
+    mask = a_touch(ball)[1]
+    for effort in ("fast", "exact"):
+        before = ball.localize(mask, effort=effort)
+        before = replace(before, refined={})
+        row = np.argsort(-before.log_prob)[:4]
+        likelihood = np.array([3.0, 0.0, -2.0, 1.0])
+        after = before.shared_anew(before.cells[row], likelihood)
+        p, q = (np.exp(x.log_prob.astype(float)) for x in (before, after))
+        assert q[row] / q[row].sum() == pytest.approx(
+            p[row] * np.exp(likelihood) / (p[row] @ np.exp(likelihood)), rel=1e-4
+        )
+        assert q[row].sum() == pytest.approx(p[row].sum(), rel=1e-5)
+        others = np.setdiff1d(np.arange(len(p)), row)
+        assert (after.log_prob[others] == before.log_prob[others]).all()
