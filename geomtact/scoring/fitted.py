@@ -34,7 +34,7 @@ from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import describe_index
 from geomtact.scoring.witness import Witness
 
-FORMAT = 7
+FORMAT = 8
 _COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
 _LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than choosing which
 _USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual
@@ -172,12 +172,14 @@ def _fit(name: str, known: dict[str, Scorer], moments: Moments, index: Index, to
         comparison = Comparison(index, touches)
         candidates = {each: known[each] for each in (ENCODER, "moments", "iou")}
         # on a large grid a further score has to be worth its time
-        data["weights"] = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
+        data["weights"], _ = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
         more = {**candidates, "likelihood": known["likelihood"]}
-        data["exact_weights"] = choose(comparison, more, least=0.02, start=data["weights"])
-        data["exact"] = asdict(calibrate(_weighed(data["exact_weights"], known), index, touches))
+        data["exact_weights"], exact = choose(comparison, more, least=0.02, start=data["weights"])
+        data["exact"] = asdict(exact)
     calibration = calibrate(_weighed(data["weights"], known), index, touches)
     data["calibration"] = asdict(calibration)
+    if name == DEFAULT_SCORER and data["exact_weights"] == data["weights"]:
+        data["exact"] = data["calibration"]
     vectors = known[vectors_name(name)]
     if isinstance(vectors, EncoderScorer):
         alone = list(data["weights"]) == [vectors_name(name)]

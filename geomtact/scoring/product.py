@@ -76,8 +76,9 @@ class Comparison:
 
 def choose(
     comparison: Comparison, candidates: Mapping[str, Scorer], least: float, start: Mapping[str, float] | None = None
-) -> dict[str, float]:
-    """The scores that together gain most, and the weight of each: one more is taken while it adds ``least`` nats.
+) -> tuple[dict[str, float], Calibration]:
+    """The scores that together gain most, with the weight of each, and what they are worth: one more is taken while it adds
+    ``least`` nats.
 
     The first of the candidates is preferred as long as none gains ``least`` more; ``start`` is a choice to go on from.
     """
@@ -106,4 +107,4 @@ def choose(
         if worth[best_trial].gain < reached.gain + least:
             break
         chosen, reached = trials[best_trial], worth[best_trial]
-    return chosen
+    return chosen, reached
