@@ -189,10 +189,9 @@ def _print(figures: dict[tuple[str, str], dict[str, Any]]) -> None:
     print_table([*headings, "wrong", "ms"], rows, {*headings[2:], "wrong", "ms"})
     rows = []
     for names, f in figures.items():
-        inside = [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in f["coverage"]]
-        rows.append([*names, *inside])
+        rows.append([*names, *study_file.inside(f)])
     typer.echo("Percentage of truths inside the region of each mass, with 95 % intervals")
-    masses = [f"in {100 * c['nominal']:.0f} %" for c in f["coverage"]]
+    masses = study_file.masses()
     print_table(["part", "touches", *masses], rows, masses)
 
 

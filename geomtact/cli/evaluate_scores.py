@@ -221,8 +221,8 @@ def _print_classes(classes: Mapping[str, Mapping[str, Any]]) -> None:
     rows = []
     for name, kinds in classes.items():
         for kind, f in kinds.items():
-            rows.append([name, kind, str(f["n"]), _number(f["gain_mean"], 2), *_inside(f)])
-    masses = _masses()
+            rows.append([name, kind, str(f["n"]), _number(f["gain_mean"], 2), *study_file.inside(f)])
+    masses = study_file.masses()
     typer.echo("By kind of contact: percentage of truths inside the region of each mass, with 99 % intervals")
     print_table(["score", "contact", "n", "gain [nats]", *masses], rows, ["n", "gain [nats]", *masses])
 
@@ -267,21 +267,10 @@ def _print_coverage(tables: Mapping[str, Mapping[str, Any]]) -> None:
     rows = []
     for title, entries in tables.items():
         for name, _, f in _groups(entries):
-            rows.append([title, name, str(f["n"]), *_inside(f)])
+            rows.append([title, name, str(f["n"]), *study_file.inside(f)])
     typer.echo("Percentage of truths inside the region of each mass, with 95 % intervals")
-    masses = _masses()
+    masses = study_file.masses()
     print_table(["part", "score", "n", *masses], rows, ["n", *masses])
-
-
-def _masses() -> list[str]:
-    from geomtact.evaluation.study import NOMINAL
-
-    return [f"in {100 * mass:.0f} %" for mass in NOMINAL]
-
-
-def _inside(figures: Mapping[str, Any]) -> list[str]:
-    """Percentage of truths inside the region of each mass, with its interval."""
-    return [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in figures["coverage"]]
 
 
 def _groups(entries: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -77,3 +77,15 @@ def save(out: Path | None, content: dict[str, Any]) -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
         text = to_text(content)
         write_whole(out, lambda path: path.write_text(text, "utf-8"))
+
+
+def masses() -> list[str]:
+    """Headings of :func:`inside`."""
+    from geomtact.evaluation.study import NOMINAL
+
+    return [f"in {100 * mass:.0f} %" for mass in NOMINAL]
+
+
+def inside(figures: Mapping[str, Any]) -> list[str]:
+    """Percentage of truths inside the region of each mass, with its interval."""
+    return [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in figures["coverage"]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -59,7 +59,7 @@ def train(
         return
     from geomtact.training import dataset
     from geomtact.training.card import read_weights, write_encoder
-    from geomtact.training.state import claim
+    from geomtact.training.state import claim, whose
     from geomtact.training.train import Settings
     from geomtact.training.train import train as run
 
@@ -70,7 +70,12 @@ def train(
             n = scenes or 600
             claim(work, recipe | {"start": _sha256(start)})
             made = dataset.shared_scenes(work / "scenes", n, seed, progress)
-            data = {"parts": "procedural", "sensors": dataset.SENSORS, "sizes": dataset.SIZES, "poses": dataset.POSES}
+            data: dict[str, Any] = {
+                "parts": "procedural",
+                "sensors": dataset.SENSORS,
+                "sizes": dataset.SIZES,
+                "poses": dataset.POSES,
+            }
         else:
             from geomtact.contact_space.resolution import MAX_POSES
             from geomtact.geometry.mesh import load_mesh
@@ -82,7 +87,7 @@ def train(
             start = start or WEIGHTS
             claim(work, recipe | {"part": mesh.sha256, "sensor": gel.sha256, "start": _sha256(start)})
             made = dataset.part_scenes(work / "scenes", mesh, gel, MAX_POSES, n, seed, progress)
-            data = {"part": mesh.name, "part_sha256": mesh.sha256, "sensor": gel.name, "sensor_sha256": gel.sha256}
+            data = whose(mesh, gel)
             settings = replace(settings, steps=steps or 600, rate=_TUNING_RATE, validation=max(n // 8, 5))
         if rate is not None:
             settings = replace(settings, rate=rate)

@@ -17,7 +17,7 @@ from geomtact.evaluation.touches import Touch
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
 from geomtact.progress import Progress
-from geomtact.scoring.catalogue import PIXELWISE, descriptor_of
+from geomtact.scoring.catalogue import PIXELWISE
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.product import Product
 from geomtact.scoring.protocol import Scorer
@@ -74,7 +74,7 @@ def prepare(
         mesh, sensor=sensor, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir, progress=watch
     )
     described = watch.of("describing")
-    stores = descriptor_of(scorer, localizer.index) is not None
+    stores = isinstance(localizer.scorer.scorer, VectorScorer) or localizer.scorer.cascade is not None
     return localizer, {
         "index": index_s,
         "describe": None if stores and not described else described,

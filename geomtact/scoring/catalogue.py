@@ -51,8 +51,9 @@ def descriptor_of(name: str, index: Index) -> tuple[Descriptor, type[VectorScore
     if not name.endswith(_WEIGHTS_FILE) and vectors_name(name) != ENCODER:
         return None
     path = Path(name) if name.endswith(_WEIGHTS_FILE) else WEIGHTS
-    _check_whose(path, index)
-    if about(path).get("architecture") == THESIS:
+    said = about(path)
+    _check_whose(path, said, index)
+    if said.get("architecture") == THESIS:
         from geomtact.scoring.resnet import CosineScorer, load_resnet  # it needs torch, a touch by the encoder does not
 
         return load_resnet(path), CosineScorer
@@ -60,8 +61,7 @@ def descriptor_of(name: str, index: Index) -> tuple[Descriptor, type[VectorScore
     return Tower(load_weights(path), cell_size(index.sensor, index.resolution.step, swing)), EncoderScorer
 
 
-def _check_whose(path: Path, index: Index) -> None:
-    said = about(path)
+def _check_whose(path: Path, said: dict[str, str], index: Index) -> None:
     for what, given in (("part", index.mesh), ("sensor", index.sensor)):
         if said.get(f"{what}_sha256", given.sha256) != given.sha256:
             raise InputError(

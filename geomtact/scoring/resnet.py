@@ -40,8 +40,7 @@ class Resnet:
 
     def describe(self, masks: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.float32]:
         """Unit vectors (m, 1000) of masks (m, h, w)."""
-        size = (self.side, self.side)
-        images = np.stack([cv2.resize(m.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) for m in masks])
+        images = resized(masks, self.side)
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
             parts = [
                 encode(self.network, torch.from_numpy(images[i : i + _BATCH])).float()
@@ -99,6 +98,11 @@ def make_network(numbers: int = NUMBERS) -> nn.Module:
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
     return network
+
+
+def resized(masks: NDArray[np.bool_], side: int) -> NDArray[np.float32]:
+    """Images (n, side, side) of masks (n, h, w), as the network is given them."""
+    return np.stack([cv2.resize(m.astype(np.float32), (side, side), interpolation=cv2.INTER_LINEAR) for m in masks])
 
 
 def encode(network: nn.Module, images: torch.Tensor) -> torch.Tensor:

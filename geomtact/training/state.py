@@ -15,10 +15,22 @@ from torch.optim import Optimizer
 
 from geomtact.errors import InputError
 from geomtact.files import write_whole
+from geomtact.geometry.mesh import Mesh
+from geomtact.sensing.sensor import Sensor
 
 Curve = dict[str, list[float]]
 _FILE, _RECIPE = "state.safetensors", "recipe.json"
 _FREE = ("rate",)  # a setting that a resumed run may change
+
+
+def whose(mesh: Mesh, sensor: Sensor) -> dict[str, str]:
+    """What weights for one part on one sensor say of themselves."""
+    return {
+        "part": mesh.name,
+        "part_sha256": mesh.sha256,
+        "sensor": sensor.name,
+        "sensor_sha256": sensor.sha256,
+    }
 
 
 def claim(folder: Path, recipe: Mapping[str, Any]) -> None:

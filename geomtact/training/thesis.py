@@ -6,7 +6,6 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -19,9 +18,9 @@ from geomtact.files import write_whole
 from geomtact.geometry.distance import PoseDistance
 from geomtact.progress import Progress
 from geomtact.scoring.encoder import THESIS
-from geomtact.scoring.resnet import SIDE, encode, make_network
+from geomtact.scoring.resnet import SIDE, encode, make_network, resized
 from geomtact.se3 import Array, exp
-from geomtact.training.state import not_a_number, resume, save_state
+from geomtact.training.state import not_a_number, resume, save_state, whose
 
 NEAR, FAR = 5e-3, 20e-3  # m: pose distance of positive pairs at most, of negative pairs at least
 SLACK = 0.3  # a similarity up to which a negative pair costs nothing
@@ -108,7 +107,7 @@ def train_thesis(
     for step in range(first, steps):
         some = order[step * settings.batch :][: settings.batch]
         masks = np.concatenate([pairs.left[some], pairs.right[some]])
-        images = torch.from_numpy(_resized(masks, settings.side)).to(device)
+        images = torch.from_numpy(resized(masks, settings.side)).to(device)
         with torch.autocast(device, torch.bfloat16):
             vectors = encode(network, images)
         a, b = vectors.float().chunk(2)
@@ -128,10 +127,7 @@ def train_thesis(
     meta = {
         "architecture": THESIS,
         "side": str(settings.side),
-        "part": space.mesh.name,
-        "part_sha256": space.mesh.sha256,
-        "sensor": space.sensor.name,
-        "sensor_sha256": space.sensor.sha256,
+        **whose(space.mesh, space.sensor),
     }
     write_whole(out, lambda temporary: save_file(weights, temporary, meta))
     card = {
@@ -149,7 +145,3 @@ def _small_motions(n: int, radius: float, rng: np.random.Generator) -> Array:
     xi = rng.normal(size=(n, 6)) * np.repeat([1 / radius, 1.0], 3)
     size = NEAR * rng.random((n, 1)) / np.sqrt(6)
     return exp(xi * size)
-
-
-def _resized(masks: NDArray[np.bool_], side: int) -> NDArray[np.float32]:
-    return np.stack([cv2.resize(m.astype(np.float32), (side, side), interpolation=cv2.INTER_LINEAR) for m in masks])
