@@ -45,10 +45,9 @@ def make_localizer(cache_dir):
     from geomtact import Localizer
     from geomtact.scoring import fitted
 
-    def make(mesh, sensor, approach=None, max_poses=20_000, touches=(80, 40), **options):
+    def make(mesh, sensor, approach=None, max_poses=20_000, touches=120, **options):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(fitted, "_FIT", touches[0])
-            patch.setattr(fitted, "_JUDGE", touches[1])
+            patch.setattr(fitted, "_TOUCHES", touches)
             options = {"cache_dir": cache_dir, **options}
             return Localizer.prepare(mesh, sensor=sensor, approach=approach, max_poses=max_poses, **options)
 
@@ -65,7 +64,7 @@ def curved_sensor():
 @pytest.fixture(scope="session")
 def plug(make_localizer):
     """A part without symmetry."""
-    return make_localizer("connector_plug", "gelslim", max_poses=20_000, touches=(160, 80))
+    return make_localizer("connector_plug", "gelslim", max_poses=20_000, touches=240)
 
 
 @pytest.fixture(scope="session")

@@ -221,7 +221,7 @@ def test_a_prior_in_the_world_frame_says_the_same(plug, a_touch):
 
 def test_a_posterior_of_another_touch_in_the_world_is_a_prior(make_localizer):
     """Two sensors' poses, one ball: the first touch tells the second where the ball is."""
-    ball = make_localizer("ball", "gelsight-mini", max_poses=4000, touches=(40, 20))
+    ball = make_localizer("ball", "gelsight-mini", max_poses=4000, touches=60)
     ball_in_world = transform(np.eye(3), [0.2, 0.1, 0.3])
     first = ball_in_world @ np.linalg.inv(transform(np.eye(3), [2 * MM, 1 * MM, 5 * MM]))
     second = ball_in_world @ np.linalg.inv(transform(np.eye(3), [-3 * MM, 2 * MM, 5.3 * MM]))
@@ -332,7 +332,7 @@ def test_the_order_of_vertices_and_faces_does_not_matter(make_localizer, rng):
     where = np.argsort(order)
     shuffled = replace(mesh, vertices=mesh.vertices[order], faces=where[mesh.faces][rng.permutation(len(mesh.faces))])
     sensor = Sensor("small", (64, 48), (0.3 * MM, 0.3 * MM), 0.0, 2 * MM)
-    a, b = (make_localizer(m, sensor, max_poses=4000, touches=(40, 20)) for m in (mesh, shuffled))
+    a, b = (make_localizer(m, sensor, max_poses=4000, touches=60) for m in (mesh, shuffled))
     assert a.index.key != b.index.key
     T = a.space.sample(3, np.random.default_rng(0), (0.5 * MM, 1 * MM))[0]
     for pose in T:

@@ -110,6 +110,25 @@ def test_pose_on_a_corner_comes_nearer_in_what_the_contact_tells(refiner, part, 
     assert end_distance < 0.75 * start_distance
 
 
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_a_sparse_surface_costs_accuracy_but_not_belief(refiner):
+    """Points farther apart than the rim's noise: the rim still lies on the surface between them."""
+    ended, believed = [], []
+    for n in (40000, 3000):
+        surface, caster = scene(stepped_block(), n)
+        assert (surface.spacing > 0.5e-3) == (n == 3000)
+        for seed in range(20):
+            rng = np.random.default_rng(seed)
+            T = facing_down(*rng.uniform([-4e-3, -3e-3], [4e-3, 3e-3]), 0.8e-3, 9e-3, (0, 0), rng.uniform(0, 6))
+            problem = make_problem(touch(caster, T), SENSOR)
+            result = refiner(surface, SPREAD).refine(problem, off(T, problem, rng)[None])
+            ended.append(told_error(result, T, result.T[0]))
+            believed.append(result.converged[0])
+    dense, sparse = np.median(np.reshape(ended, (2, 20)), 1)
+    assert np.mean(believed[20:]) >= 0.9 * np.mean(believed[:20])
+    assert sparse < 2 * dense + 0.1e-3
+
+
 def test_covariance_covers_the_error_where_the_model_holds(block):
     """Errors in units of the stated covariance are those of six normal variables, or smaller."""
     surface, caster = block

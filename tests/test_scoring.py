@@ -158,12 +158,22 @@ def test_moments_of_anything_are_finite():
 
 def test_dust_is_dropped_beside_a_large_contact_and_kept_alone():
     large, speck = ellipse(), ellipse(7, 5, 0.15, 0.15)
-    assert (without_specks(large | speck, SENSOR) == large).all()
-    assert (without_specks(speck, SENSOR) == speck).all()
+    assert (without_specks(large | speck, SENSOR.pixel_area((240, 320))) == large).all()
+    assert (without_specks(speck, SENSOR.pixel_area((240, 320))) == speck).all()
     two = ellipse(-4, 0, 2, 2) | ellipse(4, 0, 2, 2)
-    assert (without_specks(two, SENSOR) == two).all()
+    assert (without_specks(two, SENSOR.pixel_area((240, 320))) == two).all()
     nothing = np.zeros((240, 320), bool)
-    assert (without_specks(nothing, SENSOR) == nothing).all()
+    assert (without_specks(nothing, SENSOR.pixel_area((240, 320))) == nothing).all()
+
+
+def test_dust_is_found_however_much_of_it_there_is():
+    """Beside a contact, as many single pixels as fit: more than labels of 16 bits could tell apart, in the larger image."""
+    for h, w in ((400, 400), (640, 640)):
+        mask = np.zeros((h, w), bool)
+        mask[::2, ::2] = True
+        mask[100:160, 100:180] = True
+        kept = without_specks(mask, 1e-8)
+        assert kept[100:160, 100:180].all() and kept.sum() <= 62 * 82
 
 
 def some_moments(localizer, freedom=5.0):
@@ -176,7 +186,7 @@ def some_moments(localizer, freedom=5.0):
 def test_the_likelihood_is_student_t(ball, rng, freedom):
     scorer, index = some_moments(ball, freedom), ball.index
     mask = index.masks([len(index) // 3])[0]
-    seen = moments(without_specks(mask, index.sensor)[None], index.sensor)[0]
+    seen = moments(without_specks(mask, index.sensor.pixel_area(mask.shape))[None], index.sensor)[0]
     ids = rng.choice(len(index), 500)
     expected = multivariate_t(scorer.bias, scorer.covariance, df=freedom).logpdf(seen - index.moments[:, ids].T)
     assert scorer.score(index, mask).ravel()[ids] == pytest.approx(expected, rel=1e-4, abs=2e-3)
@@ -302,8 +312,7 @@ def test_touches_are_kept_and_read_back(plug, tmp_path):
 
 
 def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
-    monkeypatch.setattr("geomtact.scoring.fitted._FIT", 40)
-    monkeypatch.setattr("geomtact.scoring.fitted._JUDGE", 20)
+    monkeypatch.setattr("geomtact.scoring.fitted._TOUCHES", 60)
     names = ("l1", "iou", "moments", "fourier")  # one of each kind
     assert set(names) <= set(SCORERS)
     for name in names:
@@ -321,8 +330,7 @@ def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("damage", ["", "{}", "not json", json.dumps({"format": 999})])
 def test_a_damaged_fit_is_made_anew(ball, tmp_path, monkeypatch, damage):
-    monkeypatch.setattr("geomtact.scoring.fitted._FIT", 30)
-    monkeypatch.setattr("geomtact.scoring.fitted._JUDGE", 20)
+    monkeypatch.setattr("geomtact.scoring.fitted._TOUCHES", 50)
     (tmp_path / "iou.json").write_text(damage)
     assert fitted_scorer("iou", ball.index, tmp_path).scorer.name == "iou"
     assert json.loads((tmp_path / "iou.json").read_text())["weights"] == {"iou": 1.0}

@@ -5,6 +5,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
+from geomtact.contact_space.touch import LEAST_CONTACT
 from geomtact.errors import GeomtactError, InputError
 from geomtact.geometry.mesh import load_mesh
 from geomtact.scoring.catalogue import descriptor_of
@@ -60,18 +61,26 @@ def test_a_touch_lies_near_the_stored_contact_of_its_cell(scenes):
     for scene in scenes:
         assert scene.weight.sum() == pytest.approx(1, abs=1e-5)
         assert (scene.weight[scene.true] > 0).all()
-        stored, rigid = unpacked(scene.stored, KEY_SHAPE), unpacked(scene.rigid, TOUCH_SHAPE)
+        stored, touches = unpacked(scene.stored, KEY_SHAPE), unpacked(scene.touches, TOUCH_SHAPE)
         sensor = Sensor("any", (64, 48), (1e-3, 1e-3), 0.0, 2e-3)
-        far = np.linalg.norm(moments(rigid, sensor)[:, None, :2] - moments(stored, sensor)[None, :, :2], axis=-1)
+        far = np.linalg.norm(moments(touches, sensor)[:, None, :2] - moments(stored, sensor)[None, :, :2], axis=-1)
         own = far[np.arange(len(far)), scene.true]
         assert np.median(own) < 0.5 * np.median(far)
 
 
 def test_an_elastic_contact_is_part_of_the_rigid_one(scenes):
     for scene in scenes:
-        rigid, elastic = unpacked(scene.rigid, TOUCH_SHAPE), unpacked(scene.elastic, TOUCH_SHAPE)
-        assert not (elastic & ~rigid).any() and elastic.any((1, 2)).all()
-        assert elastic.sum() < 0.95 * rigid.sum()
+        touches, soft = unpacked(scene.touches, TOUCH_SHAPE), np.flatnonzero(scene.elastic)
+        rigid, elastic = touches[soft - 1], touches[soft]
+        assert len(soft) and not scene.elastic[soft - 1].any() and (scene.true[soft - 1] == scene.true[soft]).all()
+        assert not (elastic & ~rigid).any() and elastic.sum() < 0.95 * rigid.sum()
+
+
+def test_a_touch_has_the_least_area_whichever_gel_feels_it(scenes):
+    for scene in scenes:
+        area = unpacked(scene.touches, TOUCH_SHAPE).sum((1, 2)) * scene.pixel**2
+        assert area.min() >= LEAST_CONTACT
+        assert (~scene.elastic).sum() > scene.elastic.sum(), "what a rigid gel feels faintly, an elastic one does not"
 
 
 def test_noise_keeps_masks_masks_and_repeats():
@@ -255,7 +264,7 @@ def test_weights_are_written_read_and_refused(scenes, tmp_path):
 def test_a_localizer_takes_the_path_of_weights(make_localizer, weights, tmp_path):
     save_file(weights, tmp_path / "mine.safetensors")
     path = str(tmp_path / "mine.safetensors")
-    localizer = make_localizer("ball", "gelsight-mini", max_poses=4000, touches=(40, 20), scorer=path)
+    localizer = make_localizer("ball", "gelsight-mini", max_poses=4000, touches=60, scorer=path)
     assert localizer.scorer.scorer.stored.shape == (len(localizer.index), 8)
     mask = np.zeros((240, 320), bool)
     mask[100:140, 150:190] = True

@@ -238,14 +238,14 @@ def augmentations() -> Figure:
     from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, make_scene
 
     scene = make_scene(random_part(11, 0.06), Sensor.load("gelslim"), 600_000, np.random.default_rng(5))
-
-    elastic = unpack(scene.elastic, TOUCH_SHAPE)
+    touches, soft = unpack(scene.touches, TOUCH_SHAPE), np.flatnonzero(scene.elastic)
+    elastic = touches[soft]
     # middling contacts, as different as five of them can be
     some = np.argsort(elastic.sum((1, 2)))[(np.linspace(0.5, 0.97, 5) * len(elastic)).astype(int)]
     masks = torch.from_numpy(elastic[some]).float()[:, None]
     columns = [
-        ("stored, of the cell", unpack(scene.stored[scene.true[some]], KEY_SHAPE)),
-        ("touch, rigid", unpack(scene.rigid[some], TOUCH_SHAPE)),
+        ("stored, of the cell", unpack(scene.stored[scene.true[soft[some]]], KEY_SHAPE)),
+        ("touch, rigid", touches[soft[some] - 1]),
         ("touch, elastic", elastic[some]),
     ]
     for i, a in enumerate(AUGMENTATIONS):

@@ -161,7 +161,7 @@ class Localizer:
         with _timed(timing, "posterior"):
             common["settings"] |= _worth(rows.by, rows.calibration)
             log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
-            evidence, likeliest = self.scorer.witness.hear(self.index, mask, log_prior)
+            evidence, likeliest = self.scorer.witness.evidence(self.index, mask, log_prior)
             posterior = Posterior(self.index, rows.first, log_prob, runs=rows.runs, log_evidence=evidence, **common)
         if prior is None and likeliest < self.scorer.witness.usual:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")

@@ -66,7 +66,7 @@ class Refinery:
         if not len(cells):
             return posterior
         index, sensor = posterior.index, self.space.sensor
-        contact = without_specks(mask, sensor)
+        contact = without_specks(mask, sensor.pixel_area(mask.shape))
         problem = make_problem(contact, sensor, max_points=_RIM if thorough else _RIM // 2)
         start = index.poses(cells)
         candidates = [start, self._centred(posterior, contact, cells, start)]

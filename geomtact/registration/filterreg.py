@@ -18,7 +18,8 @@ from geomtact.se3 import Array, apply, inverse
 
 _NEIGHBOURS = 5
 _OUTLIER = 0.05  # filter value at which a rim point counts as half an outlier
-_STEPS_AT_END = 2
+_STEPS_AT_END = 12  # with the narrowest filter, at most
+_REST = 0.5  # of the noise that the last step may be
 _STRETCH = np.array([1.0, 1.0, 3.0])  # the rim is known better across the membrane (z) than along it
 _SLOPE_NOISE = 0.2  # noise across the membrane, as a share of that along it
 
@@ -49,21 +50,21 @@ class FilterReg:
         points, normals = near_surface(self.surface, problem, start, reach)
         if not len(points):
             return rejected(start)
-        rim_filter = RimFilter(problem, start, points, normals)
+        rim_filter = RimFilter(problem, start, points, normals, self.surface.spacing)
         # the motion zeta and the rim's offset along z are held by what was known before: what the rim does not tell
         # stays where it was
         held = np.append(1 / self.spread.metres(problem.length), 1 / problem.sink_std) ** 2
-        state, T, sigma, at_end = np.zeros(7), start, reach / 3, 0
-        while at_end < _STEPS_AT_END:
-            sigma = max(problem.noise, self.narrowing * sigma)
-            at_end += sigma == problem.noise
+        state, T, sigma, at_end, at_rest = np.zeros(7), start, reach / 3, 0, False
+        while at_end < _STEPS_AT_END and not at_rest:
+            sigma = max(rim_filter.narrowest, self.narrowing * sigma)
+            at_end += sigma == rim_filter.narrowest
             meeting = rim_filter.meet(T, state[6], sigma)
             if meeting.support < 6:
                 return rejected(start)
             step = np.linalg.solve(meeting.information + np.diag(held), meeting.slope - held * state)
             state += step
             T = moved(T, step[:6], problem)
-        at_rest = bool(np.linalg.norm(step[:6]) < problem.noise)
+            at_rest = bool(at_end > 1 and np.linalg.norm(step[:6]) < _REST * problem.noise)
         return judged(start, T, meeting, at_rest, self.spread, problem)
 
 
@@ -75,12 +76,18 @@ class RimFilter:
     problem : with a rim
     start : (4, 4) T_sensor_object at which the surface is given
     points, normals : (s, 3) of the surface that may have made the rim, sensor frame at ``start``
+    spacing : of those points [m]
+
+    Attributes
+    ----------
+    narrowest : width of the filter that the rim's noise and the gaps between the surface's points leave [m]
     """
 
-    def __init__(self, problem: Problem, start: Array, points: Array, normals: Array):
+    def __init__(self, problem: Problem, start: Array, points: Array, normals: Array, spacing: float):
         from scipy.spatial import cKDTree
 
         self.problem, self.start, self.points, self.normals = problem, start, points, normals
+        self.narrowest = float(np.hypot(problem.noise, spacing))
         self._tree = cKDTree(points * _STRETCH)
 
     def meet(self, T: Array, sink: float, sigma: float) -> Meeting:

@@ -52,13 +52,13 @@ class Icp:
             return rejected(start)
         # Open3D moves the rim onto the surface; the object moves the other way
         T = inverse(motion) @ start
-        rim_filter = RimFilter(problem, start, points, normals)
-        information = rim_filter.meet(T, 0.0, problem.noise).information[:6, :6]
+        rim_filter = RimFilter(problem, start, points, normals, self.surface.spacing)
+        information = rim_filter.meet(T, 0.0, rim_filter.narrowest).information[:6, :6]
         information = without_sink(information, problem.sink_std)
         held = np.diag(self.spread.metres(problem.length) ** -2.0)
         kept = np.linalg.solve(information + held, information @ motion_of(start, T, problem))
         T = moved(start, kept, problem)
-        return judged(start, T, rim_filter.meet(T, 0.0, 2 * problem.noise), True, self.spread, problem)
+        return judged(start, T, rim_filter.meet(T, 0.0, rim_filter.narrowest), True, self.spread, problem)
 
 
 def _register(problem: Problem, points: Array, normals: Array, reach: float) -> Array | None:

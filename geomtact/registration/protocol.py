@@ -29,6 +29,12 @@ class Surface:
     normals: Array
 
     @cached_property
+    def spacing(self) -> float:
+        """Side of the patch of surface that a point stands for, in the median [m]."""
+        some = self.points[:: max(1, len(self.points) // 1000)]
+        return 2 * float(np.median(self.tree.query(some, k=2)[0][:, 1]))
+
+    @cached_property
     def tree(self) -> cKDTree:
         from scipy.spatial import cKDTree
 

@@ -24,8 +24,8 @@ from geomtact.progress import Progress
 from geomtact.scoring.protocol import Scorer
 from geomtact.se3 import Array
 
-TEMPERATURES = np.geomspace(0.01, 30.0, 120)  # in units of the spread of the scores, whatever their scale
-_BINS = 1 << 14
+TEMPERATURES = np.geomspace(0.01, 30.0, 240)  # in units of the spread of the scores, whatever their scale
+_BINS = 1 << 12
 _CHUNK = 1 << 18  # rows worked on at a time
 _TINY = 1e-30  # probabilities below it are added up as logarithms: single precision ends near 1e-38
 _SPREAD_TOUCHES = 10  # that the spread of the scores is taken from
@@ -72,7 +72,7 @@ def simulate_touches(index: Index, n: int, seed: int, progress: Progress | None 
     rng = np.random.default_rng(seed)
     space = ContactSpace(index.mesh, index.sensor, index.approach)
     shape = index.sensor.along(_SHAPE)
-    pixel = float(4 * index.sensor.half_window.prod() / np.prod(shape))
+    pixel = index.sensor.pixel_area(shape)
     weight = index.weight.ravel().astype(float)
     total = np.cumsum(weight)
     masks: list[NDArray[np.bool_]] = []

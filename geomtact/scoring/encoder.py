@@ -74,7 +74,7 @@ class EncoderScorer(VectorScorer):
     def seen(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""
         assert isinstance(self.descriptor, Tower)
-        image = _lying(without_specks(mask, index.sensor)[None].astype(np.float32))[0]
+        image = _lying(without_specks(mask, index.sensor.pixel_area(mask.shape))[None].astype(np.float32))[0]
         small = cv2.resize(image, SHAPE[::-1], interpolation=cv2.INTER_AREA)
         return vector(self.descriptor.weights, small, self.descriptor.cell)
 

@@ -34,12 +34,13 @@ from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import describe_index
 from geomtact.scoring.witness import Witness
 
-FORMAT = 8
+FORMAT = 9
 _COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
 _LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than choosing which
 _USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual
 _LEAST_GAIN = 0.05  # nats that a touch has to tell in the mean
-_FIT, _JUDGE = 300, 200  # touches the moments are learned from, and touches the temperature is chosen on
+_TOUCHES = 500  # that scores are calibrated on
+_LEARN = 0.6  # share of them that the moments are learned from; the rest tell what they are worth
 
 
 @dataclass(frozen=True)
@@ -117,15 +118,13 @@ def fitted_scorer(
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             return _from_json(name, json.loads(path.read_text("utf-8")), known, index)
-    touches = _simulated(index, None if folder is None else folder / f"touches-{FORMAT}-{_FIT + _JUDGE}.npz", progress)
+    touches = _simulated(index, None if folder is None else folder / f"touches-{FORMAT}-{_TOUCHES}.npz", progress)
     if len(touches.ids) < 40:
         raise MeshError(
             f"{index.mesh.name}: hardly any pose makes a contact that the sensor {index.sensor.name!r} can resolve; "
             "check the object's unit and the approach"
         )
-    n = len(touches.ids) * _FIT // (_FIT + _JUDGE)
-    learn, judge = (Touches(touches.masks[part], touches.ids[part]) for part in (slice(n), slice(n, None)))
-    data = _fit(name, known, Moments.fit(index, learn.masks, learn.ids), index, judge)
+    data = _fit(name, known, index, touches)
     if progress:
         progress(1.0, "calibrating the score")
     if data["calibration"]["gain"] < _LEAST_GAIN and name in ("moments", DEFAULT_SCORER):
@@ -141,22 +140,25 @@ def _simulated(index: Index, path: Path | None, progress: Progress | None) -> To
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return Touches.load(path)
-    touches = simulate_touches(index, _FIT + _JUDGE, seed=20_200_531, progress=progress)
+    touches = simulate_touches(index, _TOUCHES, seed=20_200_531, progress=progress)
     if path is not None:
         with contextlib.suppress(OSError):
             write_whole(path, touches.save)
     return touches
 
 
-def _fit(name: str, known: dict[str, Scorer], moments: Moments, index: Index, touches: Touches) -> dict[str, Any]:
+def _fit(name: str, known: dict[str, Scorer], index: Index, touches: Touches) -> dict[str, Any]:
     """All that is fitted, as it stands in the cache."""
+    n = round(_LEARN * len(touches.ids))
+    learn, judge = (Touches(touches.masks[part], touches.ids[part]) for part in (slice(n), slice(n, None)))
+    moments = Moments.fit(index, learn.masks, learn.ids)
     nearest = {
-        each: float(np.quantile([-scorer.score(index, mask).max() for mask in touches.masks], _USUAL))
+        each: float(np.quantile([-scorer.score(index, mask).max() for mask in judge.masks], _USUAL))
         for each, scorer in known.items()
         if isinstance(scorer, EncoderScorer)
     }
     known = {**_limited(known, nearest), "moments": moments}
-    best = [Witness(moments).hear(index, mask)[1] for mask in touches.masks]
+    best = [Witness(moments).evidence(index, mask)[1] for mask in judge.masks]
     data: dict[str, Any] = {
         "format": FORMAT,
         "moments": {
@@ -169,13 +171,15 @@ def _fit(name: str, known: dict[str, Scorer], moments: Moments, index: Index, to
         "weights": {name: 1.0},
     }
     if name == DEFAULT_SCORER:
-        comparison = Comparison(index, touches)
+        comparison = Comparison(index, judge)
         candidates = {each: known[each] for each in (ENCODER, "moments", "iou")}
         # on a large grid a further score has to be worth its time
         data["weights"], _ = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
         more = {**candidates, "likelihood": known["likelihood"]}
         data["exact_weights"], exact = choose(comparison, more, least=0.02, start=data["weights"])
         data["exact"] = asdict(exact)
+    # only the moments have learned from some of the touches
+    touches = judge if "moments" in data["weights"] else touches
     calibration = calibrate(_weighed(data["weights"], known), index, touches)
     data["calibration"] = asdict(calibration)
     if name == DEFAULT_SCORER and data["exact_weights"] == data["weights"]:

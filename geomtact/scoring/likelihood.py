@@ -40,7 +40,7 @@ class PixelLikelihood:
 
     def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Log likelihood (P, n) of ``mask`` (h, w) at every pose."""
-        seen = to_grid(without_specks(mask, index.sensor), index.resolution.mask_shape)
+        seen = to_grid(without_specks(mask, index.sensor.pixel_area(mask.shape)), index.resolution.mask_shape)
         depths = np.asarray(index.resolution.penetrations)
         P, bin_size = len(depths), depths[0] * 2
         # between two contours the surface lies in the middle; beyond the last ones it lies a bin away

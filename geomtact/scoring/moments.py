@@ -90,4 +90,4 @@ class Moments:
 
 
 def _seen(index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    return moments(without_specks(mask, index.sensor)[None], index.sensor)[0]
+    return moments(without_specks(mask, index.sensor.pixel_area(mask.shape))[None], index.sensor)[0]

@@ -67,7 +67,7 @@ class VectorScorer:
 
     def seen(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""
-        small = to_grid(without_specks(mask, index.sensor), index.resolution.mask_shape)
+        small = to_grid(without_specks(mask, index.sensor.pixel_area(mask.shape)), index.resolution.mask_shape)
         return self.descriptor.describe(small[None], index.sensor)[0]
 
 

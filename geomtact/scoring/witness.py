@@ -30,7 +30,7 @@ class Witness:
     moments: Moments
     usual: float = -np.inf
 
-    def hear(
+    def evidence(
         self, index: Index, mask: NDArray[np.bool_], log_prior: NDArray[np.floating] | None = None
     ) -> tuple[float, float]:
         """Log evidence of ``mask`` (h, w), and the log likelihood of the best pose.

@@ -176,6 +176,10 @@ class Sensor:
         """Half width and half height (2,) of the window on the membrane [m]."""
         return 0.5 * np.asarray(self.image_size_px) * np.asarray(self.pixel_pitch)
 
+    def pixel_area(self, shape: tuple[int, ...]) -> float:
+        """Area [m^2] of a pixel of a grid (h, w) over the window."""
+        return float(4 * self.half_window.prod() / np.prod(shape))
+
     @property
     def tall(self) -> bool:
         """Whether the window is higher than wide."""

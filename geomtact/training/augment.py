@@ -69,13 +69,19 @@ def _boundary(x: torch.Tensor, pixel: float, rng: torch.Generator) -> torch.Tens
     return (soft > level).to(x)
 
 
-def _missing(x: torch.Tensor, pixel: float, rng: torch.Generator) -> torch.Tensor:
+def _dropout(x: torch.Tensor, pixel: float, rng: torch.Generator) -> torch.Tensor:
     n, _, h, w = x.shape
     area = x.sum((1, 2, 3))
     # a centre on the contact: the largest of uniform numbers masked by it
     at = (x.flatten(1) * torch.rand(n, h * w, generator=rng)).argmax(1)
     radius = _uniform(n, 0.1, 0.4, rng) * torch.sqrt(area / torch.pi) * (torch.rand(n, generator=rng) < 0.3)
     return x * ~_disks(at // w, at % w, radius, h, w)
+
+
+def _speckle(x: torch.Tensor, pixel: float, rng: torch.Generator) -> torch.Tensor:
+    share = _uniform(len(x), 0, 0.03, rng) * (torch.rand(len(x), generator=rng) < 0.2)
+    flipped = torch.rand(x.shape, generator=rng) < share[:, None, None, None]
+    return torch.where(flipped, 1 - x, x)
 
 
 def _dust(x: torch.Tensor, pixel: float, rng: torch.Generator) -> torch.Tensor:
@@ -126,10 +132,13 @@ AUGMENTATIONS = (
         _boundary,
     ),
     Augmentation(
-        "missing patch",
-        "in 30 %, 0.1 to 0.4 of the contact's radius",
+        "dropout",
+        "in 30 %, a patch of 0.1 to 0.4 of the contact's radius",
         "glare, wear, a reader that loses flats",
-        _missing,
+        _dropout,
+    ),
+    Augmentation(
+        "speckle", "in 20 %, up to 3 % of the pixels flip", "a threshold near the image's own noise", _speckle
     ),
     Augmentation("dust", "0 to 4 specks of 0.2 to 0.5 mm", "dirt on the gel reads as contact", _dust),
     Augmentation(

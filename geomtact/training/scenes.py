@@ -41,7 +41,8 @@ class Scene:
     ----------
     stored : (n, words) contacts of ``KEY_SHAPE`` at the poses of the grid
     weight : (n,) share of the uniform measure of each, among these
-    rigid, elastic : (m, words) contacts of ``TOUCH_SHAPE`` of the same touches
+    touches : (m, words) contacts of ``TOUCH_SHAPE``, each with the least area that touches have
+    elastic : (m,) whether an elastic gel felt each; such a touch follows the rigid one at the same pose
     true : (m,) the stored contact whose cell holds each touch
     pixel : of ``TOUCH_SHAPE`` [m]
     cell : (2,) the grid's, as ``scoring.encoder.cell_size`` gives it
@@ -49,8 +50,8 @@ class Scene:
 
     stored: NDArray[np.uint64]
     weight: NDArray[np.float32]
-    rigid: NDArray[np.uint64]
-    elastic: NDArray[np.uint64]
+    touches: NDArray[np.uint64]
+    elastic: NDArray[np.bool_]
     true: NDArray[np.int64]
     pixel: float
     cell: NDArray[np.float32]
@@ -65,7 +66,7 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
     resolution = replace(resolution, pixel=float((2 * sensor.half_window / shape[::-1]).min() / 3))
     directions = Directions.make(symmetry, None, resolution.level)
     view = _View(mesh, sensor, resolution)
-    stored, weight, rigid, elastic, true = [], [], [], [], []
+    stored, weight, touches, elastic, true = [], [], [], [], []
     total = 0
     for k in rng.choice(len(directions.vectors), DIRECTIONS, replace=False):
         there = view.cast(directions.vectors[k])
@@ -90,20 +91,19 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
                 depth = view.depth(maps[t], tilted[t], psi, int(cell[i]), int(p), rng)
                 if depth is None:
                     continue
-                a, b = view.felt(depth)
-                if b.sum() * view.pixel**2 < LEAST_CONTACT:
-                    continue
-                rigid.append(pack(view.lying(a[None]).reshape(1, -1))[0])
-                elastic.append(pack(view.lying(b[None]).reshape(1, -1))[0])
-                true.append(total + int(p) * share.shape[1] + int(i))
+                for soft, mask in enumerate(view.felt(depth)):
+                    if mask.sum() * view.pixel**2 >= LEAST_CONTACT:
+                        touches.append(pack(view.lying(mask[None]).reshape(1, -1))[0])
+                        elastic.append(bool(soft))
+                        true.append(total + int(p) * share.shape[1] + int(i))
                 t = (t + 1) % TILTS
             total += share.size
     mass = np.concatenate(weight).astype(np.float64)
     return Scene(
         np.concatenate(stored),
         (mass / mass.sum()).astype(np.float32),
-        np.array(rigid, np.uint64),
-        np.array(elastic, np.uint64),
+        np.array(touches, np.uint64),
+        np.array(elastic, bool),
         np.array(true, np.int64),
         view.pixel,
         cell_size(sensor, resolution.step, level_step(resolution.level) * mesh.radius_rms),

@@ -25,6 +25,7 @@ from geomtact.errors import GeomtactError, InputError
 from geomtact.progress import Progress
 from geomtact.scoring.encoder import SHAPE
 from geomtact.scoring.network import Encoder
+from geomtact.sensing.moments import without_specks
 from geomtact.training.augment import augmented
 from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, Scene
 from geomtact.training.state import not_a_number, resume, save_state
@@ -36,9 +37,8 @@ class Settings:
 
     steps: int = 4000
     scenes_a_step: int = 3
-    touches: int = 160  # of a scene, at most
+    touches: int = 160  # of a scene, at most; half of them felt by an elastic gel
     stored: int = 3000  # contacts of a scene that each touch is told from, at most
-    elastic: float = 0.7  # share of touches felt by an elastic gel
     rate: float = 2e-3
     weight_decay: float = 1e-3
     width: int = 512
@@ -148,12 +148,13 @@ def _batch(
     scene: Scene, settings: Settings, rng: np.random.Generator, flipped: bool
 ) -> tuple[torch.Tensor, torch.Tensor, NDArray[np.int64], torch.Tensor]:
     """Touches (t, 24, 32), their own stored contacts and others (t + n, 24, 32), the former's ids, the latter's log weights."""
-    some = rng.permutation(len(scene.true))[: settings.touches]
-    soft = rng.random(len(some)) < settings.elastic
-    masks = np.where(soft[:, None], scene.elastic[some], scene.rigid[some])
+    kinds = [np.flatnonzero(scene.elastic == elastic) for elastic in (False, True)]
+    some = np.concatenate([rng.permutation(kind)[: settings.touches // 2] for kind in kinds])
     noise = torch.Generator().manual_seed(int(rng.integers(1 << 62)))
-    touches = augmented(_unpacked(masks, TOUCH_SHAPE)[:, None], scene.pixel, noise)
-    touches = F.avg_pool2d(touches, TOUCH_SHAPE[0] // SHAPE[0])[:, 0]
+    noisy = augmented(_unpacked(scene.touches[some], TOUCH_SHAPE)[:, None], scene.pixel, noise)
+    # from here on as an observed contact goes: specks are left out, and pixels are shares of contact
+    seen = np.stack([without_specks(mask, scene.pixel**2) for mask in noisy[:, 0].numpy() > 0.5])
+    touches = F.avg_pool2d(torch.from_numpy(seen).float()[:, None], TOUCH_SHAPE[0] // SHAPE[0])[:, 0]
     true = scene.true[some]
     others = rng.choice(len(scene.weight), min(settings.stored, len(scene.weight)), replace=False)
     stored = _unpacked(scene.stored[np.concatenate([true, others])], KEY_SHAPE)
