@@ -22,13 +22,14 @@ if TYPE_CHECKING:
     from geomtact.sensing.noise import Noise
 
 SCHEMA = "geomtact/study/2"
-_SCORES_ONLY = "Only for scores"
+_SCORES_ONLY, _PICTURED = "Only for scores", "Only for scores and registration"
 
 
 class What(StrEnum):
     touches = "touches"
     localize = "localize"
     scores = "scores"
+    registration = "registration"
 
 
 class FeltName(StrEnum):
@@ -41,12 +42,15 @@ def evaluate(
     what: Annotated[
         What,
         typer.Argument(
-            help="touches: what is judged on; localize: the posteriors from it; scores: all scores side by side."
+            help="touches: what is judged on; localize: the posteriors from it; scores: all scores side by side; "
+            "registration: from how far off refining finds home."
         ),
     ],
     parts: Annotated[
         list[str] | None,
-        typer.Argument(metavar="OBJECT...", help="Parts or mesh files; for scores the thesis's four by default."),
+        typer.Argument(
+            metavar="OBJECT...", help="Parts or mesh files; for scores and registration the thesis's four by default."
+        ),
     ] = None,
     unit: Unit = None,
     sensor: Annotated[str, typer.Option(help="Name (see 'geomtact sensors') or TOML file.")] = "gelslim",
@@ -67,7 +71,11 @@ def evaluate(
     ] = None,
     felt: Annotated[
         FeltName | None,
-        typer.Option(help="What the gel is; elastic by default.", show_default=False, rich_help_panel=_SCORES_ONLY),
+        typer.Option(
+            help="What the gel is; elastic by default for scores, both for registration.",
+            show_default=False,
+            rich_help_panel=_PICTURED,
+        ),
     ] = None,
     max_poses: Annotated[
         int | None,
@@ -78,9 +86,7 @@ def evaluate(
             rich_help_panel=_SCORES_ONLY,
         ),
     ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="PNG of gain against time per touch.", rich_help_panel=_SCORES_ONLY)
-    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG that shows the figures.", rich_help_panel=_PICTURED)] = None,
     cache_dir: CacheDir = None,
 ) -> None:
     """Judge posteriors on simulated touches with known poses: gain, coverage and pose errors for each part.
@@ -90,13 +96,23 @@ def evaluate(
     """
     from geomtact.errors import UsageError
 
+    pictured = (What.scores, What.registration)
+    options: dict[str, tuple[Any, tuple[What, ...]]] = {
+        "--scores": (scores, (What.scores,)),
+        "--max-poses": (max_poses, (What.scores,)),
+    }
+    options |= {"--felt": (felt, pictured), "--plot": (plot, pictured)}
+    for option, (value, studies) in options.items():
+        if value and what not in studies:
+            others = " and ".join(f"'evaluate {study}'" for study in studies)
+            raise UsageError(f"{option} goes with {others}, not with 'evaluate {what}'; leave it out")
     if what is What.scores:
         from geomtact.cli.evaluate_scores import Options, judge_scores, sort_words
         from geomtact.contact_space.resolution import MAX_POSES
         from geomtact.sensing.sensor import Sensor
 
         chosen, names = sort_words(parts or [], scores or [])
-        options = Options(
+        settings = Options(
             sensor=Sensor.load(sensor),
             touches=touches,
             noise_name=str(noise),
@@ -106,11 +122,16 @@ def evaluate(
             seed=seed,
             max_poses=max_poses or MAX_POSES,
         )
-        judge_scores(chosen, unit, names, options, out, plot, cache_dir)
+        judge_scores(chosen, unit, names, settings, out, plot, cache_dir)
         return
-    for option, value in {"--scores": scores, "--felt": felt, "--max-poses": max_poses, "--plot": plot}.items():
-        if value:
-            raise UsageError(f"{option} goes with 'evaluate scores', not with 'evaluate {what}'; leave it out")
+    if what is What.registration:
+        from geomtact.cli.evaluate_registration import judge_registration
+        from geomtact.evaluation.scores import FELT, THESIS_PARTS
+
+        elastic = FELT[str(felt or FeltName.both)]
+        names = parts or list(THESIS_PARTS)
+        judge_registration(names, unit, sensor, touches, str(noise), _noise(noise), elastic, seed, out, plot)
+        return
     if not parts:
         raise UsageError(f"evaluate {what}: no OBJECT given; name a part (see 'geomtact objects') or a mesh file")
     if what is What.touches:

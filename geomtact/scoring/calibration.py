@@ -153,36 +153,44 @@ def posterior_log_prob(
 ) -> NDArray[np.float32]:
     """Log probability (N,) of every row; ``log_prior`` (N,) is the log mass of every row, normalised."""
     score, prior, floor = score.ravel(), log_prior.astype(np.float32, copy=False), calibration.floor
-    out = np.empty(len(score), np.float32)
+    out, mass = np.empty(len(score), np.float32), np.empty(len(score), np.float32)
     inverse = np.float32(1 / calibration.temperature)
 
     # in single precision and in chunks: a million rows are many megabytes a pass
-    def weigh(part: slice) -> float:
-        np.multiply(score[part], inverse, out=out[part])
-        out[part] += prior[part]
-        return _log_sum_exp(out[part])
+    def weigh(part: slice) -> tuple[float, float]:
+        joint, likely = out[part], mass[part]
+        np.multiply(score[part], inverse, out=joint)
+        joint += prior[part]
+        top = joint.max(initial=-np.inf)
+        if top == -np.inf:
+            likely.fill(0)
+            return -np.inf, -np.inf
+        np.subtract(joint, top, out=likely)
+        np.exp(likely, out=likely)
+        return float(top), float(top) + float(np.log(likely.sum()))  # numpy adds up in pairs: exact enough
 
-    def mix(part: slice) -> None:
-        joint, mine = out[part], prior[part]
+    def mix(part: slice, top: float) -> None:
+        joint, likely, mine = out[part], mass[part], prior[part]
         joint -= np.float32(total)
         if floor == 0:
             return
-        mass = np.exp(mine) * np.float32(floor)
-        mass += np.exp(joint) * np.float32(1 - floor)
-        if mass.min() > _TINY:
-            np.log(mass, out=joint)
+        likely *= np.float32((1 - floor) * np.exp(top - total))
+        likely += np.exp(mine) * np.float32(floor)
+        if likely.min(initial=1) > _TINY:
+            np.log(likely, out=joint)
             return
         # a probability too small for single precision is added up as logarithms
-        tiny = np.flatnonzero((mass < _TINY) & (mine > -np.inf))
+        tiny = np.flatnonzero((likely < _TINY) & (mine > -np.inf))
         kept = np.logaddexp(joint[tiny] + np.log1p(-floor), mine[tiny] + np.log(floor), dtype=float)
         with np.errstate(divide="ignore"):
-            np.log(mass, out=joint)
+            np.log(likely, out=joint)
         joint[tiny] = kept
 
     parts = [slice(i, i + _CHUNK) for i in range(0, len(out), _CHUNK)]
     with ThreadPoolExecutor(2 if len(parts) > 1 else 1) as pool:
-        total = float(np.logaddexp.reduce(list(pool.map(weigh, parts))))
-        list(pool.map(mix, parts))
+        tops, sums = zip(*pool.map(weigh, parts), strict=True)
+        total = float(np.logaddexp.reduce(sums))
+        list(pool.map(mix, parts, tops))
     return out
 
 
@@ -191,12 +199,3 @@ def normalised(log_mass: NDArray[np.floating]) -> NDArray[np.floating]:
     top = log_mass.max()
     out: NDArray[np.floating] = log_mass - (top + np.log(np.exp(log_mass - top).sum(dtype=np.float64)))
     return out
-
-
-def _log_sum_exp(x: NDArray[np.float32]) -> float:
-    top = float(x.max(initial=-np.inf))
-    if top == -np.inf:
-        return top
-    work = x - np.float32(top)
-    np.exp(work, out=work)
-    return top + float(np.log(work.sum()))  # numpy adds up in pairs, which keeps single precision exact enough

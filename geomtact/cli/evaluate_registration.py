@@ -1,0 +1,110 @@
+"""``geomtact evaluate registration``: from how far off each way of refining a pose still finds home."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from geomtact.cli import study_file
+from geomtact.cli.shell import print_table, tell
+
+if TYPE_CHECKING:
+    from geomtact.sensing.noise import Noise
+
+SCHEMA = "geomtact/registration/1"
+
+
+def judge_registration(
+    parts: Sequence[str],
+    unit: str | None,
+    sensor: str,
+    touches: int,
+    noise_name: str,
+    noise: Noise,
+    elastic: bool | None,
+    seed: int,
+    out: Path | None = None,
+    plot: Path | None = None,
+) -> dict[str, Any]:
+    """Refine poses off by known amounts, by every method on the same starts; print the figures and write them to ``out``.
+
+    ``elastic`` as in ``touches.random_touches``; ``plot`` is the PNG of how often each method finds home.
+    """
+    from types import SimpleNamespace
+
+    from geomtact.contact_space.build import choose_resolution
+    from geomtact.contact_space.resolution import MAX_POSES
+    from geomtact.contact_space.space import ContactSpace
+    from geomtact.evaluation import registration
+    from geomtact.evaluation.peers import peers
+    from geomtact.evaluation.touches import random_touches
+    from geomtact.geometry.mesh import load_mesh
+    from geomtact.report.result import plain
+    from geomtact.sensing.sensor import Sensor
+    from geomtact.versions import versions
+
+    content = study_file.load(out, SCHEMA)
+    content.pop("figures", None)
+    pressed = Sensor.load(sensor)
+    for mesh in [load_mesh(part, unit, sensor=pressed).with_symmetry() for part in parts]:
+        space = ContactSpace(mesh, pressed)
+        resolution = choose_resolution(mesh, pressed, None, MAX_POSES)
+        methods = registration.own_methods(mesh, resolution)
+        methods |= peers(*registration.scene(mesh, resolution))
+        settings = {
+            "object_sha256": mesh.sha256,
+            "sensor": pressed.name,
+            "sensor_sha256": pressed.sha256,
+            "touches": touches,
+            "noise": {"name": noise_name, **asdict(noise)},
+            "elastic": elastic,
+            "seed": seed,
+            "grid": resolution.to_json(),
+            "methods": list(methods),
+            "success_mm": registration.SUCCESS_MM,
+            "peers": versions("small_gicp", "probreg"),
+        }
+        found = content["parts"].get(mesh.name)
+        done = found["outcomes"] if found is not None and study_file.same(found, settings) else []
+
+        def keep(outcomes: list, name: str = mesh.name, settings: Mapping[str, Any] = settings) -> None:
+            content["parts"][name] = plain({"settings": settings, "outcomes": outcomes})
+            study_file.save(out, content)
+
+        if len(done) < touches:
+            pressed_at = random_touches(SimpleNamespace(space=space), touches, seed, elastic, noise)
+            more = registration.trials(space, pressed_at, methods, resolution.step, noise, seed, first=len(done))
+            columns = ([asdict(trial) for trial in some] for some in more)
+            done = study_file.collect(done, columns, touches, f"registering {mesh.name}", keep)
+        keep(done)
+        tell(f"{mesh.name}: done")
+    trials = [registration.Trial(**t) for part in content["parts"].values() for some in part["outcomes"] for t in some]
+    content["figures"] = plain(registration.summarise(trials))
+    study_file.save(out, content)
+    _print(content["figures"])
+    if plot is not None and any(content["figures"]["success"].values()):
+        from geomtact.files import write_whole
+        from geomtact.report.registration_plot import draw_registration
+
+        picture = draw_registration(content)
+        plot.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(plot, lambda path: path.write_bytes(picture))
+    return content
+
+
+def _print(figures: Mapping[str, Any]) -> None:
+    headings = ("method", "success", "converged", "error [mm]", "drift [mm]", "ms")
+    rows = []
+    for name, f in figures["methods"].items():
+        shares = ["-" if f[key] is None else f"{100 * f[key]:.0f} %" for key in ("success", "converged")]
+        lengths = ["-" if f[key] is None else f"{f[key]:.2f}" for key in ("error_mm_median", "drift_mm_median")]
+        rows.append([name, *shares, *lengths, f"{f['ms_median']:.1f}"])
+    typer.echo("Over all start errors; errors in what the contact tells, drift in what it does not")
+    print_table(headings, rows, headings[1:])
+    for cell in figures["lost"]:
+        start = f"{cell['turn_deg']:g} degrees and {cell['shift_mm']:g} mm off"
+        typer.echo(f"{cell['contact']}, {start}: {cell['to']} succeeds more often than filterreg")

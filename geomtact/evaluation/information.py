@@ -1,0 +1,79 @@
+"""What a contact tells about the pose, by the exact simulator: the bound that no registration can beat.
+
+The outline of a contact is displaced by sensor noise along its normal. How far it moves with the pose is measured by moving
+the object a little each way and casting, or solving the gel, again. So no method's own idea of what it sees enters.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.touch import felt_mask
+from geomtact.registration.observability import moved
+from geomtact.registration.protocol import Problem
+from geomtact.registration.rim import make_problem
+from geomtact.se3 import Array
+from geomtact.sensing.noise import Noise
+from geomtact.sensing.sensor import Sensor
+
+_STEP = 0.2e-3  # m that the contact is moved, each way
+_POINTS = 400  # of the outline, at most
+
+
+def fisher_information(
+    space: ContactSpace, T: ArrayLike, elastic: bool, problem: Problem, noise: Noise, pixel_noise: float = 0.3
+) -> Array:
+    """Fisher information (6, 6) [1/m^2] of a contact's outline about zeta (see ``registration.observability``) at the true
+    pose ``T`` (4, 4): rotations about the contact's centre times its length, then translations, in sensor axes.
+
+    Parameters
+    ----------
+    elastic : whether an elastic gel feels the contact
+    problem : gives the centre and the length that zeta is measured by
+    noise : of the outline: ``outline_rms`` along its normal, alike over the middle of ``correlation``
+    pixel_noise : of the outline's place in a pixel, standard deviation [px]
+    """
+    T = np.asarray(T, float)
+    mask = felt_mask(space, T, elastic)
+    pitch = np.sqrt(space.sensor.pixel_area(mask.shape))
+    outline = make_problem(mask, space.sensor, max_points=_POINTS, correlation=float(np.mean(noise.correlation)))
+    at = _pixels(outline.rim, space.sensor, mask.shape)
+    slope = np.zeros((len(at), 6))
+    for i, axis in enumerate(np.eye(6)):
+        ahead, behind = (felt_mask(space, moved(T, way * _STEP * axis, problem), elastic) for way in (1, -1))
+        # the outline moves outwards by what its signed distance grows
+        slope[:, i] = (_inside(ahead, at) - _inside(behind, at)) * pitch / (2 * _STEP)
+    rms = np.hypot(noise.outline_rms, pixel_noise * pitch)
+    return np.asarray(outline.independence / rms**2 * slope.T @ slope)
+
+
+def told_directions(information: Array, least_std: float) -> tuple[Array, Array]:
+    """Orthonormal rows of zeta that are told, (r, 6), to a standard deviation under ``least_std`` [m], and those that are
+    not, (6 - r, 6)."""
+    values, vectors = np.linalg.eigh(information)
+    told = values > least_std**-2.0
+    return vectors[:, told].T, vectors[:, ~told].T
+
+
+def _pixels(points: Array, sensor: Sensor, shape: tuple[int, ...]) -> Array:
+    """Where the camera sees points (n, 3) of the membrane: (row, column) (n, 2) on a grid (h, w)."""
+    xy = sensor.project(points)
+    pitch = 2 * sensor.half_window / shape[::-1]
+    return ((xy + sensor.half_window) / pitch - 0.5)[:, ::-1]
+
+
+def _inside(mask: NDArray[np.bool_], at: Array) -> Array:
+    """Distance [px] from the outline of a mask (h, w), positive inside, at ``at`` (n, 2), (row, column): (n,)."""
+    from scipy.ndimage import map_coordinates
+
+    if mask.all() or not mask.any():
+        return np.zeros(len(at))
+    image = mask.astype(np.uint8)
+    inner = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outer = cv2.distanceTransform(1 - image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # each is measured to the nearest pixel's centre beyond the outline, which runs half a pixel before it
+    signed = inner - outer - np.where(mask, 0.5, -0.5)
+    return np.asarray(map_coordinates(signed, at.T, order=1, mode="nearest"))
