@@ -181,7 +181,7 @@ def test_a_background_for_a_mask_is_said_to_be_unused(background):
     [
         (MASK.T, "(width x height), got 240 x 320 px; the image is transposed: transpose it (array.T)"),
         (MASK[:, :300], "expected 320 x 240 px for sensor gelsight-mini (width x height), got 300 x 240 px; name the sen"),
-        (MASK[::2, ::2], "got 160 x 120 px; the shape agrees: resize the image"),
+        (MASK[::2, ::2], "got 160 x 120 px; the shape agrees: scale a mask to that"),
         (np.zeros((0, 320)), "expected (H, W) or (H, W, 3), got an array of shape (0, 320)"),
         (np.zeros(320), "got an array of shape (320,)"),
         (np.zeros((*SHAPE, 7)), "got an array of shape (240, 320, 7)"),

@@ -116,7 +116,7 @@ def localize(
     else:
         _print(posterior, modes, out)
     if not posterior.contact:
-        tell("no contact found in the image")
+        tell("no contact found in the image; give a --background, or say what it is with --kind")
         raise typer.Exit(NO_CONTACT)
 
 

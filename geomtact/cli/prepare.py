@@ -13,6 +13,7 @@ from geomtact.cli.shell import progress_bar, tell
 if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
 
+_MANY_WINDOWS = 10  # long sides of the window, from which on a part's unit is doubted
 Unit = Annotated[str | None, typer.Option("--unit", help="Unit of a mesh file without one: mm, cm, m or inch.")]
 ScorerName = Annotated[
     str | None, typer.Option("--scorer", help="How contacts are compared: a score by name, or weights (.safetensors).")
@@ -36,27 +37,40 @@ def prepare(
 
     values, sources = resolve({"object": object_name, "unit": unit, "sensor": sensor})
     began = time.perf_counter()
-    localizer = open_localizer(values, sources, scorer, cache_dir)
+    localizer = open_localizer(values, sources, scorer, cache_dir, given="OBJECT")
     typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
 
 
-def open_localizer(values: dict, sources: dict, scorer: str | None, cache_dir: Path | None) -> Localizer:
-    """The localizer for resolved options, with a progress bar where its index has to be built first."""
+def open_localizer(
+    values: dict, sources: dict, scorer: str | None, cache_dir: Path | None, given: str | None = None
+) -> Localizer:
+    """The localizer for resolved options, with a progress bar where its index has to be built first.
+
+    ``given`` is how the object is named on the command line, if not by --object.
+    """
     from geomtact.cli.project import require
     from geomtact.geometry.catalogue import catalogue
     from geomtact.sensing.sensor import bundled_sensors
 
-    object_name = require(values, "object", list(catalogue()), "a mesh file with --unit")
+    object_name = require(values, "object", list(catalogue()), "a mesh file with --unit", given)
     sensor = require(values, "sensor", bundled_sensors(), "a TOML file")
     for key, source in sources.items():
         tell(f"{key}: {values[key]} (from {source})")
 
+    from geomtact.geometry.mesh import load_mesh
     from geomtact.inference.localizer import Localizer
     from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
+    from geomtact.sensing.sensor import Sensor
 
     scorer = scorer or DEFAULT_SCORER
     check_name(scorer)  # a wrong name is told before minutes go into an index
-    with progress_bar("preparing") as progress:
-        return Localizer.prepare(
-            object_name, unit=values["unit"], sensor=sensor, scorer=scorer, cache_dir=cache_dir, progress=progress
+    gel = Sensor.load(sensor)
+    mesh = load_mesh(object_name, values["unit"], sensor=gel)
+    windows = mesh.diameter / (2 * gel.half_window.max())
+    if windows > _MANY_WINDOWS:
+        tell(
+            f"warning: {mesh.name} is {1e3 * mesh.diameter:.0f} mm across as read in {mesh.unit}, {windows:.0f} windows of "
+            f"the sensor {gel.name!r}: if that is not its size, give its --unit"
         )
+    with progress_bar("preparing") as progress:
+        return Localizer.prepare(mesh, sensor=gel, scorer=scorer, cache_dir=cache_dir, progress=progress)

@@ -51,8 +51,10 @@ def resolve(
     return values, sources
 
 
-def require(values: Mapping[str, str | None], option: str, choices: list[str], other: str) -> str:
-    """``values[option]``, or an error that names the option and lists the choices.
+def require(
+    values: Mapping[str, str | None], option: str, choices: list[str], other: str, given: str | None = None
+) -> str:
+    """``values[option]``, or an error that names the option, or how else it is ``given``, and lists the choices.
 
     Raises
     ------
@@ -61,7 +63,8 @@ def require(values: Mapping[str, str | None], option: str, choices: list[str], o
     value = values.get(option)
     if value is None:
         raise UsageError(
-            f"which {option}? give --{option} NAME, one of {', '.join(choices)}; or {other}; or set {option} in {FILE}"
+            f"which {option}? give {given or f'--{option} NAME'}, one of {', '.join(choices)}; or {other}; or set {option} "
+            f"in {FILE}"
         )
     return value
 

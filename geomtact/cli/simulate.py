@@ -63,7 +63,7 @@ def simulate(
 
     check_folder(out)
     values, _ = resolve({"object": object_name, "unit": unit, "sensor": sensor})
-    named = require(values, "object", list(catalogue()), "a mesh file with --unit")
+    named = require(values, "object", list(catalogue()), "a mesh file with --unit", "OBJECT")
     sensor_named = require(values, "sensor", bundled_sensors(), "a TOML file")
     pressed = Sensor.load(sensor_named)
     mesh = load_mesh(named, values["unit"], sensor=pressed)

@@ -163,7 +163,7 @@ class Localizer:
             log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
             evidence, likeliest = self.scorer.witness.evidence(self.index, mask, log_prior)
             posterior = Posterior(self.index, rows.first, log_prob, runs=rows.runs, log_evidence=evidence, **common)
-        if prior is None and likeliest < self.scorer.witness.usual:
+        if prior is None and self.scorer.witness.odd(evidence, likeliest):
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
         with _timed(timing, "refine"):
             posterior = self._refinery.refine(posterior, mask, EFFORTS[effort].modes, EFFORTS[effort].thorough)

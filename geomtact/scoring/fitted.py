@@ -34,10 +34,11 @@ from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import describe_index
 from geomtact.scoring.witness import Witness
 
-FORMAT = 9
+FORMAT = 10
 _COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
 _LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than choosing which
 _USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual
+_ODD = 0.01  # share of touches whose evidence, or best pose, is called unlike the object
 _LEAST_GAIN = 0.05  # nats that a touch has to tell in the mean
 _TOUCHES = 500  # that scores are calibrated on
 _LEARN = 0.6  # share of them that the moments are learned from; the rest tell what they are worth
@@ -158,7 +159,7 @@ def _fit(name: str, known: dict[str, Scorer], index: Index, touches: Touches) ->
         if isinstance(scorer, EncoderScorer)
     }
     known = {**_limited(known, nearest), "moments": moments}
-    best = [Witness(moments).evidence(index, mask)[1] for mask in judge.masks]
+    heard = [Witness(moments).evidence(index, mask) for mask in judge.masks]
     data: dict[str, Any] = {
         "format": FORMAT,
         "moments": {
@@ -166,7 +167,7 @@ def _fit(name: str, known: dict[str, Scorer], index: Index, touches: Touches) ->
             "covariance": moments.covariance.tolist(),
             "freedom": moments.freedom,
         },
-        "usual": float(np.quantile(best, 0.02)),
+        "usual": np.quantile(heard, _ODD, axis=0).tolist(),
         "nearest": nearest,
         "weights": {name: 1.0},
     }
@@ -210,7 +211,7 @@ def _from_json(name: str, data: dict[str, Any], known: dict[str, Scorer], index:
         name,
         _weighed(data["weights"], known),
         Calibration(**data["calibration"]),
-        Witness(moments, data["usual"]),
+        Witness(moments, tuple(data["usual"])),
         cascade,
         exact_scorer,
         exact_calibration,

@@ -24,11 +24,11 @@ class Witness:
     Attributes
     ----------
     moments : fitted to the index
-    usual : the likelihood of the best pose that all but one in fifty touches of the object reach
+    usual : (evidence, likelihood of the best pose), each of which all but one in a hundred touches of the object reach
     """
 
     moments: Moments
-    usual: float = -np.inf
+    usual: tuple[float, float] = (-np.inf, -np.inf)
 
     def evidence(
         self, index: Index, mask: NDArray[np.bool_], log_prior: NDArray[np.floating] | None = None
@@ -46,3 +46,8 @@ class Witness:
         else:
             likelihood, log_mass = self.moments.score(index, mask).ravel().astype(float), log_prior
         return float(np.logaddexp.reduce(likelihood + log_mass)), float(likelihood.max())
+
+    def odd(self, evidence: float, best: float) -> bool:
+        """Whether hardly any touch of the object is so unlikely under the uniform distribution: as a whole, or at its best
+        pose."""
+        return evidence < self.usual[0] or best < self.usual[1]

@@ -120,7 +120,7 @@ def _check_size(array: NDArray[Any], sensor: Sensor, name: str) -> None:
         turned = "array.T" if array.ndim == 2 else "array.swapaxes(0, 1)"
         hint = f"the image is transposed: transpose it ({turned}) or rotate it by 90 degrees, as it was taken"
     elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
-        hint = "the shape agrees: resize the image, or describe this resolution in a sensor file of its own"
+        hint = "the shape agrees: scale a mask to that, or describe this resolution in a sensor file of its own"
     else:
         hint = (
             "name the sensor that took it; crop or scale nothing: give the image as the camera made it, "

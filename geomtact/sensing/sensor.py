@@ -108,7 +108,9 @@ class Sensor:
         try:
             data = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            raise SensorError(f"{origin}: not valid TOML ({error})") from None
+            raise SensorError(
+                f"{origin}: not valid TOML ({error}); write lines such as name = \"mine\", see 'geomtact sensors'"
+            ) from None
         for key in data:
             if key not in _KEYS:
                 raise SensorError(f"{origin}: unknown key {key!r}{nearest_name(key, _KEYS)}")
