@@ -12,7 +12,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from geomtact import Localizer, Mesh, Posterior, Sensor
+from geomtact.evaluation.touches import random_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.report.write import write_all
 from geomtact.se3 import inverse, random_rotations, transform
 
 CIRCLES = Path(__file__).with_name("circles_gelslam_gsmini.csv")
@@ -140,9 +142,6 @@ def test_a_mask_hardly_tells_the_balls_apart(presses):
     assert {p.file: p.ratio for p in presses if p.ratio >= 5} == {}
 
 
-DEPTHS = np.array([0.25e-3, 0.75e-3, 1.25e-3, 1.75e-3])
-
-
 def _of_marker(row, sensor):
     """T_sensor_object of the marker, from a line of ``poses_sensors.txt``: position, axis and angle of the sensor."""
     world_theirs = transform(Rotation.from_rotvec(row[3:6] / np.linalg.norm(row[3:6]) * row[6]).as_matrix(), row[:3])
@@ -150,29 +149,56 @@ def _of_marker(row, sensor):
     return inverse(world_theirs @ theirs_ours) @ transform(np.eye(3), [0.1, 0, 0.2])
 
 
-def test_a_reading_of_another_simulator_runs_from_rgb_to_a_report(data_folder, tmp_path):
-    """A DIGIT simulated by others touches a marker, whose pose is known: the readings tell something about it."""
-    from geomtact.report.write import write_all
-
+@pytest.fixture(scope="module")
+def marker(data_folder, tmp_path_factory):
+    """A localizer of a marker on a DIGIT that others simulated, and the posterior of each of their readings with its
+    pose, but for how deep it presses: [(posterior, T)]."""
     folder = data_folder / "hsp_digit_sim_ycb"
     localizer = Localizer.prepare(
-        folder / "meshes" / "040_large_marker.obj", unit="m", sensor="digit-hsp", max_poses=20_000, cache_dir=tmp_path
+        folder / "meshes" / "040_large_marker.obj",
+        unit="m",
+        sensor="digit-hsp",
+        max_poses=20_000,
+        cache_dir=tmp_path_factory.mktemp("cache"),
     )
-    found, gains = [], []
+    read = []
     for triplet in sorted((folder / "040_large_marker").iterdir()):
         for k, row in enumerate(np.loadtxt(triplet / "poses_sensors.txt")):
-            image = triplet / f"Image_heatmap_{k}.png"
-            posterior = localizer.localize(image, background=folder / "background.png")
-            assert posterior.contact and posterior.observation.kind == "reading"
-            assert posterior.entropy_nats < 0
-            # how deep the marker presses is not known: the mean density over the depths that touch
-            T, touches = localizer.space.settle(np.tile(_of_marker(row, localizer.sensor), (4, 1, 1)), DEPTHS)
-            assert touches.any()
-            found.append(posterior)
-            gains.append(np.log(np.exp(posterior.log_density(T[touches])).mean()))
-    claimed = -np.mean([p.entropy_nats for p in found])
-    print(f"\n{len(gains)} readings: gain {np.mean(gains):.2f} nats, claimed {claimed:.2f}")
-    assert len(gains) == 12 and np.mean(gains) > 0.3 and np.min(gains) > -3
-    write_all(tmp_path / "out", found[0], found[0].modes(3), localizer.simulate, {}, {})
+            posterior = localizer.localize(triplet / f"Image_heatmap_{k}.png", background=folder / "background.png")
+            read.append((posterior, _of_marker(row, localizer.sensor)))
+    assert len(read) == 12
+    return localizer, read
+
+
+def test_readings_of_another_simulator_run_from_rgb_to_a_report(marker, tmp_path):
+    localizer, read = marker
+    for posterior, _ in read:
+        assert posterior.contact and posterior.observation.kind == "reading"
+        assert posterior.entropy_nats < 0
+    posterior = read[0][0]
+    write_all(tmp_path / "out", posterior, posterior.modes(3), localizer.simulate, {}, {})
     names = {"result.json", "posterior.npz", "report.html", "report.png"}
     assert names <= {path.name for path in (tmp_path / "out").iterdir()}
+
+
+def test_readings_of_another_simulator_tell_where_the_marker_is(marker):
+    localizer, read = marker
+    depths = np.array(localizer.index.resolution.penetrations)
+    gains = []
+    for posterior, T in read:
+        # how deep the marker presses is not known: the mean density over the depths that touch
+        settled, touches = localizer.space.settle(np.tile(T, (len(depths), 1, 1)), depths)
+        gains.append(np.log(np.exp(posterior.log_density(settled[touches])).mean()))
+    claimed = -np.mean([posterior.entropy_nats for posterior, _ in read])
+    print(f"\ngain of {len(gains)} readings: {np.mean(gains):.2f} nats, claimed {claimed:.2f}")
+    assert np.mean(gains) > 0.3 and np.min(gains) > -3
+
+
+@pytest.mark.xfail(strict=True, reason="the network is too bold on another simulator's readings: see docs/method.md")
+def test_the_markers_featureless_side_is_told_less_than_a_distinctive_touch(marker):
+    localizer, read = marker
+    touches = random_touches(localizer, 40, seed=0)
+    distinctive = min(localizer.localize(t.mask, kind="mask").entropy_nats for t in touches)
+    featureless = [posterior.entropy_nats for posterior, _ in read[:3]]
+    print(f"\nentropy [nats]: readings {np.round(featureless, 2)}, distinctive {distinctive:.2f}")
+    assert min(featureless) > distinctive + 0.2

@@ -43,6 +43,9 @@ def judge_registration(
     from geomtact.evaluation.peers import peers
     from geomtact.evaluation.touches import random_touches
     from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.rotations import Directions
+    from geomtact.inference.refine import Refinery
+    from geomtact.registration.observability import Spread
     from geomtact.report.result import plain
     from geomtact.sensing.sensor import Sensor
     from geomtact.versions import versions
@@ -53,8 +56,11 @@ def judge_registration(
     for mesh in [load_mesh(part, unit, sensor=pressed).with_symmetry() for part in parts]:
         space = ContactSpace(mesh, pressed)
         resolution = choose_resolution(mesh, pressed, None, MAX_POSES)
-        methods = registration.own_methods(mesh, resolution)
-        methods |= peers(*registration.scene(mesh, resolution))
+        assert mesh.symmetry is not None
+        directions = Directions.make(mesh.symmetry, None, resolution.level, resolution.turn_step)
+        spread = Spread.of_grid(directions.angle_step(resolution.turn_step), resolution.step)
+        surface = Refinery(space).surface
+        methods = registration.own_methods(surface, spread) | peers(surface, spread)
         settings = {
             "object_sha256": mesh.sha256,
             "sensor": pressed.name,
@@ -78,8 +84,8 @@ def judge_registration(
         if len(done) < touches:
             pressed_at = random_touches(SimpleNamespace(space=space), touches, seed, elastic, noise)
             more = registration.trials(space, pressed_at, methods, resolution.step, noise, seed, first=len(done))
-            columns = ([asdict(trial) for trial in some] for some in more)
-            done = study_file.collect(done, columns, touches, f"registering {mesh.name}", keep)
+            outcomes = ([asdict(trial) for trial in some] for some in more)
+            done = study_file.collect(done, outcomes, touches, f"registering {mesh.name}", keep)
         keep(done)
         tell(f"{mesh.name}: done")
     trials = [registration.Trial(**t) for part in content["parts"].values() for some in part["outcomes"] for t in some]
@@ -87,12 +93,9 @@ def judge_registration(
     study_file.save(out, content)
     _print(content["figures"])
     if plot is not None and any(content["figures"]["success"].values()):
-        from geomtact.files import write_whole
         from geomtact.report.registration_plot import draw_registration
 
-        picture = draw_registration(content)
-        plot.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(plot, lambda path: path.write_bytes(picture))
+        study_file.draw(draw_registration(content), plot)
     return content
 
 

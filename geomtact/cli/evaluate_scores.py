@@ -116,7 +116,9 @@ def judge_scores(
     _print_coverage(tables)
     _print_classes(content["classes"])
     if plot is not None:
-        _draw(content, plot)
+        from geomtact.report.score_plot import draw_scores
+
+        study_file.draw(draw_scores(content), plot)
     return content
 
 
@@ -225,15 +227,6 @@ def _print_classes(classes: Mapping[str, Mapping[str, Any]]) -> None:
     masses = study_file.masses()
     typer.echo("By kind of contact: percentage of truths inside the region of each mass, with 99 % intervals")
     print_table(["score", "contact", "n", "gain [nats]", *masses], rows, ["n", "gain [nats]", *masses])
-
-
-def _draw(content: Mapping[str, Any], path: Path) -> None:
-    from geomtact.files import write_whole
-    from geomtact.report.score_plot import draw_scores
-
-    picture = draw_scores(content)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, lambda temporary: temporary.write_bytes(picture))
 
 
 def _print(title: str, entries: Mapping[str, Any]) -> None:

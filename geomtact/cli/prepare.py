@@ -50,7 +50,7 @@ def open_localizer(
     """
     from geomtact.cli.project import require
     from geomtact.geometry.catalogue import catalogue
-    from geomtact.sensing.sensor import bundled_sensors
+    from geomtact.sensing.sensor import Sensor, bundled_sensors
 
     object_name = require(values, "object", list(catalogue()), "a mesh file with --unit", given)
     sensor = require(values, "sensor", bundled_sensors(), "a TOML file")
@@ -60,7 +60,6 @@ def open_localizer(
     from geomtact.geometry.mesh import load_mesh
     from geomtact.inference.localizer import Localizer
     from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
-    from geomtact.sensing.sensor import Sensor
 
     scorer = scorer or DEFAULT_SCORER
     check_name(scorer)  # a wrong name is told before minutes go into an index

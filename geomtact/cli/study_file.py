@@ -79,6 +79,14 @@ def save(out: Path | None, content: dict[str, Any]) -> None:
         write_whole(out, lambda path: path.write_text(text, "utf-8"))
 
 
+def draw(picture: bytes, path: Path) -> None:
+    """Write a PNG."""
+    from geomtact.files import write_whole
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, lambda temporary: temporary.write_bytes(picture))
+
+
 def masses() -> list[str]:
     """Headings of :func:`inside`."""
     from geomtact.evaluation.study import NOMINAL

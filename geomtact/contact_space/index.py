@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.contact_space.resolution import Resolution
 from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.rotations import Directions, level_step
+from geomtact.geometry.rotations import Directions
 from geomtact.se3 import Array, hat, transform
 from geomtact.sensing.sensor import Sensor
 
@@ -77,9 +77,7 @@ class Index:
     @property
     def angle_step(self) -> float:
         """Angle between neighbouring rotations [rad]."""
-        if self.directions.level is not None:
-            return level_step(self.resolution.level)
-        return self.resolution.turn_step if self.directions.periods.any() else 0.0
+        return self.directions.angle_step(self.resolution.turn_step)
 
     @cached_property
     def directions(self) -> Directions:

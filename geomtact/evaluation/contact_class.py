@@ -32,7 +32,7 @@ def contact_class(space: ContactSpace, T: ArrayLike) -> str:
     shape = (max(8, round(high * scale)), max(8, round(wide * scale)))
     depth = space.caster.depths(sensor, np.asarray(T, float)[None], shape)[0]
     felt = depth > 0
-    pixel = 4 * wide * high / felt.size
+    pixel = sensor.pixel_area(shape)
     _, _, stats, _ = cv2.connectedComponentsWithStats(felt.astype(np.uint8), connectivity=8)
     if (stats[1:, cv2.CC_STAT_AREA] * pixel >= _PATCH).sum() >= 3:
         return "texture"

@@ -17,7 +17,6 @@ from geomtact.registration.protocol import Problem
 from geomtact.registration.rim import make_problem
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
-from geomtact.sensing.sensor import Sensor
 
 _STEP = 0.2e-3  # m that the contact is moved, each way
 _POINTS = 400  # of the outline, at most
@@ -40,7 +39,7 @@ def fisher_information(
     mask = felt_mask(space, T, elastic)
     pitch = np.sqrt(space.sensor.pixel_area(mask.shape))
     outline = make_problem(mask, space.sensor, max_points=_POINTS, correlation=float(np.mean(noise.correlation)))
-    at = _pixels(outline.rim, space.sensor, mask.shape)
+    at = space.sensor.to_pixels(space.sensor.project(outline.rim))
     slope = np.zeros((len(at), 6))
     for i, axis in enumerate(np.eye(6)):
         ahead, behind = (felt_mask(space, moved(T, way * _STEP * axis, problem), elastic) for way in (1, -1))
@@ -58,15 +57,8 @@ def told_directions(information: Array, least_std: float) -> tuple[Array, Array]
     return vectors[:, told].T, vectors[:, ~told].T
 
 
-def _pixels(points: Array, sensor: Sensor, shape: tuple[int, ...]) -> Array:
-    """Where the camera sees points (n, 3) of the membrane: (row, column) (n, 2) on a grid (h, w)."""
-    xy = sensor.project(points)
-    pitch = 2 * sensor.half_window / shape[::-1]
-    return ((xy + sensor.half_window) / pitch - 0.5)[:, ::-1]
-
-
 def _inside(mask: NDArray[np.bool_], at: Array) -> Array:
-    """Distance [px] from the outline of a mask (h, w), positive inside, at ``at`` (n, 2), (row, column): (n,)."""
+    """Distance [px] from the outline of a mask (h, w), positive inside, at ``at`` (n, 2), (column, row): (n,)."""
     from scipy.ndimage import map_coordinates
 
     if mask.all() or not mask.any():
@@ -76,4 +68,4 @@ def _inside(mask: NDArray[np.bool_], at: Array) -> Array:
     outer = cv2.distanceTransform(1 - image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     # each is measured to the nearest pixel's centre beyond the outline, which runs half a pixel before it
     signed = inner - outer - np.where(mask, 0.5, -0.5)
-    return np.asarray(map_coordinates(signed, at.T, order=1, mode="nearest"))
+    return np.asarray(map_coordinates(signed, at.T[::-1], order=1, mode="nearest"))

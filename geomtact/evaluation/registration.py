@@ -5,16 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from geomtact.contact_space.resolution import Resolution
 from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.contact_class import contact_class
 from geomtact.evaluation.information import fisher_information, told_directions
-from geomtact.evaluation.touches import Touch
-from geomtact.geometry.mesh import Mesh
+from geomtact.evaluation.touches import PENETRATION, Touch
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread, motion_of, moved
@@ -26,7 +26,6 @@ from geomtact.sensing.noise import Noise
 TURNS_DEG = (0.0, 2.5, 5.0, 10.0, 20.0)  # of the start poses about the contact's centre
 SHIFTS_MM = (0.0, 1.0, 2.0, 4.0, 8.0)  # along the membrane
 OWN = ("none", "icp", "filterreg", "both")
-SURFACE_POINTS = 30_000
 SUCCESS_MM = 0.5  # error in what the contact tells
 
 
@@ -118,16 +117,15 @@ def _start(
         axis *= turn * problem.length / np.linalg.norm(axis)
         start = moved(T, [*axis, 0.0, 0.0, 0.0], problem)
         start[:2, 3] += [shift * np.cos(way), shift * np.sin(way)]
-        depth = rng.uniform(0.3e-3, min(1.5e-3, space.sensor.max_penetration))
+        depth = rng.uniform(PENETRATION[0], min(PENETRATION[1], space.sensor.max_penetration))
         settled, ok = space.settle(start[None], depth)
         if ok[0]:
             return settled[0]
     return start
 
 
-def own_methods(mesh: Mesh, resolution: Resolution) -> dict[str, Method]:
-    """geomtact's refiners by name, and what no refinement gives; ``resolution`` tells how far off grid poses are."""
-    surface, spread = scene(mesh, resolution)
+def own_methods(surface: Surface, spread: Spread) -> dict[str, Method]:
+    """geomtact's refiners by name, and what no refinement gives."""
     filterreg, icp = _method(FilterReg(surface, spread)), _method(Icp(surface, spread))
 
     def both(problem: Problem, start: Array) -> tuple[Array, bool]:
@@ -136,12 +134,6 @@ def own_methods(mesh: Mesh, resolution: Resolution) -> dict[str, Method]:
         return T, one or other
 
     return {"none": lambda problem, start: (start, True), "icp": icp, "filterreg": filterreg, "both": both}
-
-
-def scene(mesh: Mesh, resolution: Resolution) -> tuple[Surface, Spread]:
-    """The object's surface and how far off start poses may be, as localizing takes them."""
-    surface = Surface(*mesh.sample_surface(SURFACE_POINTS, seed=0))
-    return surface, Spread(resolution.turn_step / np.sqrt(12), resolution.step / np.sqrt(12))
 
 
 def _method(refiner: Refiner) -> Method:
@@ -159,11 +151,9 @@ def summarise(trials: Sequence[Trial]) -> dict[str, Any]:
     than the best of the other libraries, beyond what chance allows: a 95 % interval of the paired difference.
     """
     told = [t for t in trials if t.told]
-    names, kinds = (list(dict.fromkeys(getattr(t, key) for t in trials)) for key in ("method", "contact"))
-    out: dict[str, Any] = {"methods": {}, "success": {}, "lost": []}
-    for name in names:
-        some = [t for t in trials if t.method == name]
-        errors = [t.error_mm for t in told if t.method == name]
+    out: dict[str, Any] = {"methods": {}, "success": {t.contact: [] for t in trials}, "lost": []}
+    for name, some in _grouped(trials, "method").items():
+        errors = [t.error_mm for t in some if t.told]
         drifts = [t.drift_mm for t in some if t.converged]
         out["methods"][name] = {
             "ms_median": float(np.median([t.ms for t in some])),
@@ -172,21 +162,29 @@ def summarise(trials: Sequence[Trial]) -> dict[str, Any]:
             "drift_mm_median": float(np.median(drifts)) if drifts else None,
             "error_mm_median": float(np.median(errors)) if errors else None,
         }
-    for kind in kinds:
-        cells = out["success"][kind] = []
-        for turn in dict.fromkeys(t.turn_deg for t in trials):
-            for shift in dict.fromkeys(t.shift_mm for t in trials):
-                here = [t for t in told if (t.contact, t.turn_deg, t.shift_mm) == (kind, turn, shift)]
-                won = {n: np.array([t.error_mm < SUCCESS_MM for t in here if t.method == n]) for n in names}
-                if not len(won[names[0]]):
-                    continue
-                rates = {n: float(w.mean()) for n, w in won.items()}
-                cells.append({"turn_deg": turn, "shift_mm": shift, "n": len(won[names[0]]), "rates": rates})
-                others = {n: rates[n] for n in names if n not in OWN}
-                if others:
-                    best = max(others, key=lambda n: others[n])
-                    difference = won["filterreg"].astype(float) - won[best]
-                    error = difference.std(ddof=1) / np.sqrt(len(difference)) if len(difference) > 1 else np.inf
-                    if difference.mean() + 1.96 * error < 0:
-                        out["lost"].append({"contact": kind, "turn_deg": turn, "shift_mm": shift, "to": best})
+    for (kind, turn, shift), here in _grouped(told, "contact", "turn_deg", "shift_mm").items():
+        won = {n: np.array([t.error_mm < SUCCESS_MM for t in some]) for n, some in _grouped(here, "method").items()}
+        rates = {name: float(each.mean()) for name, each in won.items()}
+        start = {"turn_deg": turn, "shift_mm": shift}
+        out["success"][kind].append({**start, "n": len(next(iter(won.values()))), "rates": rates})
+        best = max((name for name in rates if name not in OWN), key=rates.__getitem__, default=None)
+        if best is not None and _loses(won["filterreg"], won[best]):
+            out["lost"].append({"contact": kind, **start, "to": best})
     return out
+
+
+def _grouped(trials: Sequence[Trial], *keys: str) -> dict[Any, list[Trial]]:
+    """Trials by the value of a field, or by those of several, in the order in which they come."""
+    of = attrgetter(*keys)
+    out: dict[Any, list[Trial]] = {}
+    for trial in trials:
+        out.setdefault(of(trial), []).append(trial)
+    return out
+
+
+def _loses(won: NDArray[np.bool_], other: NDArray[np.bool_]) -> bool:
+    """Whether ``won`` (n,) is true less often than ``other`` of the same trials, beyond a 95 % interval of the difference."""
+    difference = won.astype(float) - other
+    if len(difference) < 2:
+        return False
+    return bool(difference.mean() + 1.96 * difference.std(ddof=1) / np.sqrt(len(difference)) < 0)

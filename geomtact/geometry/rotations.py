@@ -120,6 +120,12 @@ class Directions:
         turns = np.maximum(1, np.ceil(periods / turn_step - 1e-9)).astype(np.int64)
         return cls(vectors, weights, turns, periods, symmetry, cones, None, np.arange(len(vectors)))
 
+    def angle_step(self, turn_step: float) -> float:
+        """Angle between neighbouring rotations [rad]; ``turn_step`` is that of exact faces."""
+        if self.level is not None:
+            return level_step(self.level)
+        return turn_step if self.periods.any() else 0.0
+
     @cached_property
     def first_turn(self) -> NDArray[np.int64]:
         """Which of :meth:`rotations` is turn 0 of each direction (D,)."""

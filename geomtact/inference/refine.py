@@ -22,7 +22,6 @@ from geomtact.se3 import Array
 from geomtact.sensing.moments import moments, without_specks
 
 _SURFACE_POINTS, _FEWER_POINTS = 30_000, 12_000  # of the object, in a thorough refinement and in a quick one
-_LEAST_TURN = 0.02  # rad
 _RIM = 120  # points of the contact's outline, at most; half of them unless the refinement is to be thorough
 _TRUST = 0.5  # of a likelihood at one pose, in weighing the cells around several
 _SHAPE = (36, 48)  # of the casts that judge a refinement
@@ -35,7 +34,8 @@ class Refinery:
     space: ContactSpace
 
     @cached_property
-    def _surface(self) -> Surface:
+    def surface(self) -> Surface:
+        """The object's surface, as a thorough refinement takes it."""
         return Surface(*self.space.mesh.sample_surface(_SURFACE_POINTS, seed=0))
 
     @cached_property
@@ -47,12 +47,10 @@ class Refinery:
         return self.space.sensor.along(_SHAPE)
 
     def _refiners(self, index: Index, thorough: bool) -> list[Refiner]:
-        # where symmetry leaves no rotation to search, registration is still free to turn a little
-        rotation, step = max(index.angle_step, _LEAST_TURN), index.resolution.step
-        spread = Spread(rotation / np.sqrt(12), step / np.sqrt(12))
+        spread = Spread.of_grid(index.angle_step, index.resolution.step)
         if not thorough:
             return [Icp(self._sparse_surface, spread)]
-        return [FilterReg(self._surface, spread), Icp(self._surface, spread)]
+        return [FilterReg(self.surface, spread), Icp(self.surface, spread)]
 
     def refine(self, posterior: Posterior, mask: NDArray[np.bool_], k: int, thorough: bool = True) -> Posterior:
         """``posterior`` with its ``k`` leading modes refined against the observed ``mask`` (h, w), and weighed anew.
@@ -104,7 +102,7 @@ class Refinery:
         sensor = self.space.sensor
         seen = to_grid(mask, self._shape)
         depths = self.space.caster.depths(sensor, np.asarray(T, float), self._shape)
-        return cast_log_likelihood(depths, seen, float(4 * sensor.half_window.prod() / seen.size))
+        return cast_log_likelihood(depths, seen, sensor.pixel_area(seen.shape))
 
     def _centred(self, posterior: Posterior, contact: NDArray[np.bool_], cells: NDArray[np.int64], T: Array) -> Array:
         """``T`` shifted in the membrane's plane, by at most a lattice step, towards the observed centroid."""

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array, apply, exp, hat, inverse, log
 
+_LEAST_TURN = 0.02  # rad
 _GAIN = 4.0  # a direction is told where the rim's information is this many times what was known before
 
 
@@ -24,6 +25,12 @@ class Spread:
 
     rotation: float
     translation: float
+
+    @classmethod
+    def of_grid(cls, angle_step: float, step: float) -> Spread:
+        """Of poses uniform in a cell of ``angle_step`` [rad] and ``step`` [m]; where symmetry leaves no rotation to search,
+        registration is still free to turn a little."""
+        return cls(max(angle_step, _LEAST_TURN) / np.sqrt(12), step / np.sqrt(12))
 
     def metres(self, length: float) -> Array:
         """(6,) standard deviations of zeta [m]."""

@@ -48,7 +48,7 @@ class PixelLikelihood:
         felt = np.diff(overlaps(index.bits, seen).astype(np.float32), axis=0, prepend=0, append=seen.sum())
         area = np.diff(index.area.astype(np.float32), axis=0, prepend=0, append=seen.size)
         counts = np.concatenate([felt, np.maximum(area - felt, 0)]).T  # (n, 2 (P + 1))
-        weight = _independent(float(4 * index.sensor.half_window.prod() / seen.size))
+        weight = _independent(index.sensor.pixel_area(seen.shape))
         out = np.zeros(index.area.shape, np.float32)
         for p, d in enumerate(depths):
             yes = np.stack([_felt(below[p] - t * d, s) for t, s in product(THRESHOLDS, SOFTNESS)], 1)
