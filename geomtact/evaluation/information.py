@@ -39,14 +39,14 @@ def fisher_information(
     mask = felt_mask(space, T, elastic)
     pitch = np.sqrt(space.sensor.pixel_area(mask.shape))
     outline = make_problem(mask, space.sensor, max_points=_POINTS, correlation=float(np.mean(noise.correlation)))
-    at = space.sensor.to_pixels(space.sensor.project(outline.rim))
+    at = space.sensor.to_pixels(space.sensor.project(outline.points))
     slope = np.zeros((len(at), 6))
     for i, axis in enumerate(np.eye(6)):
         ahead, behind = (felt_mask(space, moved(T, way * _STEP * axis, problem), elastic) for way in (1, -1))
         # the outline moves outwards by what its signed distance grows
         slope[:, i] = (_inside(ahead, at) - _inside(behind, at)) * pitch / (2 * _STEP)
     rms = np.hypot(noise.outline_rms, pixel_noise * pitch)
-    return np.asarray(outline.independence / rms**2 * slope.T @ slope)
+    return np.asarray((slope.T * (outline.weight / rms**2)) @ slope)
 
 
 def told_directions(information: Array, least_std: float) -> tuple[Array, Array]:

@@ -39,7 +39,7 @@ def _method(align: Align, surface: Surface, spread: Spread) -> Method:
         points, normals = near_surface(surface, problem, start, reach)
         if len(points) < 6:
             return start, False
-        motion = align(_MM * problem.rim, _MM * points, normals, _MM * reach)
+        motion = align(_MM * problem.points, _MM * points, normals, _MM * reach)
         if motion is None or not np.isfinite(motion).all():
             return start, False
         motion = np.array(motion, float)

@@ -40,7 +40,7 @@ class Effort:
     resolved : what is scored: "blocks" of about 20 cells, "cells" (on a large grid those where the mass is), or "all"
         cells, their pixels counted too
     modes : that are refined
-    thorough : whether each is refined by all registrations, from the whole outline, or by one from half of its points
+    thorough : whether each is refined by all registrations or by one
     """
 
     resolved: str
@@ -166,7 +166,9 @@ class Localizer:
         if prior is None and self.scorer.witness.odd(evidence, likeliest):
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
         with _timed(timing, "refine"):
-            posterior = self._refinery.refine(posterior, mask, EFFORTS[effort].modes, EFFORTS[effort].thorough)
+            posterior = self._refinery.refine(
+                posterior, observation.contact, EFFORTS[effort].modes, EFFORTS[effort].thorough
+            )
         return replace(posterior, warnings=warnings)
 
     def simulate(self, T_sensor_object: Any) -> Contact:

@@ -19,10 +19,10 @@ from geomtact.registration.rim import make_problem
 from geomtact.scoring.likelihood import cast_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array
+from geomtact.sensing.contact import Contact
 from geomtact.sensing.moments import moments, without_specks
 
-_SURFACE_POINTS, _FEWER_POINTS = 30_000, 12_000  # of the object, in a thorough refinement and in a quick one
-_RIM = 120  # points of the contact's outline, at most; half of them unless the refinement is to be thorough
+_SURFACE_POINTS = 30_000  # of the object
 _TRUST = 0.5  # of a likelihood at one pose, in weighing the cells around several
 _SHAPE = (36, 48)  # of the casts that judge a refinement
 
@@ -35,12 +35,8 @@ class Refinery:
 
     @cached_property
     def surface(self) -> Surface:
-        """The object's surface, as a thorough refinement takes it."""
+        """The object's surface."""
         return Surface(*self.space.mesh.sample_surface(_SURFACE_POINTS, seed=0))
-
-    @cached_property
-    def _sparse_surface(self) -> Surface:
-        return Surface(*self.space.mesh.sample_surface(_FEWER_POINTS, seed=0))
 
     @property
     def _shape(self) -> tuple[int, int]:
@@ -48,39 +44,44 @@ class Refinery:
 
     def _refiners(self, index: Index, thorough: bool) -> list[Refiner]:
         spread = Spread.of_grid(index.angle_step, index.resolution.step)
-        if not thorough:
-            return [Icp(self._sparse_surface, spread)]
-        return [FilterReg(self.surface, spread), Icp(self.surface, spread)]
+        filterreg, icp = FilterReg(self.surface, spread), Icp(self.surface, spread)
+        return [filterreg, icp] if thorough else [filterreg]
 
-    def refine(self, posterior: Posterior, mask: NDArray[np.bool_], k: int, thorough: bool = True) -> Posterior:
-        """``posterior`` with its ``k`` leading modes refined against the observed ``mask`` (h, w), and weighed anew.
+    def refine(self, posterior: Posterior, contact: Contact, k: int, thorough: bool = True) -> Posterior:
+        """``posterior`` with its ``k`` leading modes refined against the observed ``contact``, and weighed anew.
 
         Of the cell's own pose, the same with the contact's centroid moved onto the observed one, and what each
         registration makes of that, the pose at which the observed contact is most likely is kept: a refinement that
         does not raise it is dropped. What the cells of these modes hold together is then shared out among them by how
-        likely the contact is at each.
+        likely the contact is around each: at its pose, times the share of its cell that is as likely (Laplace).
+
+        Parameters
+        ----------
+        contact : its mask on any grid over the window; its height, unless None, is believed
+        thorough : whether every registration has a try, or only the one that does best
         """
         cells = posterior.leading_cells(k)
         if not len(cells):
             return posterior
         index, sensor = posterior.index, self.space.sensor
-        contact = without_specks(mask, sensor.pixel_area(mask.shape))
-        problem = make_problem(contact, sensor, max_points=_RIM if thorough else _RIM // 2)
+        mask = without_specks(contact.mask, sensor.pixel_area(contact.mask.shape))
+        problem = make_problem(mask, sensor, contact.height)
         start = index.poses(cells)
-        candidates = [start, self._centred(posterior, contact, cells, start)]
+        candidates = [start, self._centred(posterior, mask, cells, start)]
         refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index, thorough)]
         poses = np.stack([*candidates, *(r.T for r in refinements)])
-        winner, likelihood = self._best(contact, poses)
-        refined = {}
+        winner, likelihood = self._best(mask, poses)
+        refined, volume = {}, np.zeros(len(cells))
         for i, cell in enumerate(cells):
             best = int(winner[i])
             T = poses[best, i]
             covariance, observable = index.cell_covariance(T), np.zeros((0, 6))
             if best >= len(candidates):
                 found = refinements[best - len(candidates)]
+                volume[i] = 0.5 * (np.linalg.slogdet(found.covariance[i])[1] - np.linalg.slogdet(covariance)[1])
                 covariance, observable = found.covariance[i], found.observable[i]
             refined[int(cell)] = Refined(T, covariance, observable, problem.length, best > 0)
-        return replace(posterior.shared_anew(cells, _TRUST * likelihood), refined=refined)
+        return replace(posterior.shared_anew(cells, _TRUST * (likelihood + np.minimum(volume, 0))), refined=refined)
 
     def _best(self, mask: NDArray[np.bool_], poses: Array) -> tuple[NDArray[np.int64], Array]:
         """At which of the poses (c, n, 4, 4) ``mask`` is most likely, for each of n modes, the first where none touches;

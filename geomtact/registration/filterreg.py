@@ -1,127 +1,184 @@
-"""FilterReg (Gao and Tedrake, CVPR 2019) for the rim of a contact: a Gaussian filter as E-step, point to plane as M-step.
+"""FilterReg (Gao and Tedrake, CVPR 2019) for contacts: a Gaussian filter as E-step, point to plane or to point as M-step.
 
-Each rim point meets the average of the surface points around it, weighted by a Gaussian that narrows from the spread
-of the start poses to the noise of the rim, against a constant for outliers.
+Each observed point meets the average of the surface points around it, weighted by a Gaussian that narrows from the spread
+of the start poses to the noise of the points, against a constant for outliers. Membrane inside the contact that lies out of
+the object, and membrane outside the contact that lies in it, pulls the surface over. All poses are refined at once.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from geomtact.registration.fit import Fit, Meeting, gather, judged, rejected
+from geomtact.registration.fit import FEWEST, Meeting, judged
 from geomtact.registration.observability import Spread, jacobian, moved
 from geomtact.registration.protocol import Problem, Refinement, Surface
-from geomtact.registration.rim import near_surface
 from geomtact.se3 import Array, apply, inverse
 
-_NEIGHBOURS = 5
-_OUTLIER = 0.05  # filter value at which a rim point counts as half an outlier
+_NEIGHBOURS = 8
+_FEWER = 4  # around points that are only inside or outside
+_OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
 _STEPS_AT_END = 12  # with the narrowest filter, at most
-_REST = 0.5  # of the noise that the last step may be
-_STRETCH = np.array([1.0, 1.0, 3.0])  # the rim is known better across the membrane (z) than along it
+_REST = 0.5  # standard deviations that the last step may be
 _SLOPE_NOISE = 0.2  # noise across the membrane, as a share of that along it
+_FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
 
 
 @dataclass(frozen=True)
 class FilterReg:
-    """Refines poses of one object against the rim of a contact.
+    """Refines poses of one object against its contacts.
 
     Attributes
     ----------
     surface : the object's surface, points denser than the sensor's pixels
     spread : how far the start poses may be off
     narrowing : of the filter at each step; the smaller, the fewer steps
+    objective : whether points are drawn to the surface's planes or to its points
     """
 
     surface: Surface
     spread: Spread
-    narrowing: float = 0.6
+    narrowing: float = 0.55
+    objective: Literal["plane", "point"] = "plane"
     name: str = "filterreg"
 
-    def refine(self, problem: Problem, T: Array) -> Refinement:
-        """Refine the poses ``T`` (k, 4, 4), T_sensor_object, one after the other."""
-        fits = [self._refine_one(problem, start) for start in np.asarray(T, float).reshape(-1, 4, 4)]
-        return gather(fits, problem, self.spread)
-
-    def _refine_one(self, problem: Problem, start: Array) -> Fit:
-        reach = 3 * self.spread.radius(problem.length) + 2 * problem.pitch
-        points, normals = near_surface(self.surface, problem, start, reach)
-        if not len(points):
-            return rejected(start)
-        rim_filter = RimFilter(problem, start, points, normals, self.surface.spacing)
-        # the motion zeta and the rim's offset along z are held by what was known before: what the rim does not tell
-        # stays where it was
-        held = np.append(1 / self.spread.metres(problem.length), 1 / problem.sink_std) ** 2
-        state, T, sigma, at_end, at_rest = np.zeros(7), start, reach / 3, 0, False
-        while at_end < _STEPS_AT_END and not at_rest:
-            sigma = max(rim_filter.narrowest, self.narrowing * sigma)
-            at_end += sigma == rim_filter.narrowest
-            meeting = rim_filter.meet(T, state[6], sigma)
-            if meeting.support < 6:
-                return rejected(start)
-            step = np.linalg.solve(meeting.information + np.diag(held), meeting.slope - held * state)
-            state += step
-            T = moved(T, step[:6], problem)
-            at_rest = bool(at_end > 1 and np.linalg.norm(step[:6]) < _REST * problem.noise)
+    def refine(self, problem: Problem, T: Array, sinks: Array | None = None) -> Refinement:
+        """Refine the poses ``T`` (k, 4, 4) of the object in the problem's frame, where the gel sinks around the object by
+        about ``sinks`` (k, c) [m] at each contact, 0 by default."""
+        start = np.asarray(T, float).reshape(-1, 4, 4)
+        contact_filter = ContactFilter(problem, self.surface, self.objective)
+        # motions zeta and sinks of the gel are held by what was known before: what is not told stays where it was
+        held = np.append(1 / self.spread.metres(problem.length), np.full(problem.contacts, 1 / problem.sink_std)) ** 2
+        known = np.zeros((len(start), len(held)))
+        known[:, 6:] = 0.0 if sinks is None else sinks
+        state, T, at_rest = known.copy(), start.copy(), np.zeros(len(start), bool)
+        sigma, at_end = self.spread.radius(problem.length), 0
+        going = np.arange(len(start))
+        while len(going) and at_end < _STEPS_AT_END and len(problem.points) >= FEWEST:
+            sigma = max(contact_filter.narrowest, self.narrowing * sigma)
+            at_end += sigma == contact_filter.narrowest
+            meeting = contact_filter.meet(T[going], state[going, 6:], sigma)
+            supported = meeting.support >= FEWEST
+            slope = meeting.slope - held * (state - known)[going]
+            information = meeting.information + np.diag(held)
+            if len(problem.around):
+                pull = contact_filter.pull(T[going], sigma)
+                information[:, :6, :6] += pull[0]
+                slope[:, :6] += pull[1]
+            step = np.linalg.solve(information, slope[..., None])[..., 0]
+            expected = (step * slope).sum(1)[supported]  # the square of the step in units of what it is known by
+            going, step = going[supported], step[supported]
+            state[going] += step
+            T[going] = moved(T[going], step[:, :6], problem)
+            if at_end > 1:
+                at_rest[going] = expected < _REST**2
+                going = going[~at_rest[going]]
+        meeting = contact_filter.meet(T, state[:, 6:], contact_filter.narrowest)
         return judged(start, T, meeting, at_rest, self.spread, problem)
 
 
-class RimFilter:
-    """Which surface each rim point meets, for poses close to ``start``.
-
-    Parameters
-    ----------
-    problem : with a rim
-    start : (4, 4) T_sensor_object at which the surface is given
-    points, normals : (s, 3) of the surface that may have made the rim, sensor frame at ``start``
-    spacing : of those points [m]
+class ContactFilter:
+    """Which surface each observed point meets at a pose.
 
     Attributes
     ----------
-    narrowest : width of the filter that the rim's noise and the gaps between the surface's points leave [m]
+    noise : of the observed points, in the median [m]
+    narrowest : width of the filter that this noise and the gaps between the surface's points leave [m]
     """
 
-    def __init__(self, problem: Problem, start: Array, points: Array, normals: Array, spacing: float):
-        from scipy.spatial import cKDTree
+    def __init__(self, problem: Problem, surface: Surface, objective: str = "plane"):
+        self.problem, self.surface, self.objective = problem, surface, objective
+        self.noise = float(np.median(problem.noise)) if len(problem.noise) else problem.pitch
+        self.narrowest = float(np.hypot(self.noise, surface.spacing))
 
-        self.problem, self.start, self.points, self.normals = problem, start, points, normals
-        self.narrowest = float(np.hypot(problem.noise, spacing))
-        self._tree = cKDTree(points * _STRETCH)
-
-    def meet(self, T: Array, sink: float, sigma: float) -> Meeting:
-        """Filter the surface at pose ``T`` with width ``sigma`` [m] for a rim ``sink`` [m] above the surface."""
+    def meet(self, T: Array, sinks: Array, sigma: float) -> Meeting:
+        """Filter the surface at poses ``T`` (k, 4, 4) with width ``sigma`` [m], the gel sunk by ``sinks`` (k, c) [m]."""
         problem = self.problem
-        # the rim moves under the surface instead of the surface over the rim: one tree serves all poses
-        motion = T @ inverse(self.start)
-        lowered = problem.rim - sink / problem.rays[:, 2:] * problem.rays
-        rim = apply(inverse(motion), lowered)
-        outward = problem.outward @ motion[:3, :3]
-        distance, index = self._tree.query(rim * _STRETCH, k=min(_NEIGHBOURS, len(self.points)))
-        distance, index = distance.reshape(len(rim), -1), index.reshape(len(rim), -1)
-        n = self.normals[index]
-        # a surface that faces another way along the membrane has not made this part of the rim
-        across = np.einsum("ijk,ik->ij", n, outward)
-        alike = np.clip(across / np.linalg.norm(n[..., :2], axis=2), 0, 1)
-        filtered = alike * np.exp(-0.5 * (distance / sigma) ** 2)
-        total = filtered.sum(1)
-        share = filtered / np.maximum(total, 1e-300)[:, None]
-        target = np.einsum("ij,ijk->ik", share, self.points[index])
-        normal = np.einsum("ij,ijk->ik", share, n)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        inlier = total / n.shape[1]
-        inlier = inlier / (inlier + _OUTLIER)
-
+        points = problem.points + sinks[:, problem.contact, None] * problem.sinking
+        target, normal, inlier = self._filtered(T, points, sigma)
         # noise along the membrane shows along the normal only as far as the surface is steep
-        lateral = np.hypot(np.linalg.norm(normal[:, :2], axis=1), _SLOPE_NOISE)
-        error = ((rim - target) * normal).sum(1)
-        J = jacobian(lowered, normal @ motion[:3, :3].T, problem)
-        J = np.concatenate([J, J[:, 5:]], 1)  # lowering the rim does what raising the object does
-        weight = inlier * problem.independence / (problem.noise * lateral) ** 2
+        lateral = problem.noise * np.hypot(np.einsum("knj,nj->kn", normal, problem.facing), _SLOPE_NOISE)
+        error = ((points - target) * normal).sum(-1)
+        if self.objective == "plane":
+            planes = [(normal, error, lateral)]
+        else:
+            axes = [np.broadcast_to(axis, points.shape) for axis in np.eye(3)]
+            planes = [(axis, (points - target)[..., i], problem.noise) for i, axis in enumerate(axes)]
+        own = problem.contact[:, None] == np.arange(problem.contacts)
+        size = 6 + problem.contacts
+        information, slope = np.zeros((len(T), size, size)), np.zeros((len(T), size))
+        for axis, off, noise in planes:
+            sunk = np.einsum("knj,nj->kn", axis, problem.sinking)
+            J = np.concatenate([jacobian(points, axis, problem), sunk[..., None] * own], -1)
+            more = _normal_equations(J, off, inlier * problem.weight / noise**2)
+            information, slope = information + more[0], slope + more[1]
+        squared = (inlier * (error / lateral) ** 2).sum(1)
         return Meeting(
-            information=(J * weight[:, None]).T @ J,
-            slope=-(J * weight[:, None]).T @ error,
-            residual=float(np.sqrt((inlier * (error / lateral) ** 2).sum() / max(inlier.sum(), 1e-12))),
-            support=int((inlier > 0.5).sum()),
+            information=information,
+            slope=slope,
+            residual=np.sqrt(squared / np.maximum(inlier.sum(1), 1e-12)),
+            support=(inlier > 0.5).sum(1),
         )
+
+    def pull(self, T: Array, sigma: float) -> tuple[Array, Array]:
+        """Normal equations (k, 6, 6), (k, 6) of the membrane that is on the wrong side of the surface."""
+        problem = self.problem
+        points = np.broadcast_to(problem.around, (len(T), *problem.around.shape))
+        near, normals, off = self._nearest(T, points, _FEWER, sigma)
+        distance2 = (off**2).sum(-1)
+        share = np.exp(-0.5 * (distance2 - distance2.min(-1, keepdims=True)) / sigma**2)
+        share /= share.sum(-1, keepdims=True)
+        above = np.einsum("kni,knij,knij->kn", share, normals, off)
+        normal = _unit(np.einsum("kni,knij->knj", share, normals)) @ np.swapaxes(T[:, :3, :3], 1, 2)
+        wrong = problem.side * above > 0
+        # all together weigh as much as the points; what is deeper on the wrong side than the filter is wide may itself be wrong
+        each = problem.weight.sum() / len(problem.around) / self.noise**2
+        return _normal_equations(
+            jacobian(points, normal, problem), above, wrong * each / (1 + (above / (3 * sigma)) ** 2)
+        )
+
+    def _filtered(self, T: Array, points: Array, sigma: float) -> tuple[Array, Array, Array]:
+        """The E-step: where the points (k, n, 3) meet the surface, its normals there, and how surely (k, n)."""
+        R = T[:, :3, :3]
+        facing, across = self.problem.facing @ R, self.problem.across @ R
+        near, normals, off = self._nearest(T, points, _NEIGHBOURS, sigma, facing)
+        face, lean = (np.einsum("knij,knj->kni", normals, v) for v in (facing, across))
+        slope = np.hypot(face, lean)
+        # a surface that faces another way, or runs along the membrane, has not made this part of the outline
+        alike = np.where(slope > _FLAT, np.clip(face / np.maximum(slope, _FLAT), 0, 1), 0)
+        filtered = alike * np.exp(-0.5 * (off**2).sum(-1) / sigma**2)
+        total = filtered.sum(-1)
+        share = filtered / np.maximum(total, 1e-300)[..., None]
+        target, normal = (np.einsum("kni,knij->knj", share, v) for v in (near, normals))
+        return apply(T, target), _unit(normal) @ np.swapaxes(R, 1, 2), total / (total + _OUTLIER)
+
+    def _nearest(
+        self, T: Array, points: Array, most: int, sigma: float, facing: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Nearest surface (k, n, i, 3) of points (k, n, 3), its normals, and the points' distance from it: object frame.
+
+        Where ``facing`` (k, n, 3) is given, in the object's frame, surface that looks that way counts as nearer.
+        """
+        at = apply(inverse(T), points)
+        surface = self.surface.at_scale(sigma)
+        most = min(most, len(surface.points))
+        if facing is None:
+            index = surface.tree.query(at.reshape(-1, 3), k=range(1, most + 1))[1]
+        else:
+            both = np.concatenate([at, surface.turn * facing], -1)
+            index = surface.facing_tree.query(both.reshape(-1, 6), k=range(1, most + 1))[1]
+        index = index.reshape(*at.shape[:-1], most)
+        near = surface.points[index]
+        return near, surface.normals[index], at[..., None, :] - near
+
+
+def _normal_equations(J: Array, error: Array, weight: Array) -> tuple[Array, Array]:
+    """(k, p, p) and (k, p) from the slopes (k, n, p) of errors (k, n) and their weights (k, n)."""
+    weighted = np.swapaxes(J * weight[..., None], 1, 2)
+    return weighted @ J, -(weighted @ error[..., None])[..., 0]
+
+
+def _unit(v: Array) -> Array:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))

@@ -1,78 +1,74 @@
-"""One refined pose, whether it can be believed, and how the fits of several modes become one result."""
+"""How what was observed lies on the surface at some poses, and which of them can be believed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from geomtact.registration.observability import Spread, summary, without_sink
+from geomtact.registration.observability import Spread, motion_of, moved, summary, without_sinks
 from geomtact.registration.protocol import Problem, Refinement
-from geomtact.se3 import Array, apply, inverse
+from geomtact.se3 import Array
 
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """One refined pose; ``information`` (6, 6) about zeta (see observability) is zero where it did not converge."""
-
-    T: Array
-    converged: bool
-    information: Array
-    residual: float
-    support: int
+FEWEST = 6  # points on the surface without which no pose is believed
+_SHARE = 0.3  # of the points that must lie on it
+_LOOSE = 3.0  # residual, in units of the noise, beyond which a pose is not believed
+_RAN = 4.0  # standard deviations of the start that a pose may move
 
 
 @dataclass(frozen=True, eq=False)
 class Meeting:
-    """How the rim lies on the surface at one pose.
+    """How what was observed lies on the surface at k poses, with c contacts.
 
     Attributes
     ----------
-    information, slope : (7, 7), (7,) normal equations about zeta (see observability) and the rim's offset along z
-    residual : rms distance of the rim from the surface, measured along the membrane [m]
-    support : how many rim points lie on the surface
+    information, slope : (k, 6 + c, 6 + c), (k, 6 + c) normal equations about zeta (see observability) and the sinks
+    residual : (k,) rms distance of the points from the surface, in units of their noise
+    support : (k,) how many points lie on the surface
     """
 
     information: Array
     slope: Array
-    residual: float
-    support: int
+    residual: Array
+    support: NDArray[np.int64]
 
 
-def rejected(start: Array, residual: float = np.inf, support: int = 0) -> Fit:
-    """The start pose, about which nothing was learnt."""
-    return Fit(start, False, np.zeros((6, 6)), residual, support)
+def as_far_as_told(start: Array, T: Array, meeting: Meeting, spread: Spread, problem: Problem) -> Array:
+    """``T`` (k, 4, 4) moved back to ``start`` (k, 4, 4) as far as what is told where they meet is less than was known."""
+    zeta = motion_of(start, T, problem)
+    held = np.diag(spread.metres(problem.length) ** -2.0)
+    for i, each in enumerate(meeting.information):
+        information = without_sinks(each, problem.sink_std)
+        if np.isfinite(information).all():
+            zeta[i] = np.linalg.solve(information + held, information @ zeta[i])
+    return moved(start, zeta, problem)
 
 
-def gather(fits: list[Fit], problem: Problem, spread: Spread) -> Refinement:
-    """One Refinement of all fits."""
-    told_of = [summary(fit.T, fit.information, spread, problem) for fit in fits]
-    return Refinement(
-        T=np.array([fit.T for fit in fits]).reshape(-1, 4, 4),
-        converged=np.array([fit.converged for fit in fits], bool),
-        covariance=np.array([covariance for covariance, _ in told_of]).reshape(-1, 6, 6),
-        observable=[rows for _, rows in told_of],
-        residual=np.array([fit.residual for fit in fits]),
-        support=np.array([fit.support for fit in fits], int),
-        length=problem.length,
-    )
+def judged(
+    start: Array, T: Array, meeting: Meeting, at_rest: NDArray[np.bool_], spread: Spread, problem: Problem
+) -> Refinement:
+    """``T`` (k, 4, 4) where it can be believed: the starts (k, 4, 4) elsewhere, about which nothing was learnt.
 
-
-def judged(start: Array, T: Array, meeting: Meeting, at_rest: bool, spread: Spread, problem: Problem) -> Fit:
-    """The fit to ``T``, or the start pose unless the rim lies on the surface and the pose came to rest nearby."""
-    ran = np.linalg.norm(apply(T @ inverse(start), problem.centre[None])[0] - problem.centre)
-    turned = np.arccos(np.clip((np.trace(T[:3, :3].T @ start[:3, :3]) - 1) / 2, -1, 1))
+    A pose is believed that came to rest near its start, with what was observed on the surface.
+    """
+    zeta = motion_of(start, T, problem).reshape(-1, 2, 3)
+    ran = np.linalg.norm(zeta, axis=2) / [spread.rotation * problem.length, spread.translation]
     believed = (
         at_rest
-        and np.isfinite(T).all()
-        and np.isfinite(meeting.information).all()
-        and meeting.support >= max(6, 0.3 * len(problem.rim))
-        and meeting.residual < 3 * problem.noise
-        and ran < 4 * spread.translation
-        and turned < 4 * spread.rotation
+        & np.isfinite(T).all((1, 2))
+        & np.isfinite(meeting.information).all((1, 2))
+        & (meeting.support >= max(FEWEST, _SHARE * len(problem.points)))
+        & (meeting.residual < _LOOSE)
+        & (ran < _RAN).all(1)
     )
-    if not believed:
-        return rejected(start, meeting.residual, meeting.support)
-    # noise larger than assumed tells less
-    information = meeting.information[:6, :6] / max(1.0, meeting.residual / problem.noise) ** 2
-    return Fit(T, True, without_sink(information, problem.sink_std), meeting.residual, meeting.support)
+    out = np.where(believed[:, None, None], T, start)
+    covariance, observable = np.zeros((len(T), 6, 6)), []
+    for i in range(len(T)):
+        information = np.zeros((6, 6))
+        if believed[i]:
+            # noise larger than assumed tells less
+            information = without_sinks(meeting.information[i], problem.sink_std) / max(1.0, meeting.residual[i]) ** 2
+        covariance[i], rows = summary(out[i], information, spread, problem)
+        observable.append(rows)
+    return Refinement(out, believed, covariance, observable, meeting.residual, meeting.support, problem.length)

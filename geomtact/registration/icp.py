@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geomtact.registration.filterreg import RimFilter
-from geomtact.registration.fit import Fit, gather, judged, rejected
-from geomtact.registration.observability import Spread, motion_of, moved, without_sink
+from geomtact.registration.filterreg import ContactFilter
+from geomtact.registration.fit import FEWEST, as_far_as_told, judged
+from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.registration.rim import near_surface
 from geomtact.se3 import Array, inverse
@@ -37,28 +37,26 @@ class Icp:
     name: str = "icp"
 
     def refine(self, problem: Problem, T: Array) -> Refinement:
-        """Refine the poses ``T`` (k, 4, 4), T_sensor_object, one after the other."""
+        """Refine the poses ``T`` (k, 4, 4) of the object in the problem's frame, one after the other."""
+        start = np.asarray(T, float).reshape(-1, 4, 4)
         with _one_thread():
-            fits = [self._refine_one(problem, start) for start in np.asarray(T, float).reshape(-1, 4, 4)]
-        return gather(fits, problem, self.spread)
+            found = [self._register(problem, pose) for pose in start]
+        met = np.array([pose is not None for pose in found], bool)
+        ended = np.array([first if pose is None else pose for first, pose in zip(start, found, strict=True)])
+        contact_filter = ContactFilter(problem, self.surface)
+        sinks, sigma = np.zeros((len(start), problem.contacts)), contact_filter.narrowest
+        T = ended.reshape(-1, 4, 4)
+        T = as_far_as_told(start, T, contact_filter.meet(T, sinks, sigma), self.spread, problem)
+        return judged(start, T, contact_filter.meet(T, sinks, sigma), met, self.spread, problem)
 
-    def _refine_one(self, problem: Problem, start: Array) -> Fit:
+    def _register(self, problem: Problem, start: Array) -> Array | None:
         reach = 3 * self.spread.radius(problem.length) + 2 * problem.pitch
         points, normals = near_surface(self.surface, problem, start, reach)
-        if len(points) < 6:
-            return rejected(start)
+        if len(points) < FEWEST:
+            return None
         motion = _register(problem, points, normals, reach)
-        if motion is None or not np.isfinite(motion).all():
-            return rejected(start)
-        # Open3D moves the rim onto the surface; the object moves the other way
-        T = inverse(motion) @ start
-        rim_filter = RimFilter(problem, start, points, normals, self.surface.spacing)
-        information = rim_filter.meet(T, 0.0, rim_filter.narrowest).information[:6, :6]
-        information = without_sink(information, problem.sink_std)
-        held = np.diag(self.spread.metres(problem.length) ** -2.0)
-        kept = np.linalg.solve(information + held, information @ motion_of(start, T, problem))
-        T = moved(start, kept, problem)
-        return judged(start, T, rim_filter.meet(T, 0.0, rim_filter.narrowest), True, self.spread, problem)
+        # Open3D moves what was observed onto the surface; the object moves the other way
+        return None if motion is None or not np.isfinite(motion).all() else inverse(motion) @ start
 
 
 def _register(problem: Problem, points: Array, normals: Array, reach: float) -> Array | None:
@@ -70,11 +68,11 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
     # Open3D's tolerances are absolute and made for metres of room: in units of a pixel they fit
     unit = problem.pitch
     anchors, axes = _anchors(problem, reach)
-    rim.points = o3d.utility.Vector3dVector(np.concatenate([problem.rim, anchors]) / unit)
+    rim.points = o3d.utility.Vector3dVector(np.concatenate([problem.points, anchors]) / unit)
     cloud.points = o3d.utility.Vector3dVector(np.concatenate([points, anchors]) / unit)
     cloud.normals = o3d.utility.Vector3dVector(np.concatenate([normals, axes]))
     motion, found = np.eye(4), False
-    for within in (reach, 3 * problem.noise + problem.pitch):
+    for within in (reach, 3 * float(np.median(problem.noise)) + problem.pitch):
         result = registration.registration_icp(
             rim,
             cloud,

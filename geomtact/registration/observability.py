@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomtact.registration.protocol import Problem
-from geomtact.se3 import Array, apply, exp, hat, inverse, log
+from geomtact.se3 import Array, apply, exp, hat, inverse, log, transform
 
 _LEAST_TURN = 0.02  # rad
 _GAIN = 4.0  # a direction is told where the rim's information is this many times what was known before
@@ -42,20 +42,21 @@ class Spread:
 
 
 def jacobian(points: Array, normals: Array, problem: Problem) -> Array:
-    """Change of normals . (points - surface) (n,) by zeta in sensor axes: (n, 6).
+    """Change of normals . (points - surface) (..., n) by zeta in the problem's axes: (..., n, 6).
 
     Moving the object by zeta moves it under the points, so distances to its surface shrink along the normals.
     """
-    return -np.concatenate([np.cross(points - problem.centre, normals) / problem.length, normals], 1)
+    return -np.concatenate([np.cross(points - problem.centre, normals) / problem.length, normals], -1)
 
 
-def without_sink(information: Array, sink_std: float) -> Array:
-    """Information (6, 6) about zeta after the rim's unknown offset along z has been integrated out.
+def without_sinks(information: Array, sink_std: float) -> Array:
+    """Information (6, 6) about zeta, from that about zeta and the sinks of c contacts (6 + c, 6 + c), when sinks are not known.
 
-    That offset acts as a shift of the object along z does, so what the rim tells about z is capped at 1 / sink_std^2.
+    A sink acts as a shift of the object along the membrane's normal does, so that what one contact tells about that shift
+    is capped at 1 / sink_std^2.
     """
-    z = information[5]
-    return information - np.outer(z, z) / (1 / sink_std**2 + z[5])
+    mixed, sinks = information[:6, 6:], information[6:, 6:]
+    return information[:6, :6] - mixed @ np.linalg.solve(sinks + np.eye(len(sinks)) / sink_std**2, mixed.T)
 
 
 def told(information: Array, spread: Spread, length: float) -> tuple[Array, Array, Array]:
@@ -70,19 +71,15 @@ def told(information: Array, spread: Spread, length: float) -> tuple[Array, Arra
 
 
 def moved(T: Array, zeta: ArrayLike, problem: Problem) -> Array:
-    """Pose after the motion ``zeta`` (6,), in sensor axes about the contact's centre."""
-    zeta, about = np.asarray(zeta, float), np.eye(4)
-    about[:3, 3] = problem.centre
-    motion = about @ exp(np.concatenate([zeta[:3] / problem.length, zeta[3:]])) @ inverse(about)
-    return motion @ T
+    """Poses (..., 4, 4) after the motions ``zeta`` (..., 6), in the problem's axes about the contact's centre."""
+    about = transform(np.eye(3), problem.centre)
+    return about @ exp(np.asarray(zeta, float) / np.repeat([problem.length, 1.0], 3)) @ inverse(about) @ T
 
 
 def motion_of(start: Array, T: Array, problem: Problem) -> Array:
-    """Inverse of :func:`moved`: the zeta (6,) that takes ``start`` to ``T``."""
-    about = np.eye(4)
-    about[:3, 3] = problem.centre
-    xi = log(inverse(about) @ T @ inverse(start) @ about)
-    return np.concatenate([xi[:3] * problem.length, xi[3:]])
+    """Inverse of :func:`moved`: the zeta (..., 6) that takes ``start`` to ``T``."""
+    about = transform(np.eye(3), problem.centre)
+    return log(inverse(about) @ T @ inverse(start) @ about) * np.repeat([problem.length, 1.0], 3)
 
 
 def summary(T: Array, information: Array, spread: Spread, problem: Problem) -> tuple[Array, Array]:

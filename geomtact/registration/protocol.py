@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
@@ -13,6 +13,11 @@ from geomtact.se3 import Array
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
+
+_FEWEST_POINTS = 2000  # by which a surface is made coarser still
+_DENSE = 1.5  # points per width of a filter, along a line
+_TURN = 2.0  # gaps between points that count as much as a normal which differs by 1
+_DEEP = 1e-3  # m that this counts as at least: so deep below the membrane, faces parallel to it lie
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,40 +45,108 @@ class Surface:
 
         return cKDTree(self.points)
 
+    @cached_property
+    def turn(self) -> float:
+        """How far away a point counts as whose normal differs by 1 [m]."""
+        return max(_TURN * self.spacing, _DEEP)
+
+    @cached_property
+    def facing_tree(self) -> cKDTree:
+        """Of points and normals together (M, 6), normals times :attr:`turn`."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(np.concatenate([self.points, self.turn * self.normals], 1))
+
+    @cached_property
+    def coarser(self) -> Surface | None:
+        """Every fourth point: the surface at twice the spacing; None where few are left."""
+        return Surface(self.points[::4], self.normals[::4]) if len(self.points) > _FEWEST_POINTS else None
+
+    def at_scale(self, sigma: float) -> Surface:
+        """The surface by as many points as a filter ``sigma`` [m] wide needs."""
+        if sigma < _DENSE * 2 * self.spacing or self.coarser is None:
+            return self
+        return self.coarser.at_scale(sigma)
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """One observed contact, ready for registration. Sensor frame, metres.
+    """What was observed, of one contact or of several, ready for registration: all in one frame, metres.
 
     Attributes
     ----------
-    rim : (n, 3) points of the contact's outline on the membrane, evenly spaced
-    outward : (n, 3) unit vectors parallel to z = 0 that point out of the contact
-    rays : (n, 3) unit vectors from the camera through the rim
-    centre : (3,) centre of the contact
-    length : size of the contact (rms distance from its centre); rotations are scaled by it
-    spacing : between neighbouring rim points
-    pitch : of the image's pixels
-    noise : standard deviation of the rim along ``outward``
-    correlation : length over which that noise is alike: closer rim points tell the same thing
-    sink_std : by how much the whole rim may lie above the surface because an elastic gel sinks around the object
+    points : (n, 3) where the object's surface was met: contact outlines on the membrane, and where heights are known the gel
+    facing : (n, 3) unit vectors that the surface looks along there: out of the contact, parallel to the membrane, on an
+        outline; towards the camera within a contact
+    across : (n, 3) unit vectors along which it may lean freely: along the membrane and along the outline; 0 within a contact
+    sinking : (n, 3) how a point moves for each metre that the gel sinks around the object; 0 where heights are known
+    noise : (n,) standard deviation of each point along ``facing``
+    weight : (n,) share of each point that tells something new: neighbours err alike
+    contact : (n,) which contact it belongs to
+    around : (m, 3) points of the membranes that lie inside the object where ``side`` (m,) is 1, outside where it is -1
+    centre : (3,) of the contacts
+    length : size of the contacts (rms distance from the centre); rotations are scaled by it
+    pitch : of the images' pixels
+    sink_std : by how much a whole outline may lie above the surface because an elastic gel sinks around the object
     """
 
-    rim: Array
-    outward: Array
-    rays: Array
+    points: Array
+    facing: Array
+    across: Array
+    sinking: Array
+    noise: Array
+    weight: Array
+    contact: NDArray[np.int64]
+    around: Array
+    side: NDArray[np.int64]
     centre: Array
     length: float
-    spacing: float
     pitch: float
-    noise: float
-    correlation: float
     sink_std: float
 
     @property
-    def independence(self) -> float:
-        """Share of the rim points that tell something new: their spacing over the noise's correlation length."""
-        return min(1.0, self.spacing / self.correlation)
+    def contacts(self) -> int:
+        """How many contacts there are."""
+        return int(self.contact.max(initial=0)) + 1
+
+    def sunk(self, sink: Array | float) -> Problem:
+        """As observed with a gel that sinks by ``sink`` [m], one number or (n,), around the object."""
+        return replace(self, points=self.points + np.reshape(sink, (-1, 1)) * self.sinking)
+
+    @staticmethod
+    def joined(problems: list[Problem], T_world_sensor: Array) -> Problem:
+        """All contacts as one, from the frames of their sensors (c, 4, 4) in the world: what one does not tell another may."""
+
+        def along(name: str) -> Array:
+            turned = (getattr(p, name) @ T[:3, :3].T for p, T in zip(problems, T_world_sensor, strict=True))
+            return np.concatenate(list(turned))
+
+        def placed(name: str) -> Array:
+            moved = (getattr(p, name) @ T[:3, :3].T + T[:3, 3] for p, T in zip(problems, T_world_sensor, strict=True))
+            return np.concatenate(list(moved))
+
+        def strung(name: str) -> Array:
+            return np.concatenate([getattr(p, name) for p in problems])
+
+        points = placed("points")
+        centre = points.mean(0) if len(points) else np.zeros(3)
+        spread = np.sqrt(((points - centre) ** 2).sum(1).mean()) if len(points) else 0.0
+        first = np.cumsum([0] + [p.contacts for p in problems])
+        return Problem(
+            points=points,
+            facing=along("facing"),
+            across=along("across"),
+            sinking=along("sinking"),
+            noise=strung("noise"),
+            weight=strung("weight"),
+            contact=np.concatenate([p.contact + i for p, i in zip(problems, first, strict=False)]),
+            around=placed("around"),
+            side=strung("side").astype(np.int64),
+            centre=centre,
+            length=max(float(spread), *(p.pitch for p in problems)),
+            pitch=max(p.pitch for p in problems),
+            sink_std=max(p.sink_std for p in problems),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +155,12 @@ class Refinement:
 
     Attributes
     ----------
-    T : (k, 4, 4) T_sensor_object
-    converged : (k,) bool: enough of the rim lies on the surface, and the pose has stopped moving
+    T : (k, 4, 4) of the object in the problem's frame
+    converged : (k,) bool: enough of what was observed lies on the surface, and the pose has stopped moving
     covariance : (k, 6, 6) of xi = (rx, ry, rz, tx, ty, tz) in T exp(xi^), radians and metres
     observable : k arrays (r, 6) of orthonormal rows: the directions of xi that the contact tells, rotations times length
-    residual : (k,) rms distance of the rim from the surface, measured along the membrane [m]; inf without support
-    support : (k,) how many rim points lie on the surface
+    residual : (k,) rms distance of the points from the surface, in units of their noise; inf without support
+    support : (k,) how many points lie on the surface
     length : by which rotations are scaled in ``observable`` [m]
     """
 
@@ -101,11 +174,11 @@ class Refinement:
 
 
 class Refiner(Protocol):
-    """Moves poses so that the object's surface meets the rim of one contact."""
+    """Moves poses so that the object's surface meets what was observed."""
 
     @property
     def name(self) -> str: ...
 
     def refine(self, problem: Problem, T: Array) -> Refinement:
-        """Refine the poses ``T`` (k, 4, 4), T_sensor_object."""
+        """Refine the poses ``T`` (k, 4, 4) of the object in the problem's frame."""
         ...

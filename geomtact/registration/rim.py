@@ -1,13 +1,15 @@
-"""The rim of a contact, lifted to the membrane, and the part of the object's surface that may have made it.
+"""A contact as registration sees it: its outline on the membrane, points inside and outside it, and heights where known.
 
-Along the rim the object's surface crosses the membrane, so the rim is a curve on the surface. An elastic gel sinks
-around the object: its rim lies a little above the surface. That offset along z looks exactly like a smaller
-penetration, so the rim cannot tell the two apart: its expected size is given (``sink``), and what is not known of it
-(``sink_std``) is taken off what the rim tells about z.
+Along the outline the object's surface crosses the membrane, so the outline is a curve on the surface. An elastic gel sinks
+around the object: its outline lies a little above the surface. That offset along z looks exactly like a smaller
+penetration, so the outline cannot tell the two apart: its expected size is given (``sink``), and what is not known of it
+(``sink_std``) is taken off what the outline tells about z. Membrane inside the outline lies within the object, membrane
+outside of it does not. Where the reading has heights, the gel lies on the object's surface all over the contact.
 """
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -15,75 +17,139 @@ from geomtact.registration.protocol import Problem, Surface
 from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.sensor import Sensor
 
-_FEWEST = 4  # rim points on a contour; shorter ones are specks
+_FEWEST = 4  # points on a contour; shorter ones are specks
 _FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
+_CLEAR = 0.5e-3  # m that a point is off the outline to count as inside or outside of it
+_AROUND = 4e-3  # m from the contact within which points outside of it are taken
 
 
 def make_problem(
     mask: ArrayLike,
     sensor: Sensor,
+    height: ArrayLike | None = None,
     *,
     max_points: int = 120,
     outline_noise: float = 0.15e-3,
+    height_noise: float = 0.1e-3,
     correlation: float = 2e-3,
     sink: float = 0.0,
     sink_std: float = 0.3e-3,
 ) -> Problem:
-    """The rim of a contact as points of the membrane.
+    """One contact, in the sensor's frame.
 
     Parameters
     ----------
     mask : (H, W) bool, on any grid over the sensor's window
     sensor : whose membrane the contact lies on
-    max_points : of the rim
+    height : (H, W) how deep the gel is pressed in [m], where the reading tells; NaN tells nothing. The contact is then taken
+        to end where it is half of the deepest, and ``sink`` is not used
+    max_points : of the outline, of the heights, and of what lies inside and outside, at most
     outline_noise : how far the outline of a real mask strays, standard deviation along its normal [m]
-    correlation : over what length it strays the same way [m]
-    sink : how far below the membrane the object's surface lies at the rim [m]: 0 for a rigid gel
+    height_noise : standard deviation of heights [m]
+    correlation : over what length both stray the same way [m]
+    sink : how far below the membrane the object's surface lies at the outline [m]: 0 for a rigid gel
     sink_std : and how much more or less it may be [m]
     """
-    mask = np.asarray(mask, bool)
-    pitch_xy = 2 * sensor.half_window / mask.shape[::-1]
+    contact: NDArray[np.bool_] = np.asarray(mask, bool)
+    if height is not None:
+        # of an elastic gel, what is not pressed in half as deep as the deepest may hang free of the object
+        depth = np.nan_to_num(np.asarray(height, float), nan=0.0)
+        sink, sink_std = 0.5 * float(depth.max(where=contact, initial=0.0)), 0.0
+        contact = contact & (depth > sink)
+    pitch_xy = 2 * sensor.half_window / contact.shape[::-1]
     pitch = float(np.sqrt(pitch_xy.prod()))
-    pixels, outward, spacing = _outline(mask, pitch_xy, max_points)
 
     def lifted(uv: Array) -> Array:
         return sensor.lift((uv + 0.5) * pitch_xy - sensor.half_window)
 
+    pixels, outward, spacing = _outline(contact, pitch_xy, max_points)
     rim = lifted(pixels)
-    rays = rim + [0.0, 0.0, sensor.camera_distance] if sensor.camera_distance else np.zeros_like(rim) + [0.0, 0.0, 1.0]
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    rim = rim - sink / rays[:, 2:] * rays
-    centre = rim.mean(0) if len(rim) else np.zeros(3)
-    length = float(np.sqrt(((rim - centre) ** 2).sum(1).mean())) if len(rim) else 0.0
+    down = _down(rim, sensor)
+    facing = np.concatenate([outward, np.zeros((len(outward), 1))], 1)
+    points = [rim + sink * down]
+    facings = [facing]
+    noises = [np.full(len(rim), np.hypot(outline_noise, 0.3 * pitch))]
+    weights = [np.full(len(rim), min(1.0, spacing / correlation))]
+    if height is not None:
+        uv, apart = _spaced(contact, pitch_xy, max_points)
+        gel = lifted(uv)
+        points.append(gel + depth[tuple(uv.astype(int).T[::-1])][:, None] * _down(gel, sensor))
+        facings.append(_unit(_down(gel, sensor)))
+        noises.append(np.full(len(gel), np.hypot(height_noise, 0.1 * pitch)))
+        weights.append(np.full(len(gel), min(1.0, (apart / correlation) ** 2)))
+    within = [(0, len(gel)), (0, 0)] if height is not None else [(0, 0), (0, 0)]  # points that are on no outline
+    inside, outside = (lifted(uv) for uv in _inside_and_outside(contact, pitch_xy, max_points))
+    # what the gel may have sunk to lies neither inside nor outside
+    inside, outside = inside + sink * _down(inside, sensor), outside + (sink + sink_std) * _down(outside, sensor)
+    every = np.concatenate(points)
+    centre = every.mean(0) if len(every) else np.zeros(3)
+    length = float(np.sqrt(((every - centre) ** 2).sum(1).mean())) if len(every) else 0.0
     return Problem(
-        rim=rim,
-        outward=np.concatenate([outward, np.zeros((len(outward), 1))], 1),
-        rays=rays,
+        points=every,
+        facing=np.concatenate(facings),
+        across=np.pad(_unit(np.cross(down, facing)), within),
+        sinking=np.pad(down if height is None else 0 * down, within),
+        noise=np.concatenate(noises),
+        weight=np.concatenate(weights),
+        contact=np.zeros(len(every), np.int64),
+        around=np.concatenate([inside, outside]),
+        side=np.repeat([1, -1], [len(inside), len(outside)]),
         centre=centre,
         length=max(length, pitch),
-        spacing=spacing,
         pitch=pitch,
-        noise=float(np.hypot(outline_noise, 0.3 * pitch)),
-        correlation=correlation,
         sink_std=max(sink_std, 1e-9),
     )
 
 
-def near_surface(surface: Surface, problem: Problem, T: Array, reach: float) -> tuple[Array, Array]:
-    """Points (s, 3) and normals (s, 3), sensor frame at ``T``, of the surface that may have made the rim.
+def _down(points: Array, sensor: Sensor) -> Array:
+    """Towards the camera (n, 3), per metre along z, from points (n, 3)."""
+    if not sensor.camera_distance:
+        return np.tile([0.0, 0.0, -1.0], (len(points), 1))
+    camera = np.array([0.0, 0.0, -sensor.camera_distance])
+    return -(points - camera) / (points - camera)[:, 2:]
 
-    It lies within ``reach`` [m] of the rim and is not parallel to the membrane, or it would not cross it.
-    """
-    if len(problem.rim) < _FEWEST:
+
+def _unit(v: Array) -> Array:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
+
+
+def near_surface(surface: Surface, problem: Problem, T: Array, reach: float) -> tuple[Array, Array]:
+    """Points (s, 3) and normals (s, 3) of the surface, in the problem's frame at ``T``, within ``reach`` [m] of what was
+    observed, as far as they may have made a single contact: not parallel to its membrane."""
+    if len(problem.points) < _FEWEST:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    around = float(np.linalg.norm(problem.rim - problem.centre, axis=1).max()) + reach
+    around = float(np.linalg.norm(problem.points - problem.centre, axis=1).max()) + reach
     centre = apply(inverse(T), problem.centre[None])[0]
     index = np.array(surface.tree.query_ball_point(centre, around, return_sorted=False), dtype=np.intp)
-    # few of these points lie close to the membrane: heights first
-    z = surface.points[index] @ T[2, :3] + T[2, 3]
-    index = index[(z > problem.rim[:, 2].min() - reach) & (z < problem.rim[:, 2].max() + reach)]
-    index = index[np.abs(surface.normals[index] @ T[2, :3]) < np.sqrt(1 - _FLAT**2)]
+    if problem.contacts == 1:
+        # few of these points lie close to the membrane: heights first
+        z = surface.points[index] @ T[2, :3] + T[2, 3]
+        index = index[(z > problem.points[:, 2].min() - reach) & (z < problem.points[:, 2].max() + reach)]
+        if problem.across.any(1).all():
+            index = index[np.abs(surface.normals[index] @ T[2, :3]) < np.sqrt(1 - _FLAT**2)]
     return apply(T, surface.points[index]), surface.normals[index] @ T[:3, :3].T
+
+
+def _inside_and_outside(mask: NDArray[np.bool_], pitch_xy: Array, most: int) -> tuple[Array, Array]:
+    """Pixels (m, 2), (l, 2) as (column, row) that are clearly in contact, and clearly not but close to it."""
+    image = mask.astype(np.uint8)
+    if not mask.any():
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    clear = _CLEAR / float(np.sqrt(pitch_xy.prod()))
+    inside = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > clear
+    off = cv2.distanceTransform(1 - image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outside = (off > clear) & (off < clear * _AROUND / _CLEAR)
+    return _spaced(inside, pitch_xy, most // 2)[0], _spaced(outside, pitch_xy, most // 2)[0]
+
+
+def _spaced(where: NDArray[np.bool_], pitch_xy: Array, most: int) -> tuple[Array, float]:
+    """At most ``most`` pixels (m, 2) as (column, row) spread evenly over those of ``where`` (h, w), and how far apart [m]."""
+    area = float(where.sum() * pitch_xy.prod())
+    apart = np.maximum(1, np.ceil(np.sqrt(area / max(most, 1)) / pitch_xy)).astype(int)
+    some = np.zeros_like(where)
+    some[apart[1] // 2 :: apart[1], apart[0] // 2 :: apart[0]] = True
+    rows, cols = np.nonzero(where & some)
+    return np.stack([cols, rows], 1)[:most].astype(float), float(np.sqrt((apart * pitch_xy).prod()))
 
 
 def _outline(mask: NDArray[np.bool_], pitch_xy: Array, max_points: int) -> tuple[Array, Array, float]:
