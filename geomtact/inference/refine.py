@@ -53,7 +53,7 @@ class Refinery:
         Of the cell's own pose, the same with the contact's centroid moved onto the observed one, and what each
         registration makes of that, the pose at which the observed contact is most likely is kept: a refinement that
         does not raise it is dropped. What the cells of these modes hold together is then shared out among them by how
-        likely the contact is around each: at its pose, times the share of its cell that is as likely (Laplace).
+        likely the contact is at each.
 
         Parameters
         ----------
@@ -71,17 +71,16 @@ class Refinery:
         refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index, thorough)]
         poses = np.stack([*candidates, *(r.T for r in refinements)])
         winner, likelihood = self._best(mask, poses)
-        refined, volume = {}, np.zeros(len(cells))
+        refined = {}
         for i, cell in enumerate(cells):
             best = int(winner[i])
             T = poses[best, i]
             covariance, observable = index.cell_covariance(T), np.zeros((0, 6))
             if best >= len(candidates):
                 found = refinements[best - len(candidates)]
-                volume[i] = 0.5 * (np.linalg.slogdet(found.covariance[i])[1] - np.linalg.slogdet(covariance)[1])
                 covariance, observable = found.covariance[i], found.observable[i]
             refined[int(cell)] = Refined(T, covariance, observable, problem.length, best > 0)
-        return replace(posterior.shared_anew(cells, _TRUST * (likelihood + np.minimum(volume, 0))), refined=refined)
+        return replace(posterior.shared_anew(cells, _TRUST * likelihood), refined=refined)
 
     def _best(self, mask: NDArray[np.bool_], poses: Array) -> tuple[NDArray[np.int64], Array]:
         """At which of the poses (c, n, 4, 4) ``mask`` is most likely, for each of n modes, the first where none touches;

@@ -17,11 +17,11 @@ from geomtact.registration.observability import Spread, jacobian, moved
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.se3 import Array, apply, inverse
 
-_NEIGHBOURS = 8
-_FEWER = 4  # around points that are only inside or outside
+_NEIGHBOURS = 6
+_FEWER = 2  # around points that are only inside or outside
 _OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
-_STEPS_AT_END = 12  # with the narrowest filter, at most
-_REST = 0.5  # standard deviations that the last step may be
+_STEPS_AT_END = 8  # with the narrowest filter, at most
+_REST = 1.0  # standard deviations that the last step may be
 _SLOPE_NOISE = 0.2  # noise across the membrane, as a share of that along it
 _FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
 
