@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from geomtact.registration.fit import FEWEST, Meeting, judged
+from geomtact.registration.fit import FEWEST, Meeting, judged, only_told
 from geomtact.registration.observability import Spread, jacobian, moved
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.se3 import Array, apply, inverse
@@ -22,7 +22,7 @@ _FEWER = 2  # around points that are only inside or outside
 _OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
 _STEPS_AT_END = 8  # with the narrowest filter, at most
 _REST = 1.0  # standard deviations that the last step may be
-_SLOPE_NOISE = 0.2  # noise across the membrane, as a share of that along it
+_SLOPE_NOISE = 0.3  # noise across the membrane, as a share of that along it
 _FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
 
 
@@ -75,7 +75,9 @@ class FilterReg:
             if at_end > 1:
                 at_rest[going] = expected < _REST**2
                 going = going[~at_rest[going]]
-        meeting = contact_filter.meet(T, state[:, 6:], contact_filter.narrowest)
+        sinks, sigma = state[:, 6:], contact_filter.narrowest
+        T = only_told(start, T, contact_filter.meet(T, sinks, sigma), self.spread, problem)
+        meeting = contact_filter.meet(T, sinks, sigma)
         return judged(start, T, meeting, at_rest, self.spread, problem)
 
 

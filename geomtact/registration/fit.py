@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.registration.observability import Spread, motion_of, moved, summary, without_sinks
+from geomtact.registration.observability import Spread, motion_of, moved, summary, told, without_sinks
 from geomtact.registration.protocol import Problem, Refinement
 from geomtact.se3 import Array
 
@@ -34,14 +34,14 @@ class Meeting:
     support: NDArray[np.int64]
 
 
-def as_far_as_told(start: Array, T: Array, meeting: Meeting, spread: Spread, problem: Problem) -> Array:
-    """``T`` (k, 4, 4) moved back to ``start`` (k, 4, 4) as far as what is told where they meet is less than was known."""
+def only_told(start: Array, T: Array, meeting: Meeting, spread: Spread, problem: Problem) -> Array:
+    """``T`` (k, 4, 4) moved back to ``start`` (k, 4, 4) along all directions that are not told where they meet."""
     zeta = motion_of(start, T, problem)
-    held = np.diag(spread.metres(problem.length) ** -2.0)
     for i, each in enumerate(meeting.information):
         information = without_sinks(each, problem.sink_std)
         if np.isfinite(information).all():
-            zeta[i] = np.linalg.solve(information + held, information @ zeta[i])
+            measure, move, _ = told(information, spread, problem.length)
+            zeta[i] = move @ (measure @ zeta[i])
     return moved(start, zeta, problem)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomtact.registration.filterreg import ContactFilter
-from geomtact.registration.fit import FEWEST, as_far_as_told, judged
+from geomtact.registration.fit import FEWEST, judged, only_told
 from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.registration.rim import near_surface
@@ -46,7 +46,7 @@ class Icp:
         contact_filter = ContactFilter(problem, self.surface)
         sinks, sigma = np.zeros((len(start), problem.contacts)), contact_filter.narrowest
         T = ended.reshape(-1, 4, 4)
-        T = as_far_as_told(start, T, contact_filter.meet(T, sinks, sigma), self.spread, problem)
+        T = only_told(start, T, contact_filter.meet(T, sinks, sigma), self.spread, problem)
         return judged(start, T, contact_filter.meet(T, sinks, sigma), met, self.spread, problem)
 
     def _register(self, problem: Problem, start: Array) -> Array | None:

@@ -16,7 +16,7 @@ from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array, apply, exp, hat, inverse, log, transform
 
 _LEAST_TURN = 0.02  # rad
-_GAIN = 4.0  # a direction is told where the rim's information is this many times what was known before
+_GAIN = 4 / 3  # information over what was known before from which a direction is told: to a quarter of the grid's step
 
 
 @dataclass(frozen=True)

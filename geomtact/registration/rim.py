@@ -29,11 +29,11 @@ def make_problem(
     height: ArrayLike | None = None,
     *,
     max_points: int = 60,
-    outline_noise: float = 0.15e-3,
+    outline_noise: float = 0.2e-3,
     height_noise: float = 0.1e-3,
     correlation: float = 2e-3,
-    sink: float = 0.0,
-    sink_std: float = 0.3e-3,
+    sink: float = 0.2e-3,
+    sink_std: float = 0.35e-3,
 ) -> Problem:
     """One contact, in the sensor's frame.
 
@@ -47,8 +47,9 @@ def make_problem(
     outline_noise : how far the outline of a real mask strays, standard deviation along its normal [m]
     height_noise : standard deviation of heights [m]
     correlation : over what length both stray the same way [m]
-    sink : how far below the membrane the object's surface lies at the outline [m]: 0 for a rigid gel
-    sink_std : and how much more or less it may be [m]
+    sink : how far below the membrane the object's surface lies at the outline [m]: 0 for a rigid gel, about 0.55 of the deepest
+        for an elastic one
+    sink_std : and how much more or less it may be [m]; by default both gels may be
     """
     contact: NDArray[np.bool_] = np.asarray(mask, bool)
     if height is not None:
