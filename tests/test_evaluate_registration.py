@@ -14,9 +14,10 @@ from geomtact.cli import app
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask
 from geomtact.evaluation import registration
-from geomtact.evaluation.information import fisher_information, told_directions
+from geomtact.evaluation.information import agreement, fisher_information, split
 from geomtact.evaluation.peers import peers
-from geomtact.evaluation.registration import Trial, summarise, trials
+from geomtact.evaluation.registration import End, Seen, Trial, own_methods, summarise, trials
+from geomtact.evaluation.shapes import SHAPES, shape
 from geomtact.evaluation.touches import random_touches
 from geomtact.registration.observability import Spread, motion_of, moved
 from geomtact.registration.protocol import Problem, Surface
@@ -37,8 +38,8 @@ def nut():
     return ContactSpace(load_mesh("hex_nut").with_symmetry(), SENSOR)
 
 
-def stay(problem, start):
-    return start, True
+def stay(seen, start):
+    return End(start, True)
 
 
 def touches_of(space, n, elastic=None, noise=CLEAN):
@@ -58,8 +59,9 @@ def pressed_in_the_middle(space, depth=0.8e-3):
 def test_a_ball_tells_where_it_is_and_not_how_it_is_turned(ball, elastic):
     T = pressed_in_the_middle(ball)
     problem = make_problem(felt_mask(ball, T, elastic), SENSOR)
-    told, rest = told_directions(fisher_information(ball, T, elastic, problem, MODERATE), 0.2e-3)
-    assert len(told) == 3 and np.allclose(np.vstack([told, rest]) @ np.vstack([told, rest]).T, np.eye(6))
+    spread = Spread(0.8e-3 / problem.length / np.sqrt(12), 0.8e-3 / np.sqrt(12))
+    told, rest = split(fisher_information(ball, T, elastic, problem, MODERATE), spread, problem.length)
+    assert np.trace(told) == pytest.approx(3) and np.allclose(told @ told, told) and np.allclose(told + rest, np.eye(6))
     centre = T @ np.append(ball.mesh.centre, 1)
     for axis in np.eye(3):
         # a turn about the contact's centre that is undone by a shift leaves the ball where it is
@@ -81,9 +83,28 @@ def test_information_is_that_of_the_outline(ball):
     assert np.diag(found)[3:5] == pytest.approx(expected, rel=0.2)
 
 
-def test_a_touch_that_nothing_moves_tells_nothing(nut):
-    told, rest = told_directions(np.zeros((6, 6)), 1e-3)
-    assert told.shape == (0, 6) and rest.shape == (6, 6)
+def test_a_touch_that_nothing_moves_tells_nothing():
+    told, rest = split(np.zeros((6, 6)), Spread(0.1, 1e-3), 5e-3)
+    assert (told == 0).all() and np.allclose(rest, np.eye(6))
+
+
+def test_what_is_told_depends_on_the_grid_and_not_on_the_units_of_a_turn():
+    """A quarter of the grid's step, in shifts and in turns, parts what is told from what is not."""
+    spread, length = Spread(np.radians(6) / np.sqrt(12), 4e-3 / np.sqrt(12)), 2e-3
+    step = np.repeat([np.radians(6) * length, 4e-3], 3)
+    for factor, expected in ((0.99, 6), (1.01, 0)):
+        told, _ = split(np.diag((factor * step / 4) ** -2.0), spread, length)
+        assert np.trace(told) == pytest.approx(expected)
+
+
+def test_agreement_counts_directions():
+    spread, length = Spread(0.1, 1e-3), 10e-3
+    known = np.diag(spread.metres(length) ** 2)
+    sharp = np.linalg.inv(known) * 100
+    assert agreement(sharp, known / 100, spread, length) == 1 and agreement(sharp, known, spread, length) == 0
+    half = sharp.copy()
+    half[:3, :3] = 0
+    assert agreement(half, known / 100, spread, length) == 0.5
 
 
 def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
@@ -91,19 +112,20 @@ def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
     seen = {"a": [], "b": []}
 
     def spying(name):
-        def method(problem, start):
+        def method(contact, start):
             seen[name].append(start)
-            return start, True
+            return End(start, True)
 
         return method
 
     methods = {name: spying(name) for name in seen}
-    whole = list(trials(nut, touches, methods, 2e-3, CLEAN, 5, turns_deg=(0.0, 5.0), shifts_mm=(0.0, 2.0)))
-    assert [len(some) for some in whole] == [8, 8, 8]
+    spread = Spread(0.05, 1e-3)
+    whole = list(trials(nut, touches, methods, spread, CLEAN, 5, turns_deg=(0.0, 5.0), shifts_mm=(0.0, 2.0)))
+    assert [len(some) for some in whole] == [12, 12, 12]
     np.testing.assert_array_equal(seen["a"], seen["b"])
     for i, touch in enumerate(touches):
         problem = make_problem(touch.mask, SENSOR)
-        for start, trial in zip(seen["a"][4 * i :], whole[i][::2], strict=False):
+        for start, trial in zip(seen["a"][6 * i :], whole[i][:-4:2], strict=False):
             R = touch.T_sensor_object[:3, :3].T @ start[:3, :3]
             turned = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
             assert turned == pytest.approx(trial.turn_deg, abs=1e-3)
@@ -111,7 +133,11 @@ def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
             off = 1e3 * (start @ centre)[:2] - 1e3 * problem.centre[:2]
             assert np.linalg.norm(off) == pytest.approx(trial.shift_mm, abs=1e-6)
             assert trial.error_mm == trial.start_mm and trial.drift_mm == pytest.approx(0, abs=1e-9)
-    again = list(trials(nut, touches, {"a": stay}, 2e-3, CLEAN, 5, (0.0, 5.0), (0.0, 2.0), first=2))
+        for start, trial in zip(seen["a"][6 * i + 4 :], whole[i][-4::2], strict=False):
+            assert trial.turn_deg is None and trial.shift_mm is None
+            zeta = motion_of(touch.T_sensor_object, start, problem)
+            assert (abs(zeta[:3]) / problem.length < 0.05 * np.sqrt(3) * 1.1).all()
+    again = list(trials(nut, touches, {"a": stay}, spread, CLEAN, 5, (0.0, 5.0), (0.0, 2.0), first=2))
     assert [t.start_mm for t in again[0]] == [t.start_mm for t in whole[2] if t.method == "a"]
 
 
@@ -126,12 +152,62 @@ def test_who_loses_to_another_library_is_said():
             for method, error in (("none", 2.0), ("filterreg", own), ("another", other))
         ]
 
-    figures = summarise([*made(1.0, 2.0, 0.1), *made(2.0, 0.1, 2.0), *made(4.0, 0.1, 0.1)])
+    figures = summarise([*made(1.0, 2.0, 0.1), *made(2.0, 0.1, 2.0), *made(4.0, 0.1, 0.1)], 0.2)
     assert figures["lost"] == [{"contact": "edge", "turn_deg": 0.0, "shift_mm": 1.0, "to": "another"}]
     rates = [cell["rates"]["filterreg"] for cell in figures["success"]["edge"]]
     assert rates == [0, 1, 1] and figures["methods"]["filterreg"]["success"] == pytest.approx(2 / 3)
-    nothing = summarise([Trial(0, "flat", True, "none", 0.0, 0.0, 0, 0.0, 0.0, 0.0, True, 1.0)] * 2)
+    nothing = summarise([Trial(0, "flat", True, "none", 0.0, 0.0, 0, 0.0, 0.0, 0.0, True, 1.0)] * 2, 0.2)
     assert nothing["success"]["flat"] == [] and nothing["methods"]["none"]["success"] is None
+
+
+def test_figures_from_the_grid_are_shares_of_what_they_say():
+    """Ten trials from the grid: one gets worse by more than half a pixel, eight of ten truths lie in the 90 % region."""
+    levels = np.append(np.linspace(0.1, 0.88, 8), [0.92, 0.99])
+    some = [
+        Trial(
+            i,
+            "edge",
+            False,
+            "filterreg",
+            None,
+            None,
+            3,
+            2.0,
+            2.3 if i == 0 else 0.5,
+            0.01 * i,
+            True,
+            1.0,
+            float(level),
+            1.0,
+        )
+        for i, level in enumerate(levels)
+    ]
+    figures = summarise(some, 0.25)
+    found = figures["from_grid"]["filterreg"]
+    assert found["worse"] == pytest.approx(0.1) and found["of_start"] == pytest.approx(0.25)
+    assert found["coverage"]["0.9"] == pytest.approx(0.8) and found["agreement"] == 1
+    assert figures["drift"]["edge"]["filterreg"]["median_mm"] == pytest.approx(0.045)
+    assert figures["methods"] == {} and figures["success"] == {"edge": []}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_shapes_are_closed_and_face_outwards(name):
+    mesh = shape(name)
+    made = mesh.trimesh if hasattr(mesh, "trimesh") else SHAPES[name]()
+    assert made.is_watertight and made.is_winding_consistent and made.volume > 0
+
+
+def test_the_thesis_refines_along_the_membrane_only(nut):
+    """Mask points to mask points: a shift and a turn in the image's plane, and nothing else, is undone."""
+    surface, spread = Surface(*nut.mesh.sample_surface(3000)), Spread(0.1, 1e-3)
+    T = touches_of(nut, 1)[0].T_sensor_object
+    mask = felt_mask(nut, T, False)
+    seen = Seen(mask, make_problem(mask, SENSOR))
+    off = moved(T, [0, 0, 0.03 * seen.problem.length, 0.4e-3, -0.3e-3, 0], seen.problem)
+    end = own_methods(nut, surface, spread)["thesis"](seen, off)
+    before, after = (motion_of(T, pose, seen.problem) for pose in (off, end.T))
+    assert end.converged and np.linalg.norm(after) < 0.5 * np.linalg.norm(before)
+    np.testing.assert_allclose((end.T @ se3.inverse(off))[2], [0, 0, 1, 0], atol=1e-9)
 
 
 def corner(rng, n):
@@ -164,9 +240,9 @@ def test_other_libraries_move_the_object_the_right_way(name):
     problem = observed(rim)
     method = peers(Surface(1e-3 * points, normals), Spread(0.05, 1e-3))[name]
     start = moved(np.eye(4), 1e-3 * np.array([0.2, -0.1, 0.15, 0.5, -0.4, 0.3]), problem)
-    T, converged = method(problem, start)
-    before, after = (np.linalg.norm(motion_of(np.eye(4), pose, problem)) for pose in (start, T))
-    assert converged and after < 0.5 * before
+    end = method(Seen(np.zeros((2, 2), bool), problem), start)
+    before, after = (np.linalg.norm(motion_of(np.eye(4), pose, problem)) for pose in (start, end.T))
+    assert end.converged and after < 0.5 * before
 
 
 def test_the_command_goes_on_and_draws(tmp_path):
@@ -189,8 +265,8 @@ def test_the_command_goes_on_and_draws(tmp_path):
     assert again[0] == kept[0] and [t["start_mm"] for t in again[1]] == pytest.approx(
         [t["start_mm"] for t in kept[1]], rel=1e-9
     )
-    assert content["schema"] == "geomtact/registration/1" and len(content["parts"]["hex_nut"]["outcomes"]) == 2
-    assert {"none", "icp", "filterreg", "both"} <= set(content["figures"]["methods"])
+    assert content["schema"] == "geomtact/registration/2" and len(content["parts"]["hex_nut"]["outcomes"]) == 2
+    assert {"none", "icp", "filterreg", "both", "thesis"} <= set(content["figures"]["methods"])
     assert np.asarray(Image.open(io.BytesIO(plot.read_bytes()))).std() > 5
     refused = CliRunner().invoke(app, [*words, "--max-poses", "5000"])
     assert refused.exit_code == 2 and "--max-poses" in refused.output

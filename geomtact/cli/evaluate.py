@@ -49,7 +49,8 @@ def evaluate(
     parts: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="OBJECT...", help="Parts or mesh files; for scores and registration the thesis's four by default."
+            metavar="OBJECT...",
+            help="Parts or mesh files; for scores the thesis's four by default, for registration those and bare shapes.",
         ),
     ] = None,
     unit: Unit = None,
@@ -127,9 +128,10 @@ def evaluate(
     if what is What.registration:
         from geomtact.cli.evaluate_registration import judge_registration
         from geomtact.evaluation.scores import FELT, THESIS_PARTS
+        from geomtact.evaluation.shapes import SHAPES
 
         elastic = FELT[str(felt or FeltName.both)]
-        names = parts or list(THESIS_PARTS)
+        names = parts or [*THESIS_PARTS, *SHAPES]
         judge_registration(names, unit, sensor, touches, str(noise), _noise(noise), elastic, seed, out, plot)
         return
     if not parts:

@@ -13,9 +13,11 @@ from geomtact.cli import study_file
 from geomtact.cli.shell import print_table, tell
 
 if TYPE_CHECKING:
+    from geomtact.geometry.mesh import Mesh
     from geomtact.sensing.noise import Noise
+    from geomtact.sensing.sensor import Sensor
 
-SCHEMA = "geomtact/registration/1"
+SCHEMA = "geomtact/registration/2"
 
 
 def judge_registration(
@@ -42,7 +44,6 @@ def judge_registration(
     from geomtact.evaluation import registration
     from geomtact.evaluation.peers import peers
     from geomtact.evaluation.touches import random_touches
-    from geomtact.geometry.mesh import load_mesh
     from geomtact.geometry.rotations import Directions
     from geomtact.inference.refine import Refinery
     from geomtact.registration.observability import Spread
@@ -53,14 +54,14 @@ def judge_registration(
     content = study_file.load(out, SCHEMA)
     content.pop("figures", None)
     pressed = Sensor.load(sensor)
-    for mesh in [load_mesh(part, unit, sensor=pressed).with_symmetry() for part in parts]:
+    for mesh in [_mesh(part, unit, pressed).with_symmetry() for part in parts]:
         space = ContactSpace(mesh, pressed)
         resolution = choose_resolution(mesh, pressed, None, MAX_POSES)
         assert mesh.symmetry is not None
         directions = Directions.make(mesh.symmetry, None, resolution.level, resolution.turn_step)
         spread = Spread.of_grid(directions.angle_step(resolution.turn_step), resolution.step)
         surface = Refinery(space).surface
-        methods = registration.own_methods(surface, spread) | peers(surface, spread)
+        methods = registration.own_methods(space, surface, spread) | peers(surface, spread)
         settings = {
             "object_sha256": mesh.sha256,
             "sensor": pressed.name,
@@ -83,13 +84,14 @@ def judge_registration(
 
         if len(done) < touches:
             pressed_at = random_touches(SimpleNamespace(space=space), touches, seed, elastic, noise)
-            more = registration.trials(space, pressed_at, methods, resolution.step, noise, seed, first=len(done))
+            more = registration.trials(space, pressed_at, methods, spread, noise, seed, first=len(done))
             outcomes = ([asdict(trial) for trial in some] for some in more)
             done = study_file.collect(done, outcomes, touches, f"registering {mesh.name}", keep)
         keep(done)
         tell(f"{mesh.name}: done")
     trials = [registration.Trial(**t) for part in content["parts"].values() for some in part["outcomes"] for t in some]
-    content["figures"] = plain(registration.summarise(trials))
+    half_pixel = 0.5 * float(pressed.pixel_area(pressed.along((48, 64)))) ** 0.5
+    content["figures"] = plain(registration.summarise(trials, 1e3 * half_pixel))
     study_file.save(out, content)
     _print(content["figures"])
     if plot is not None and any(content["figures"]["success"].values()):
@@ -99,15 +101,42 @@ def judge_registration(
     return content
 
 
+def _mesh(part: str, unit: str | None, sensor: Sensor) -> Mesh:
+    from geomtact.evaluation.shapes import SHAPES, shape
+    from geomtact.geometry.mesh import load_mesh
+
+    return shape(part) if part in SHAPES else load_mesh(part, unit, sensor=sensor)
+
+
 def _print(figures: Mapping[str, Any]) -> None:
+    def share(x: float | None) -> str:
+        return "-" if x is None else f"{100 * x:.0f} %"
+
+    def length(x: float | None) -> str:
+        return "-" if x is None else f"{x:.2f}"
+
     headings = ("method", "success", "converged", "error [mm]", "drift [mm]", "ms")
     rows = []
     for name, f in figures["methods"].items():
-        shares = ["-" if f[key] is None else f"{100 * f[key]:.0f} %" for key in ("success", "converged")]
-        lengths = ["-" if f[key] is None else f"{f[key]:.2f}" for key in ("error_mm_median", "drift_mm_median")]
-        rows.append([name, *shares, *lengths, f"{f['ms_median']:.1f}"])
+        lengths = [length(f["error_mm_median"]), length(f["drift_mm_median"])]
+        rows.append([name, share(f["success"]), share(f["converged"]), *lengths, f"{f['ms_median']:.1f}"])
     typer.echo("Over all start errors; errors in what the contact tells, drift in what it does not")
     print_table(headings, rows, headings[1:])
+    headings = ("method", "error [mm]", "of start's", "got worse", "in 90 %", "agreement")
+    rows = []
+    for name, f in figures["from_grid"].items():
+        inside = None if f["coverage"] is None else f["coverage"]["0.9"]
+        shares = [share(f["worse"]), share(inside), share(f["agreement"])]
+        rows.append([name, length(f["error_mm_median"]), length(f["of_start"]), *shares])
+    typer.echo("From poses of the grid; in 90 %: truths inside the region that is said to hold so many")
+    print_table(headings, rows, headings[1:])
+    names = list(figures["methods"])
+    rows = [
+        [kind, *(length(methods.get(name, {}).get("median_mm")) for name in names)]
+        for kind, methods in figures["drift"].items()
+    ]
+    typer.echo("Median drift [mm] from poses of the grid")
+    print_table(["contact", *names], rows, names)
     for cell in figures["lost"]:
         start = f"{cell['turn_deg']:g} degrees and {cell['shift_mm']:g} mm off"
         typer.echo(f"{cell['contact']}, {start}: {cell['to']} succeeds more often than filterreg")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask
-from geomtact.registration.observability import moved
+from geomtact.registration.observability import GAIN, Spread, moved, told
 from geomtact.registration.protocol import Problem
 from geomtact.registration.rim import make_problem
 from geomtact.se3 import Array
@@ -49,12 +49,24 @@ def fisher_information(
     return np.asarray((slope.T * (outline.weight / rms**2)) @ slope)
 
 
-def told_directions(information: Array, least_std: float) -> tuple[Array, Array]:
-    """Orthonormal rows of zeta that are told, (r, 6), to a standard deviation under ``least_std`` [m], and those that are
-    not, (6 - r, 6)."""
-    values, vectors = np.linalg.eigh(information)
-    told = values > least_std**-2.0
-    return vectors[:, told].T, vectors[:, ~told].T
+def split(information: Array, spread: Spread, length: float) -> tuple[Array, Array]:
+    """Matrices (6, 6) that take from a motion zeta the part that is told, and the rest; they add up to one.
+
+    A direction is told that ``information`` (6, 6) fixes to a standard deviation under a quarter of the grid's step, which is
+    one length for shifts and another for turns: ``spread`` tells both.
+    """
+    measure, move, _ = told(information, spread, length)
+    kept = move @ measure
+    return kept, np.eye(6) - kept
+
+
+def agreement(information: Array, covariance: Array, spread: Spread, length: float) -> float:
+    """In how many of six directions, as a share, a covariance (6, 6) of zeta and ``information`` (6, 6) say the same of whether
+    they are told; the directions are those which ``information`` tells independently of each other."""
+    known = spread.metres(length)
+    gain, axes = np.linalg.eigh(known[:, None] * information * known)
+    variance = np.einsum("ia,ij,ja->a", axes, covariance / np.outer(known, known), axes)
+    return float(np.mean((gain > GAIN) == (variance < 1 / (1 + GAIN))))
 
 
 def _inside(mask: NDArray[np.bool_], at: Array) -> Array:

@@ -10,9 +10,9 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from geomtact.evaluation.registration import Method
+from geomtact.evaluation.registration import End, Method, Seen
 from geomtact.registration.observability import Spread
-from geomtact.registration.protocol import Problem, Surface
+from geomtact.registration.protocol import Surface
 from geomtact.registration.rim import near_surface
 from geomtact.se3 import Array, inverse
 
@@ -34,17 +34,18 @@ def peers(surface: Surface, spread: Spread) -> dict[str, Method]:
 
 
 def _method(align: Align, surface: Surface, spread: Spread) -> Method:
-    def refine(problem: Problem, start: Array) -> tuple[Array, bool]:
+    def refine(seen: Seen, start: Array) -> End:
+        problem = seen.problem
         reach = 3 * spread.radius(problem.length) + 2 * problem.pitch
         points, normals = near_surface(surface, problem, start, reach)
         if len(points) < 6:
-            return start, False
+            return End(start, False)
         motion = align(_MM * problem.points, _MM * points, normals, _MM * reach)
         if motion is None or not np.isfinite(motion).all():
-            return start, False
+            return End(start, False)
         motion = np.array(motion, float)
         motion[:3, 3] /= _MM
-        return inverse(motion) @ start, True
+        return End(inverse(motion) @ start, True)
 
     return refine
 

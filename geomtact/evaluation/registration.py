@@ -3,36 +3,59 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.contact_class import contact_class
-from geomtact.evaluation.information import fisher_information, told_directions
+from geomtact.evaluation.information import agreement, fisher_information, split
+from geomtact.evaluation.shapes import SHAPES
 from geomtact.evaluation.touches import PENETRATION, Touch
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
-from geomtact.registration.observability import Spread, motion_of, moved
+from geomtact.registration.observability import Spread, motion_of, moved, zeta_of_xi
 from geomtact.registration.protocol import Problem, Refiner, Surface
 from geomtact.registration.rim import make_problem
-from geomtact.se3 import Array
+from geomtact.scoring.overlap import to_grid
+from geomtact.se3 import Array, inverse, log
 from geomtact.sensing.noise import Noise
+from geomtact.sensing.sensor import Sensor
 
 TURNS_DEG = (0.0, 2.5, 5.0, 10.0, 20.0)  # of the start poses about the contact's centre
 SHIFTS_MM = (0.0, 1.0, 2.0, 4.0, 8.0)  # along the membrane
-OWN = ("none", "icp", "filterreg", "both")
+FROM_GRID = 2  # starts a touch that are as far off as a grid's poses
+OWN = ("none", "icp", "filterreg", "both", "thesis")
 SUCCESS_MM = 0.5  # error in what the contact tells
+NOMINAL = (0.5, 0.8, 0.9, 0.95)
+_MASK_NEIGHBOURS = 200  # within a filled mask, the nearest points alone pull nowhere
+_MASK = (48, 64)  # half a pixel of such a mask is what a refined pose may lose
 
 
-class Method(Protocol):
-    """Takes one start pose (4, 4) to a better one, and says whether it believes that it did."""
+@dataclass(frozen=True)
+class Seen:
+    """One contact, as a mask (H, W) and as registration sees it."""
 
-    def __call__(self, problem: Problem, start: Array) -> tuple[Array, bool]: ...
+    mask: NDArray[np.bool_]
+    problem: Problem
+
+
+@dataclass(frozen=True)
+class End:
+    """Where a method ends: its pose (4, 4), whether it believes in it, and the covariance (6, 6) of xi that it states."""
+
+    T: Array
+    converged: bool
+    covariance: Array | None = None
+
+
+Method = Callable[[Seen, Array], End]  # takes a start pose (4, 4) to a better one
 
 
 @dataclass(frozen=True)
@@ -42,81 +65,118 @@ class Trial:
     Attributes
     ----------
     touch : number of the touch, the same for all methods and start errors
-    contact : one of ``contact_class.CLASSES``
+    contact : one of ``contact_class.CLASSES``, or the name of a bare shape
+    turn_deg, shift_mm : how far off the start is; None for one as far off as the grid's poses
     told : how many of the six directions the contact tells
     start_mm, error_mm : distance from the truth along those, before and after
     drift_mm : distance from the start along all others
     converged : as the method says
+    level : mass of the stated covariance's region that just holds the truth; None where none is stated
+    agrees : share of directions in which stated covariance and exact simulator say the same of whether they are told
     """
 
     touch: int
     contact: str
     elastic: bool
     method: str
-    turn_deg: float
-    shift_mm: float
+    turn_deg: float | None
+    shift_mm: float | None
     told: int
     start_mm: float
     error_mm: float
     drift_mm: float
     converged: bool
     ms: float
+    level: float | None = None
+    agrees: float | None = None
 
 
 def trials(
     space: ContactSpace,
     touches: Sequence[Touch],
     methods: Mapping[str, Method],
-    step: float,
+    spread: Spread,
     noise: Noise,
     seed: int,
     turns_deg: Sequence[float] = TURNS_DEG,
     shifts_mm: Sequence[float] = SHIFTS_MM,
     first: int = 0,
 ) -> Iterator[list[Trial]]:
-    """The trials of each touch: from one start pose for every pair of a turn and a shift, by every method.
+    """The trials of each touch: from one start pose for every pair of a turn and a shift, and from some as far off as those of
+    the grid, by every method.
 
     Start poses are turned about a random axis and shifted along the membrane in a random direction, and then settled at a
     random penetration, as a pose of a grid is.
 
     Parameters
     ----------
-    step : of the grid [m]; a direction is told where the exact simulator fixes it to a quarter of that
+    spread : of the grid's poses
     noise : that ``touches`` were made with
     first : touches before it are left out; the others come out as if they were not
     """
     for number, touch in enumerate(touches[first:], first):
         rng = np.random.default_rng([seed, number])
-        problem = make_problem(touch.mask, space.sensor)
-        kind = contact_class(space, touch.T_sensor_object)
-        information = fisher_information(space, touch.T_sensor_object, touch.elastic, problem, noise)
-        told, rest = told_directions(information, step / 4)
+        T = touch.T_sensor_object
+        seen = Seen(touch.mask, make_problem(touch.mask, space.sensor))
+        kind = space.mesh.name if space.mesh.name in SHAPES else contact_class(space, T)
+        information = fisher_information(space, T, touch.elastic, seen.problem, noise)
+        told, rest = split(information, spread, seen.problem.length)
         out = []
-        for turn in turns_deg:
-            for shift in shifts_mm:
-                start = _start(space, touch.T_sensor_object, problem, np.radians(turn), 1e-3 * shift, rng)
-                before = motion_of(touch.T_sensor_object, start, problem)
-                for name, method in methods.items():
-                    began = time.perf_counter()
-                    T, converged = method(problem, start)
-                    ms = 1e3 * (time.perf_counter() - began)
-                    after = motion_of(touch.T_sensor_object, T, problem)
-                    sizes = (told @ before, told @ after, rest @ (after - before))
-                    off, left, drift = (1e3 * float(np.linalg.norm(size)) for size in sizes)
-                    who = (number, kind, touch.elastic, name, turn, shift, len(told))
-                    out.append(Trial(*who, off, left, drift, bool(converged), ms))
+        offs: list[tuple[float | None, float | None]] = [(turn, shift) for turn in turns_deg for shift in shifts_mm]
+        for turn, shift in offs + [(None, None)] * FROM_GRID:
+            draw = partial(_grid_off, spread) if turn is None or shift is None else partial(_off, turn, shift)
+            start = _start(space, T, seen.problem, draw, rng)
+            before = motion_of(T, start, seen.problem)
+            for name, method in methods.items():
+                began = time.perf_counter()
+                end = method(seen, start)
+                ms = 1e3 * (time.perf_counter() - began)
+                after = motion_of(T, end.T, seen.problem)
+                sizes = (told @ before, told @ after, rest @ (after - before))
+                off, left, drift = (1e3 * float(np.linalg.norm(size)) for size in sizes)
+                who = (number, kind, touch.elastic, name, turn, shift, round(float(np.trace(told))))
+                said = _said(end, T, information, spread, seen.problem)
+                out.append(Trial(*who, off, left, drift, bool(end.converged), ms, *said))
         yield out
 
 
+def _said(
+    end: End, T: Array, information: Array, spread: Spread, problem: Problem
+) -> tuple[float | None, float | None]:
+    """How far out the truth ``T`` lies in the stated covariance, and how far that agrees with the exact ``information``."""
+    if end.covariance is None or not end.converged:
+        return None, None
+    off = log(inverse(end.T) @ T)
+    level = float(chi2.cdf(off @ np.linalg.solve(end.covariance, off), 6))
+    to_zeta = zeta_of_xi(end.T, problem)
+    return level, agreement(information, to_zeta @ end.covariance @ to_zeta.T, spread, problem.length)
+
+
+def _off(turn_deg: float, shift_mm: float, rng: np.random.Generator) -> Array:
+    """A rotation vector [rad] and a shift along the membrane [m], (5,), of these sizes, in random directions."""
+    axis, way = rng.normal(size=3), rng.uniform(0, 2 * np.pi)
+    shift = 1e-3 * shift_mm * np.array([np.cos(way), np.sin(way)])
+    return np.append(np.radians(turn_deg) * axis / np.linalg.norm(axis), shift)
+
+
+def _grid_off(spread: Spread, rng: np.random.Generator) -> Array:
+    """As :func:`_off`, of a grid's pose: uniform over a cell."""
+    width = np.sqrt(12) * np.array([spread.rotation] * 3 + [spread.translation] * 2)
+    return np.asarray(width * rng.uniform(-0.5, 0.5, 5))
+
+
 def _start(
-    space: ContactSpace, T: Array, problem: Problem, turn: float, shift: float, rng: np.random.Generator
+    space: ContactSpace,
+    T: Array,
+    problem: Problem,
+    draw: Callable[[np.random.Generator], Array],
+    rng: np.random.Generator,
 ) -> Array:
-    """``T`` turned [rad] and shifted [m], and settled where it touches; after ten tries only moved."""
+    """``T`` turned and shifted by what ``draw`` gives, and settled where it touches; after ten tries only moved."""
     for _ in range(10):
-        axis, way = rng.normal(size=3), rng.uniform(0, 2 * np.pi)
-        axis *= turn * problem.length / np.linalg.norm(axis)
-        start = moved(T, [*axis, 0.0, 0.0, 0.0], problem)
-        start[:2, 3] += [shift * np.cos(way), shift * np.sin(way)]
+        off = draw(rng)
+        start = moved(T, [*(off[:3] * problem.length), 0.0, 0.0, 0.0], problem)
+        start[:2, 3] += off[3:]
         depth = rng.uniform(PENETRATION[0], min(PENETRATION[1], space.sensor.max_penetration))
         settled, ok = space.settle(start[None], depth)
         if ok[0]:
@@ -124,44 +184,100 @@ def _start(
     return start
 
 
-def own_methods(surface: Surface, spread: Spread) -> dict[str, Method]:
-    """geomtact's refiners by name, and what no refinement gives."""
+def own_methods(space: ContactSpace, surface: Surface, spread: Spread) -> dict[str, Method]:
+    """geomtact's refiners by name, the thesis's, and what no refinement gives."""
     filterreg, icp = _method(FilterReg(surface, spread)), _method(Icp(surface, spread))
 
-    def both(problem: Problem, start: Array) -> tuple[Array, bool]:
-        T, one = filterreg(problem, start)
-        T, other = icp(problem, T)
-        return T, one or other
+    def both(seen: Seen, start: Array) -> End:
+        one = filterreg(seen, start)
+        other = icp(seen, one.T)
+        return other if other.converged else one
 
-    return {"none": lambda problem, start: (start, True), "icp": icp, "filterreg": filterreg, "both": both}
+    return {
+        "none": lambda seen, start: End(start, True),
+        "icp": icp,
+        "filterreg": filterreg,
+        "both": both,
+        "thesis": _thesis(space, spread),
+    }
 
 
 def _method(refiner: Refiner) -> Method:
-    def refine(problem: Problem, start: Array) -> tuple[Array, bool]:
-        found = refiner.refine(problem, start[None])
-        return found.T[0], bool(found.converged[0])
+    def refine(seen: Seen, start: Array) -> End:
+        found = refiner.refine(seen.problem, start[None])
+        return End(found.T[0], bool(found.converged[0]), found.covariance[0])
 
     return refine
 
 
-def summarise(trials: Sequence[Trial]) -> dict[str, Any]:
-    """Success by contact class, method and start error, and the medians of time, error and drift by method.
+def _thesis(space: ContactSpace, spread: Spread) -> Method:
+    """The thesis's refinement (6.3): FilterReg from the points of the simulated local shape to those of the sensed one."""
 
-    Touches that tell nothing are left out of the success. ``lost`` names the cells in which FilterReg succeeds less often
-    than the best of the other libraries, beyond what chance allows: a 95 % interval of the paired difference.
+    def refine(seen: Seen, start: Array) -> End:
+        sensor = space.sensor
+        simulated = space.caster.depths(sensor, start[None], sensor.along(_MASK))[0] > 0
+        points, sensed = (_mask_points(mask, sensor) for mask in (simulated, seen.mask))
+        if len(points) < 6 or len(sensed) < 6:
+            return End(start, False)
+        towards = np.array([0.0, 0.0, -1.0])
+        n, none = len(sensed), np.zeros((0, 3))
+        problem = replace(
+            seen.problem,
+            points=sensed,
+            facing=np.tile(towards, (n, 1)),
+            across=np.zeros((n, 3)),
+            sinking=np.zeros((n, 3)),
+            noise=np.full(n, seen.problem.pitch),
+            weight=np.ones(n),
+            contact=np.zeros(n, np.int64),
+            around=none,
+            centre=sensed.mean(0),
+            side=np.zeros(0, np.int64),
+        )
+        surface = Surface(points, np.tile(towards, (len(points), 1)))
+        found = FilterReg(surface, spread, objective="point", neighbours=_MASK_NEIGHBOURS).refine(
+            problem, np.eye(4)[None]
+        )
+        return End(found.T[0] @ start, bool(found.converged[0]))
+
+    return refine
+
+
+def _mask_points(mask: NDArray[np.bool_], sensor: Sensor) -> Array:
+    """The contact pixels of a mask, on a grid of ``_MASK``, as points (n, 3) of the membrane's plane."""
+    rows, cols = np.nonzero(to_grid(mask, sensor.along(_MASK)))
+    h, w = sensor.along(_MASK)
+    xy = (np.stack([cols, rows], 1) + 0.5) * (2 * sensor.half_window / [w, h]) - sensor.half_window
+    return np.column_stack([xy, np.zeros(len(xy))])
+
+
+def summarise(trials: Sequence[Trial], half_pixel_mm: float) -> dict[str, Any]:
+    """All figures: by method over all start errors, by method from the grid's poses, success by contact and start error, and
+    drift by contact.
+
+    Touches that tell nothing are left out of success and errors. ``lost`` names the cells in which FilterReg succeeds less
+    often than the best of the other libraries, beyond what chance allows: a 95 % interval of the paired difference.
+
+    Parameters
+    ----------
+    half_pixel_mm : of a mask; a refined pose that is farther from the truth than its start by more has got worse
     """
-    told = [t for t in trials if t.told]
-    out: dict[str, Any] = {"methods": {}, "success": {t.contact: [] for t in trials}, "lost": []}
-    for name, some in _grouped(trials, "method").items():
-        errors = [t.error_mm for t in some if t.told]
-        drifts = [t.drift_mm for t in some if t.converged]
-        out["methods"][name] = {
-            "ms_median": float(np.median([t.ms for t in some])),
-            "success": float(np.mean([error < SUCCESS_MM for error in errors])) if errors else None,
-            "converged": len(drifts) / len(some),
-            "drift_mm_median": float(np.median(drifts)) if drifts else None,
-            "error_mm_median": float(np.median(errors)) if errors else None,
+    basin, gridded = ([t for t in trials if (t.turn_deg is None) == grid] for grid in (False, True))
+    out: dict[str, Any] = {
+        "methods": {name: _over_all(some) for name, some in _grouped(basin, "method").items()},
+        "from_grid": {name: _from_grid(some, half_pixel_mm) for name, some in _grouped(gridded, "method").items()},
+        "success": {t.contact: [] for t in trials},
+        "drift": {},
+        "lost": [],
+    }
+    for (kind, name), some in _grouped([t for t in gridded if t.converged], "contact", "method").items():
+        drifts = np.quantile([t.drift_mm for t in some], [0.5, 0.9])
+        out["drift"].setdefault(kind, {})[name] = {
+            "n": len(some),
+            "median_mm": drifts[0],
+            "of_90_percent_mm": drifts[1],
         }
+    told = [t for t in basin if t.told]
     for (kind, turn, shift), here in _grouped(told, "contact", "turn_deg", "shift_mm").items():
         won = {n: np.array([t.error_mm < SUCCESS_MM for t in some]) for n, some in _grouped(here, "method").items()}
         rates = {name: float(each.mean()) for name, each in won.items()}
@@ -171,6 +287,33 @@ def summarise(trials: Sequence[Trial]) -> dict[str, Any]:
         if best is not None and _loses(won["filterreg"], won[best]):
             out["lost"].append({"contact": kind, **start, "to": best})
     return out
+
+
+def _over_all(some: Sequence[Trial]) -> dict[str, Any]:
+    errors = [t.error_mm for t in some if t.told]
+    drifts = [t.drift_mm for t in some if t.converged]
+    return {
+        "ms_median": float(np.median([t.ms for t in some])),
+        "success": float(np.mean([error < SUCCESS_MM for error in errors])) if errors else None,
+        "converged": len(drifts) / len(some),
+        "drift_mm_median": float(np.median(drifts)) if drifts else None,
+        "error_mm_median": float(np.median(errors)) if errors else None,
+    }
+
+
+def _from_grid(some: Sequence[Trial], half_pixel_mm: float) -> dict[str, Any]:
+    told, stated = [t for t in some if t.told], [t for t in some if t.level is not None]
+    before, after = (np.array([getattr(t, name) for t in told]) for name in ("start_mm", "error_mm"))
+    inside = [float(np.mean([t.level <= mass for t in stated])) for mass in NOMINAL] if stated else None  # type: ignore[operator]
+    return {
+        "n": len(some),
+        "error_mm_median": float(np.median(after)) if len(told) else None,
+        "of_start": float(np.median(after) / np.median(before)) if len(told) else None,
+        "worse": float((after > before + half_pixel_mm).mean()) if len(told) else None,
+        "stated": len(stated),
+        "coverage": inside and dict(zip(map(str, NOMINAL), inside, strict=True)),
+        "agreement": float(np.mean([t.agrees for t in stated])) if stated else None,  # type: ignore[misc]
+    }
 
 
 def _grouped(trials: Sequence[Trial], *keys: str) -> dict[Any, list[Trial]]:

@@ -17,7 +17,6 @@ from geomtact.registration.observability import Spread, jacobian, moved
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.se3 import Array, apply, inverse
 
-_NEIGHBOURS = 6
 _FEWER = 2  # around points that are only inside or outside
 _OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
 _STEPS_AT_END = 8  # with the narrowest filter, at most
@@ -36,19 +35,21 @@ class FilterReg:
     spread : how far the start poses may be off
     narrowing : of the filter at each step; the smaller, the fewer steps
     objective : whether points are drawn to the surface's planes or to its points
+    neighbours : how many surface points a filter takes in, at most
     """
 
     surface: Surface
     spread: Spread
     narrowing: float = 0.55
     objective: Literal["plane", "point"] = "plane"
+    neighbours: int = 6
     name: str = "filterreg"
 
     def refine(self, problem: Problem, T: Array, sinks: Array | None = None) -> Refinement:
         """Refine the poses ``T`` (k, 4, 4) of the object in the problem's frame, where the gel sinks around the object by
         about ``sinks`` (k, c) [m] at each contact, 0 by default."""
         start = np.asarray(T, float).reshape(-1, 4, 4)
-        contact_filter = ContactFilter(problem, self.surface, self.objective)
+        contact_filter = ContactFilter(problem, self.surface, self.objective, self.neighbours)
         # motions zeta and sinks of the gel are held by what was known before: what is not told stays where it was
         held = np.append(1 / self.spread.metres(problem.length), np.full(problem.contacts, 1 / problem.sink_std)) ** 2
         known = np.zeros((len(start), len(held)))
@@ -90,8 +91,8 @@ class ContactFilter:
     narrowest : width of the filter that this noise and the gaps between the surface's points leave [m]
     """
 
-    def __init__(self, problem: Problem, surface: Surface, objective: str = "plane"):
-        self.problem, self.surface, self.objective = problem, surface, objective
+    def __init__(self, problem: Problem, surface: Surface, objective: str = "plane", neighbours: int = 6):
+        self.problem, self.surface, self.objective, self.neighbours = problem, surface, objective, neighbours
         self.noise = float(np.median(problem.noise)) if len(problem.noise) else problem.pitch
         self.narrowest = float(np.hypot(self.noise, surface.spacing))
 
@@ -145,7 +146,7 @@ class ContactFilter:
         """The E-step: where the points (k, n, 3) meet the surface, its normals there, and how surely (k, n)."""
         R = T[:, :3, :3]
         facing, across = self.problem.facing @ R, self.problem.across @ R
-        near, normals, off = self._nearest(T, points, _NEIGHBOURS, sigma, facing)
+        near, normals, off = self._nearest(T, points, self.neighbours, sigma, facing)
         face, lean = (np.einsum("knij,knj->kni", normals, v) for v in (facing, across))
         slope = np.hypot(face, lean)
         # a surface that faces another way, or runs along the membrane, has not made this part of the outline

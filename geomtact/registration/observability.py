@@ -16,7 +16,7 @@ from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array, apply, exp, hat, inverse, log, transform
 
 _LEAST_TURN = 0.02  # rad
-_GAIN = 4 / 3  # information over what was known before from which a direction is told: to a quarter of the grid's step
+GAIN = 4 / 3  # information over what was known before from which a direction is told: to a quarter of the grid's step
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ def told(information: Array, spread: Spread, length: float) -> tuple[Array, Arra
     """
     known = spread.metres(length)
     gain, axes = np.linalg.eigh(known[:, None] * information * known)
-    axes = axes[:, gain > _GAIN]
-    return axes.T / known, known[:, None] * axes, gain[gain > _GAIN]
+    axes = axes[:, gain > GAIN]
+    return axes.T / known, known[:, None] * axes, gain[gain > GAIN]
 
 
 def moved(T: Array, zeta: ArrayLike, problem: Problem) -> Array:
@@ -91,7 +91,7 @@ def summary(T: Array, information: Array, spread: Spread, problem: Problem) -> t
     measure, move, gain = told(information, spread, problem.length)
     # in told directions the variance known**2 becomes known**2 / (1 + gain)
     covariance = np.diag(known**2) - (move * (gain / (1 + gain))) @ move.T
-    to_zeta = _zeta_of_xi(T, problem)
+    to_zeta = zeta_of_xi(T, problem)
     back = np.linalg.inv(to_zeta)
     scale = np.repeat([problem.length, 1.0], 3)
     rows = measure @ to_zeta / scale
@@ -100,7 +100,7 @@ def summary(T: Array, information: Array, spread: Spread, problem: Problem) -> t
     return 0.5 * (covariance + covariance.T), observable
 
 
-def _zeta_of_xi(T: Array, problem: Problem) -> Array:
+def zeta_of_xi(T: Array, problem: Problem) -> Array:
     """(6, 6) S A: xi moves the object about its own origin and axes, zeta about the contact's centre in sensor axes."""
     R = T[:3, :3]
     centre = apply(inverse(T), problem.centre[None])[0]
