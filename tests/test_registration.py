@@ -1,5 +1,7 @@
 """Refinement brings poses nearer in what the contact tells, leaves the rest alone, and never claims too much."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -298,3 +300,150 @@ def test_open3d_repeats_itself_to_the_last_digit(pin, a_touch):
     icp = next(r for r in pin._refinery._refiners(pin.index, True) if r.name == "icp")
     first = icp.refine(problem, starts).T
     assert all((first == icp.refine(problem, starts).T).all() for _ in range(15))
+
+
+def ring(radius=4e-3):
+    """Mask pixels of a thin ring: an outline of one pixel."""
+    x, y = SENSOR.pixel_centres()
+    return np.abs(np.hypot(x, y[:, None]) - radius) < 0.16e-3
+
+
+def unsound():
+    """Readings that break registration written for clean ones, by name: (mask, height)."""
+    x, y = SENSOR.pixel_centres()
+    disk = np.hypot(x, y[:, None]) < 4e-3
+    two = (np.hypot(x - 5e-3, y[:, None]) < 2e-3) | (np.hypot(x + 5e-3, y[:, None]) < 2e-3)
+    few = np.zeros_like(disk)
+    few[20, 30:33] = True
+    eight = few.copy()
+    eight[21:23, 30:33] = True
+    eight[22, 32] = False
+    height = np.where(disk, 0.5e-3, 0)
+    broken = height.copy()
+    broken[::3] = np.nan
+    return {
+        "a rim of one pixel": (ring(), None),
+        "three pixels": (few, None),
+        "eight pixels": (eight, None),
+        "two patches": (two, None),
+        "heights with gaps": (disk, broken),
+        "no height anywhere": (disk, 0 * height),
+        "all heights missing": (disk, np.full(disk.shape, np.nan)),
+        "heights without a contact": (0 * disk, height),
+    }
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+@pytest.mark.parametrize("name", unsound())
+def test_unsound_readings_end_in_a_sound_result(refiner, name, block):
+    surface, _ = block
+    mask, height = unsound()[name]
+    starts = np.stack([facing_down(x, 0, 0.8e-3, 9e-3, turn=x) for x in (0.0, 2e-3)])
+    result = refiner(surface, SPREAD).refine(make_problem(mask, SENSOR, height), starts)
+    is_sound(result, 2)
+    np.testing.assert_array_equal(result.T[~result.converged], starts[~result.converged])
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_a_surface_in_millimetres_converges_nowhere(refiner, block):
+    """Units wrong by a thousand: nothing meets, and nothing is claimed."""
+    surface, caster = block
+    T = facing_down(0, 0, 0.8e-3, 9e-3)
+    wrong = Surface(1e3 * surface.points, surface.normals)
+    result = refiner(wrong, SPREAD).refine(make_problem(touch(caster, T), SENSOR), T[None])
+    is_sound(result, 1)
+    assert not result.converged[0] and len(result.observable[0]) == 0
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_points_that_lie_on_each_other_change_nothing(refiner, block):
+    surface, caster = block
+    T = facing_down(1e-3, -1e-3, 0.8e-3, 9e-3, turn=0.4)
+    problem = make_problem(touch(caster, T), SENSOR)
+    start = off(T, problem, np.random.default_rng(0))
+    some = Surface(np.repeat(surface.points[:10000], 3, 0), np.repeat(surface.normals[:10000], 3, 0))
+    result = refiner(some, SPREAD).refine(problem, start[None])
+    is_sound(result, 1)
+    assert result.converged[0] and told_error(result, T, result.T[0]) < told_error(result, T, start)
+
+
+def test_a_third_of_outliers_leaves_the_pose_where_it_belongs(block):
+    """Points of the outline moved anywhere in the window: what is told is still told to half a pixel, by median."""
+    surface, caster = block
+    errors, before, believed = [], [], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        T = facing_down(*rng.uniform(-3e-3, 3e-3, 2), 0.8e-3, 9e-3, turn=rng.uniform(-3, 3))
+        problem = make_problem(touch(caster, T), SENSOR)
+        astray = rng.random(len(problem.points)) < 0.3
+        points = problem.points.copy()
+        points[astray, :2] = rng.uniform(-SENSOR.half_window, SENSOR.half_window, (astray.sum(), 2))
+        start = off(T, problem, rng)
+        result = FilterReg(surface, SPREAD).refine(dataclasses.replace(problem, points=points), start[None])
+        believed.append(result.converged[0])
+        errors.append(told_error(result, T, result.T[0]))
+        before.append(told_error(result, T, start))
+    assert np.mean(believed) > 0.8 and np.median(errors) < 0.15e-3 < np.median(before)
+
+
+def test_a_surface_drawn_point_to_point_comes_nearer_too(block):
+    surface, caster = block
+    ratio = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        T = facing_down(*rng.uniform(-3e-3, 3e-3, 2), 0.8e-3, 9e-3, turn=rng.uniform(-3, 3))
+        problem = make_problem(touch(caster, T), SENSOR, sink=0.0)
+        start = off(T, problem, rng)
+        result = FilterReg(surface, SPREAD, objective="point").refine(problem, start[None])
+        is_sound(result, 1)
+        if result.converged[0]:
+            ratio.append(told_error(result, T, result.T[0]) / told_error(result, T, start))
+    assert len(ratio) > 10 and np.median(ratio) < 0.7
+
+
+def test_heights_tell_what_the_outline_does_not(ball):
+    """How deep a ball is pressed: an outline may belong to a gel that sinks around it, heights say."""
+    surface, caster = ball
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        T = facing_down(*rng.uniform(-3e-3, 3e-3, 2), 1e-3, 8e-3, turn=rng.uniform(-3, 3))
+        contact = caster.contact(SENSOR, T)
+        start = se3.transform(np.eye(3), [0.3e-3, -0.2e-3, 0.4e-3]) @ T
+        found = {}
+        for name, height in (("outline", None), ("heights", contact.height)):
+            problem = make_problem(contact.mask, SENSOR, height)
+            result = FilterReg(surface, Spread(TURN, 1e-3)).refine(problem, start[None])
+            assert result.converged[0]
+            covariance = result.T[0][:3, :3] @ result.covariance[0][3:, 3:] @ result.T[0][:3, :3].T
+            found[name] = abs(result.T[0][2, 3] - T[2, 3]), np.sqrt(covariance[2, 2])
+        assert found["heights"][0] < 0.05e-3 < found["outline"][0]
+        assert found["heights"][1] < 0.5 * found["outline"][1]
+
+
+def test_contacts_of_two_sensors_tell_together_what_each_leaves_open():
+    """Two edges of a plate at right angles: each tells the shift across itself, both tell the place."""
+    plate = trimesh.creation.box((80e-3, 60e-3, 5e-3))
+    surface, caster = scene(plate, 80000)
+    T_world_object = np.eye(4)
+    # each sensor looks at the plate's underside, one over the edge at x = 40 mm, the other over that at y = 30 mm
+    sensors = [
+        se3.transform(np.eye(3), [40e-3, 5e-3, -2.5e-3 + 0.8e-3]),
+        se3.transform(se3.exp([0, 0, 0.7, 0, 0, 0])[:3, :3], [-8e-3, 30e-3, -2.5e-3 + 0.6e-3]),
+    ]
+    problems = [make_problem(touch(caster, se3.inverse(S) @ T_world_object), SENSOR) for S in sensors]
+    joint = Problem.joined(problems, np.array(sensors))
+    assert joint.contacts == 2 and len(joint.points) == sum(len(p.points) for p in problems)
+    start = se3.transform(np.eye(3), [0.5e-3, -0.6e-3, 0.0]) @ T_world_object
+    spread = Spread(np.radians(1.0), 1e-3)
+    errors = []
+    for problem, S in zip(problems, sensors, strict=True):
+        alone = FilterReg(surface, spread).refine(problem, (se3.inverse(S) @ start)[None])
+        errors.append(np.linalg.norm((S @ alone.T[0])[:2, 3]))
+    together = FilterReg(surface, spread).refine(joint, start[None])
+    is_sound(together, 1)
+    assert together.converged[0] and np.linalg.norm(together.T[0][:2, 3]) < 0.15e-3 < min(errors)
+    # one contact alone, carried into the world, is what it was in its sensor's frame
+    moved_alone = FilterReg(surface, spread).refine(Problem.joined(problems[:1], np.array(sensors[:1])), start[None])
+    here = FilterReg(surface, spread).refine(problems[0], (se3.inverse(sensors[0]) @ start)[None])
+    np.testing.assert_allclose(moved_alone.T[0], sensors[0] @ here.T[0], atol=1e-9)
+    np.testing.assert_allclose(moved_alone.covariance[0], here.covariance[0], rtol=1e-6, atol=1e-15)
