@@ -99,12 +99,13 @@ def test_what_is_told_depends_on_the_grid_and_not_on_the_units_of_a_turn():
 
 def test_agreement_counts_directions():
     spread, length = Spread(0.1, 1e-3), 10e-3
-    known = np.diag(spread.metres(length) ** 2)
-    sharp = np.linalg.inv(known) * 100
-    assert agreement(sharp, known / 100, spread, length) == 1 and agreement(sharp, known, spread, length) == 0
+    sharp = np.diag(100 / spread.metres(length) ** 2)
+    rows = np.random.default_rng(0).normal(size=(6, 6))  # all is told, however it is measured
+    assert agreement(sharp, rows, spread, length) == 1 and agreement(0 * sharp, rows, spread, length) == 0
+    assert agreement(sharp, rows[:0], spread, length) == 0 and agreement(0 * sharp, rows[:0], spread, length) == 1
     half = sharp.copy()
     half[:3, :3] = 0
-    assert agreement(half, known / 100, spread, length) == 0.5
+    assert agreement(half, np.eye(6)[3:], spread, length) == 1 and agreement(half, np.eye(6)[:3], spread, length) == 0
 
 
 def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):

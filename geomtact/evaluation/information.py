@@ -60,13 +60,17 @@ def split(information: Array, spread: Spread, length: float) -> tuple[Array, Arr
     return kept, np.eye(6) - kept
 
 
-def agreement(information: Array, covariance: Array, spread: Spread, length: float) -> float:
-    """In how many of six directions, as a share, a covariance (6, 6) of zeta and ``information`` (6, 6) say the same of whether
-    they are told; the directions are those which ``information`` tells independently of each other."""
+def agreement(information: Array, rows: Array, spread: Spread, length: float) -> float:
+    """In how many of six directions, as a share, a method and ``information`` (6, 6) say the same of whether they are told.
+
+    The directions are those which ``information`` tells independently of each other; ``rows`` (r, 6) measure in zeta what the
+    method calls told.
+    """
     known = spread.metres(length)
     gain, axes = np.linalg.eigh(known[:, None] * information * known)
-    variance = np.einsum("ia,ij,ja->a", axes, covariance / np.outer(known, known), axes)
-    return float(np.mean((gain > GAIN) == (variance < 1 / (1 + GAIN))))
+    basis = np.linalg.qr((rows * known).T)[0]  # (6, r), in units of what was known
+    said = ((basis.T @ axes) ** 2).sum(0) > 0.5
+    return float(np.mean((gain > GAIN) == said))
 
 
 def _inside(mask: NDArray[np.bool_], at: Array) -> Array:

@@ -48,11 +48,13 @@ class Seen:
 
 @dataclass(frozen=True)
 class End:
-    """Where a method ends: its pose (4, 4), whether it believes in it, and the covariance (6, 6) of xi that it states."""
+    """Where a method ends: its pose (4, 4), whether it believes in it, and the covariance (6, 6) of xi and the observable
+    directions (r, 6) that it states, as in ``Refinement``."""
 
     T: Array
     converged: bool
     covariance: Array | None = None
+    observable: Array | None = None
 
 
 Method = Callable[[Seen, Array], End]  # takes a start pose (4, 4) to a better one
@@ -72,7 +74,7 @@ class Trial:
     drift_mm : distance from the start along all others
     converged : as the method says
     level : mass of the stated covariance's region that just holds the truth; None where none is stated
-    agrees : share of directions in which stated covariance and exact simulator say the same of whether they are told
+    agrees : share of directions of which method and exact simulator say the same: whether they are told
     """
 
     touch: int
@@ -144,12 +146,12 @@ def _said(
     end: End, T: Array, information: Array, spread: Spread, problem: Problem
 ) -> tuple[float | None, float | None]:
     """How far out the truth ``T`` lies in the stated covariance, and how far that agrees with the exact ``information``."""
-    if end.covariance is None or not end.converged:
+    if end.covariance is None or end.observable is None or not end.converged:
         return None, None
     off = log(inverse(end.T) @ T)
     level = float(chi2.cdf(off @ np.linalg.solve(end.covariance, off), 6))
-    to_zeta = zeta_of_xi(end.T, problem)
-    return level, agreement(information, to_zeta @ end.covariance @ to_zeta.T, spread, problem.length)
+    rows = end.observable * np.repeat([problem.length, 1.0], 3) @ np.linalg.inv(zeta_of_xi(end.T, problem))
+    return level, agreement(information, rows, spread, problem.length)
 
 
 def _off(turn_deg: float, shift_mm: float, rng: np.random.Generator) -> Array:
@@ -205,7 +207,7 @@ def own_methods(space: ContactSpace, surface: Surface, spread: Spread) -> dict[s
 def _method(refiner: Refiner) -> Method:
     def refine(seen: Seen, start: Array) -> End:
         found = refiner.refine(seen.problem, start[None])
-        return End(found.T[0], bool(found.converged[0]), found.covariance[0])
+        return End(found.T[0], bool(found.converged[0]), found.covariance[0], found.observable[0])
 
     return refine
 
