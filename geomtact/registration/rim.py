@@ -17,6 +17,7 @@ from geomtact.registration.protocol import Problem, Surface
 from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.sensor import Sensor
 
+SINK, SINK_STD = 0.2e-3, 0.35e-3  # m that a gel, rigid or elastic, is taken to sink around the object, give or take
 _FEWEST = 4  # points on a contour; shorter ones are specks
 _FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
 _CLEAR = 0.5e-3  # m that a point is off the outline to count as inside or outside of it
@@ -32,8 +33,8 @@ def make_problem(
     outline_noise: float = 0.2e-3,
     height_noise: float = 0.1e-3,
     correlation: float = 2e-3,
-    sink: float = 0.2e-3,
-    sink_std: float = 0.35e-3,
+    sink: float = SINK,
+    sink_std: float = SINK_STD,
 ) -> Problem:
     """One contact, in the sensor's frame.
 
