@@ -11,14 +11,16 @@ from typer.testing import CliRunner
 
 from geomtact import load_mesh, se3
 from geomtact.cli import app
+from geomtact.contact_space.build import choose_resolution
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask
 from geomtact.evaluation import registration
 from geomtact.evaluation.information import agreement, fisher_information, split
 from geomtact.evaluation.peers import peers
-from geomtact.evaluation.registration import End, Seen, Trial, own_methods, summarise, trials
+from geomtact.evaluation.registration import End, Grid, Seen, Trial, own_methods, summarise, trials
 from geomtact.evaluation.shapes import SHAPES, shape
 from geomtact.evaluation.touches import random_touches
+from geomtact.geometry.rotations import Directions
 from geomtact.registration.observability import Spread, motion_of, moved
 from geomtact.registration.protocol import Problem, Surface
 from geomtact.registration.rim import make_problem
@@ -72,14 +74,14 @@ def test_a_ball_tells_where_it_is_and_not_how_it_is_turned(ball, elastic):
 
 def test_information_is_that_of_the_outline(ball):
     """A disk of radius a shifted along x moves its outline by the cosine of the normal, which is a half in mean square: pi a
-    over the noise's correlation is told, per noise variance; to a fifth, at such pixels."""
+    over the noise's correlation, sqrt(pi) times its length, is told, per noise variance; to a fifth, at such pixels."""
     T = pressed_in_the_middle(ball)
     mask = felt_mask(ball, T, False)
     problem = make_problem(mask, SENSOR)
     radius = np.sqrt(mask.sum() * SENSOR.pixel_area(mask.shape) / np.pi)
     noise = Noise(outline_rms=0.2e-3, correlation=(1e-3, 3e-3))
     found = fisher_information(ball, T, False, problem, noise, pixel_noise=0.0)
-    expected = np.pi * radius / 2e-3 / 0.2e-3**2
+    expected = np.sqrt(np.pi) * radius / 2e-3 / 0.2e-3**2
     assert np.diag(found)[3:5] == pytest.approx(expected, rel=0.2)
 
 
@@ -108,6 +110,33 @@ def test_agreement_counts_directions():
     assert agreement(half, np.eye(6)[3:], spread, length) == 1 and agreement(half, np.eye(6)[:3], spread, length) == 0
 
 
+def grid_of(space):
+    resolution = choose_resolution(space.mesh, space.sensor, None, 20_000)
+    directions = Directions.make(space.mesh.symmetry, None, resolution.level, resolution.turn_step)
+    return Grid(directions, resolution)
+
+
+@pytest.mark.parametrize("name, turned", [("sphere", [0.0, 0.3, 0.2]), ("rod", [0.0, 0.0, 0.3])])
+def test_what_a_symmetry_leaves_open_is_not_told(name, turned):
+    """The same contact, the part turned within its symmetry: no error, however the part lies to the pixels."""
+    space = ContactSpace(shape(name).with_symmetry(), Sensor("s", (320, 240), (0.07e-3, 0.07e-3), 20e-3, 2e-3))
+    T = se3.transform(
+        se3.exp([0, 0, 0.4, 0, 0, 0])[:3, :3] @ se3.exp([0, np.pi / 2, 0, 0, 0, 0])[:3, :3], [1e-3, 0.5e-3, 0]
+    )
+    settled, ok = space.settle(T[None], 0.9e-3)
+    assert ok[0]
+    T = settled[0]
+    mask = felt_mask(space, T, False)
+    problem = make_problem(mask, space.sensor)
+    grid = Grid(
+        Directions.make(space.mesh.symmetry, None, 1, 0.25), choose_resolution(space.mesh, space.sensor, None, 20_000)
+    )
+    told, _ = split(fisher_information(space, T, False, problem, MODERATE), Spread(np.radians(4), 2e-3), problem.length)
+    other = T @ se3.exp([*turned, 0, 0, 0])
+    assert (felt_mask(space, other, False) ^ mask).mean() < 1e-3 and grid.spread.rotation > 0
+    assert np.linalg.norm(told @ motion_of(T, other, problem)) < 0.15e-3
+
+
 def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
     touches = touches_of(nut, 3)
     seen = {"a": [], "b": []}
@@ -120,13 +149,13 @@ def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
         return method
 
     methods = {name: spying(name) for name in seen}
-    spread = Spread(0.05, 1e-3)
-    whole = list(trials(nut, touches, methods, spread, CLEAN, 5, turns_deg=(0.0, 5.0), shifts_mm=(0.0, 2.0)))
-    assert [len(some) for some in whole] == [12, 12, 12]
+    grid = grid_of(nut)
+    whole = list(trials(nut, touches, lambda _: methods, grid, CLEAN, 5, turns_deg=(0.0, 5.0), shifts_mm=(0.0, 2.0)))
+    assert [len(some) for some in whole] == [14, 14, 14]
     np.testing.assert_array_equal(seen["a"], seen["b"])
     for i, touch in enumerate(touches):
         problem = make_problem(touch.mask, SENSOR)
-        for start, trial in zip(seen["a"][6 * i :], whole[i][:-4:2], strict=False):
+        for start, trial in zip(seen["a"][7 * i :], whole[i][:-6:2], strict=False):
             R = touch.T_sensor_object[:3, :3].T @ start[:3, :3]
             turned = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
             assert turned == pytest.approx(trial.turn_deg, abs=1e-3)
@@ -134,11 +163,13 @@ def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
             off = 1e3 * (start @ centre)[:2] - 1e3 * problem.centre[:2]
             assert np.linalg.norm(off) == pytest.approx(trial.shift_mm, abs=1e-6)
             assert trial.error_mm == trial.start_mm and trial.drift_mm == pytest.approx(0, abs=1e-9)
-        for start, trial in zip(seen["a"][6 * i + 4 :], whole[i][-4::2], strict=False):
+        for start, trial in zip(seen["a"][7 * i + 4 :], whole[i][-6::2], strict=False):
             assert trial.turn_deg is None and trial.shift_mm is None
-            zeta = motion_of(touch.T_sensor_object, start, problem)
-            assert (abs(zeta[:3]) / problem.length < 0.05 * np.sqrt(3) * 1.1).all()
-    again = list(trials(nut, touches, {"a": stay}, spread, CLEAN, 5, (0.0, 5.0), (0.0, 2.0), first=2))
+            rotations = grid.directions.rotations()[0]
+            assert np.abs(rotations - start[:3, :3]).max((1, 2)).min() < 1e-9
+            depth = nut.penetration(start[None])[0]
+            assert np.abs(np.array(grid.resolution.penetrations) - depth).min() < 1e-5
+    again = list(trials(nut, touches, lambda _: {"a": stay}, grid, CLEAN, 5, (0.0, 5.0), (0.0, 2.0), first=2))
     assert [t.start_mm for t in again[0]] == [t.start_mm for t in whole[2] if t.method == "a"]
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from geomtact import se3
+from geomtact.errors import PoseError
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread
@@ -277,7 +278,7 @@ def test_rim_lies_on_the_outline_and_not_on_the_border_of_the_image():
     assert (problem.facing[clear, :2] * expected[clear]).sum(1).min() > 0.95
     gaps = np.linalg.norm(np.diff(problem.points, axis=0), axis=1)
     assert np.ptp(gaps[gaps < 2 * np.median(gaps)]) < 0.3 * np.median(gaps)
-    assert problem.weight[0] == pytest.approx(min(1, np.median(gaps) / 2e-3), rel=0.1)
+    assert problem.weight[0] == pytest.approx(min(1, np.median(gaps) / (np.sqrt(np.pi) * 2e-3)), rel=0.1)
 
 
 def test_specks_have_no_rim_and_a_curved_membrane_lifts_it():
@@ -447,3 +448,13 @@ def test_contacts_of_two_sensors_tell_together_what_each_leaves_open():
     here = FilterReg(surface, spread).refine(problems[0], (se3.inverse(sensors[0]) @ start)[None])
     np.testing.assert_allclose(moved_alone.T[0], sensors[0] @ here.T[0], atol=1e-9)
     np.testing.assert_allclose(moved_alone.covariance[0], here.covariance[0], rtol=1e-6, atol=1e-15)
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_a_start_that_is_no_pose_is_refused(refiner, block):
+    surface, caster = block
+    T = facing_down(0, 0, 0.8e-3, 9e-3)
+    problem = make_problem(touch(caster, T), SENSOR)
+    for wrong in (np.nan * T, 1e3 * T):
+        with pytest.raises(PoseError, match="start pose"):
+            refiner(surface, SPREAD).refine(problem, np.stack([T, wrong]))

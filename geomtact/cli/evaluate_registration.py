@@ -14,6 +14,7 @@ from geomtact.cli.shell import print_table, tell
 
 if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
+    from geomtact.registration.protocol import Surface
     from geomtact.sensing.noise import Noise
     from geomtact.sensing.sensor import Sensor
 
@@ -59,9 +60,14 @@ def judge_registration(
         resolution = choose_resolution(mesh, pressed, None, MAX_POSES)
         assert mesh.symmetry is not None
         directions = Directions.make(mesh.symmetry, None, resolution.level, resolution.turn_step)
-        spread = Spread.of_grid(directions.angle_step(resolution.turn_step), resolution.step)
+        grid = registration.Grid(directions, resolution)
         surface = Refinery(space).surface
-        methods = registration.own_methods(space, surface, spread) | peers(surface, spread)
+
+        def methods(
+            spread: Spread, space: ContactSpace = space, surface: Surface = surface
+        ) -> dict[str, registration.Method]:
+            return registration.own_methods(space, surface, spread) | peers(surface, spread)
+
         settings = {
             "object_sha256": mesh.sha256,
             "sensor": pressed.name,
@@ -71,7 +77,7 @@ def judge_registration(
             "elastic": elastic,
             "seed": seed,
             "grid": resolution.to_json(),
-            "methods": list(methods),
+            "methods": list(methods(grid.spread)),
             "success_mm": registration.SUCCESS_MM,
             "peers": versions("small_gicp", "probreg"),
         }
@@ -84,7 +90,7 @@ def judge_registration(
 
         if len(done) < touches:
             pressed_at = random_touches(SimpleNamespace(space=space), touches, seed, elastic, noise)
-            more = registration.trials(space, pressed_at, methods, spread, noise, seed, first=len(done))
+            more = registration.trials(space, pressed_at, methods, grid, noise, seed, first=len(done))
             outcomes = ([asdict(trial) for trial in some] for some in more)
             done = study_file.collect(done, outcomes, touches, f"registering {mesh.name}", keep)
         keep(done)

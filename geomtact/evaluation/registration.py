@@ -5,32 +5,35 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import binomtest, chi2
 
+from geomtact.contact_space.resolution import Resolution
 from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.contact_class import contact_class
 from geomtact.evaluation.information import agreement, fisher_information, split
 from geomtact.evaluation.shapes import SHAPES
 from geomtact.evaluation.touches import PENETRATION, Touch
+from geomtact.geometry.rotations import Directions
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread, motion_of, moved, zeta_of_xi
 from geomtact.registration.protocol import Problem, Refiner, Surface
 from geomtact.registration.rim import make_problem
 from geomtact.scoring.overlap import to_grid
-from geomtact.se3 import Array, inverse, log
+from geomtact.se3 import Array, inverse, log, transform
 from geomtact.sensing.noise import Noise
 from geomtact.sensing.sensor import Sensor
 
 TURNS_DEG = (0.0, 2.5, 5.0, 10.0, 20.0)  # of the start poses about the contact's centre
 SHIFTS_MM = (0.0, 1.0, 2.0, 4.0, 8.0)  # along the membrane
-FROM_GRID = 2  # starts a touch that are as far off as a grid's poses
+FAR = Spread(np.radians(6), 3e-3)  # of starts that are turned and shifted by these
+FROM_GRID = 3  # starts a touch that are as far off as a grid's poses
 OWN = ("none", "icp", "filterreg", "both", "thesis")
 SUCCESS_MM = 0.5  # error in what the contact tells
 NOMINAL = (0.5, 0.8, 0.9, 0.95)
@@ -57,6 +60,31 @@ class End:
     observable: Array | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Where a grid's poses lie, without the grid: rotations, and a lattice of the object's centre over the window."""
+
+    directions: Directions
+    resolution: Resolution
+
+    @cached_property
+    def spread(self) -> Spread:
+        return Spread.of_grid(self.directions.angle_step(self.resolution.turn_step), self.resolution.step)
+
+    def near(self, space: ContactSpace, T: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """The pose (4, 4) of the cell that holds ``T`` (4, 4), on a lattice moved at random, and the pose that is ``T`` but for
+        the object's symmetry to which it is near."""
+        same, k, j = self.directions.lookup(T[None])
+        same, R = same[0], self.directions.rotations()[0][self.directions.first_turn[k[0]] + j[0]]
+        centre = same[:3, :3] @ space.mesh.centre + same[:3, 3]
+        phase = rng.uniform(-0.5, 0.5, 2)
+        centre[:2] = (np.rint(centre[:2] / self.resolution.step + phase) - phase) * self.resolution.step
+        bins = np.array(self.resolution.penetrations)
+        depth = bins[np.abs(bins - space.penetration(T[None])[0]).argmin()]
+        settled, touches = space.settle(transform(R, centre - R @ space.mesh.centre)[None], depth)
+        return (settled[0] if touches[0] else same), same
+
+
 Method = Callable[[Seen, Array], End]  # takes a start pose (4, 4) to a better one
 
 
@@ -73,7 +101,7 @@ class Trial:
     start_mm, error_mm : distance from the truth along those, before and after
     drift_mm : distance from the start along all others
     converged : as the method says
-    level : mass of the stated covariance's region that just holds the truth; None where none is stated
+    level : mass of the region, in the observable directions, that just holds the truth; None where none is stated
     agrees : share of directions of which method and exact simulator say the same: whether they are told
     """
 
@@ -96,8 +124,8 @@ class Trial:
 def trials(
     space: ContactSpace,
     touches: Sequence[Touch],
-    methods: Mapping[str, Method],
-    spread: Spread,
+    methods: Callable[[Spread], Mapping[str, Method]],
+    grid: Grid,
     noise: Noise,
     seed: int,
     turns_deg: Sequence[float] = TURNS_DEG,
@@ -112,10 +140,14 @@ def trials(
 
     Parameters
     ----------
-    spread : of the grid's poses
+    methods : by name, for starts of a given spread: methods are told how far off starts may be
+    grid : on which the object is searched for
     noise : that ``touches`` were made with
     first : touches before it are left out; the others come out as if they were not
     """
+    spread = grid.spread
+    near = methods(spread)
+    far = methods(Spread(max(spread.rotation, FAR.rotation), max(spread.translation, FAR.translation)))
     for number, touch in enumerate(touches[first:], first):
         rng = np.random.default_rng([seed, number])
         T = touch.T_sensor_object
@@ -126,18 +158,20 @@ def trials(
         out = []
         offs: list[tuple[float | None, float | None]] = [(turn, shift) for turn in turns_deg for shift in shifts_mm]
         for turn, shift in offs + [(None, None)] * FROM_GRID:
-            draw = partial(_grid_off, spread) if turn is None or shift is None else partial(_off, turn, shift)
-            start = _start(space, T, seen.problem, draw, rng)
-            before = motion_of(T, start, seen.problem)
-            for name, method in methods.items():
+            if turn is None or shift is None:
+                start, true = grid.near(space, T, rng)
+            else:
+                start, true = _start(space, T, seen.problem, partial(_off, turn, shift), rng), T
+            before = motion_of(true, start, seen.problem)
+            for name, method in (near if turn is None else far).items():
                 began = time.perf_counter()
                 end = method(seen, start)
                 ms = 1e3 * (time.perf_counter() - began)
-                after = motion_of(T, end.T, seen.problem)
+                after = motion_of(true, end.T, seen.problem)
                 sizes = (told @ before, told @ after, rest @ (after - before))
                 off, left, drift = (1e3 * float(np.linalg.norm(size)) for size in sizes)
                 who = (number, kind, touch.elastic, name, turn, shift, round(float(np.trace(told))))
-                said = _said(end, T, information, spread, seen.problem)
+                said = _said(end, true, information, spread, seen.problem)
                 out.append(Trial(*who, off, left, drift, bool(end.converged), ms, *said))
         yield out
 
@@ -145,12 +179,15 @@ def trials(
 def _said(
     end: End, T: Array, information: Array, spread: Spread, problem: Problem
 ) -> tuple[float | None, float | None]:
-    """How far out the truth ``T`` lies in the stated covariance, and how far that agrees with the exact ``information``."""
+    """How far out the truth ``T`` lies in the stated covariance of the observable directions, and in how many of all directions
+    these agree with the exact ``information``."""
     if end.covariance is None or end.observable is None or not end.converged:
         return None, None
-    off = log(inverse(end.T) @ T)
-    level = float(chi2.cdf(off @ np.linalg.solve(end.covariance, off), 6))
-    rows = end.observable * np.repeat([problem.length, 1.0], 3) @ np.linalg.inv(zeta_of_xi(end.T, problem))
+    rows = end.observable * np.repeat([problem.length, 1.0], 3)
+    off, level = rows @ log(inverse(end.T) @ T), None
+    if len(rows):
+        level = float(chi2.cdf(off @ np.linalg.solve(rows @ end.covariance @ rows.T, off), len(rows)))
+    rows = rows @ np.linalg.inv(zeta_of_xi(end.T, problem))
     return level, agreement(information, rows, spread, problem.length)
 
 
@@ -159,12 +196,6 @@ def _off(turn_deg: float, shift_mm: float, rng: np.random.Generator) -> Array:
     axis, way = rng.normal(size=3), rng.uniform(0, 2 * np.pi)
     shift = 1e-3 * shift_mm * np.array([np.cos(way), np.sin(way)])
     return np.append(np.radians(turn_deg) * axis / np.linalg.norm(axis), shift)
-
-
-def _grid_off(spread: Spread, rng: np.random.Generator) -> Array:
-    """As :func:`_off`, of a grid's pose: uniform over a cell."""
-    width = np.sqrt(12) * np.array([spread.rotation] * 3 + [spread.translation] * 2)
-    return np.asarray(width * rng.uniform(-0.5, 0.5, 5))
 
 
 def _start(
@@ -258,7 +289,7 @@ def summarise(trials: Sequence[Trial], half_pixel_mm: float) -> dict[str, Any]:
     drift by contact.
 
     Touches that tell nothing are left out of success and errors. ``lost`` names the cells in which FilterReg succeeds less
-    often than the best of the other libraries, beyond what chance allows: a 95 % interval of the paired difference.
+    often than the best of the other libraries, beyond what chance allows.
 
     Parameters
     ----------
@@ -285,8 +316,9 @@ def summarise(trials: Sequence[Trial], half_pixel_mm: float) -> dict[str, Any]:
         rates = {name: float(each.mean()) for name, each in won.items()}
         start = {"turn_deg": turn, "shift_mm": shift}
         out["success"][kind].append({**start, "n": len(next(iter(won.values()))), "rates": rates})
-        best = max((name for name in rates if name not in OWN), key=rates.__getitem__, default=None)
-        if best is not None and _loses(won["filterreg"], won[best]):
+        peers = [name for name in rates if name not in OWN]
+        best = max(peers, key=rates.__getitem__, default=None)
+        if best is not None and _loses(won["filterreg"], won[best], len(peers)):
             out["lost"].append({"contact": kind, **start, "to": best})
     return out
 
@@ -327,9 +359,8 @@ def _grouped(trials: Sequence[Trial], *keys: str) -> dict[Any, list[Trial]]:
     return out
 
 
-def _loses(won: NDArray[np.bool_], other: NDArray[np.bool_]) -> bool:
-    """Whether ``won`` (n,) is true less often than ``other`` of the same trials, beyond a 95 % interval of the difference."""
-    difference = won.astype(float) - other
-    if len(difference) < 2:
-        return False
-    return bool(difference.mean() + 1.96 * difference.std(ddof=1) / np.sqrt(len(difference)) < 0)
+def _loses(won: NDArray[np.bool_], other: NDArray[np.bool_], peers: int) -> bool:
+    """Whether ``won`` (n,) is true less often than ``other`` of the same trials, the best of ``peers``, beyond chance: an exact
+    sign test at 5 %, shared among the peers."""
+    better, worse = int((won & ~other).sum()), int((other & ~won).sum())
+    return worse > better and bool(binomtest(better, better + worse).pvalue < 0.05 / peers)

@@ -15,7 +15,7 @@ import numpy as np
 from geomtact.registration.fit import FEWEST, Meeting, judged, only_told
 from geomtact.registration.observability import Spread, jacobian, moved
 from geomtact.registration.protocol import Problem, Refinement, Surface
-from geomtact.se3 import Array, apply, inverse
+from geomtact.se3 import Array, apply, check_transforms, inverse
 
 _FEWER = 2  # around points that are only inside or outside
 _OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
@@ -45,16 +45,13 @@ class FilterReg:
     neighbours: int = 6
     name: str = "filterreg"
 
-    def refine(self, problem: Problem, T: Array, sinks: Array | None = None) -> Refinement:
-        """Refine the poses ``T`` (k, 4, 4) of the object in the problem's frame, where the gel sinks around the object by
-        about ``sinks`` (k, c) [m] at each contact, 0 by default."""
-        start = np.asarray(T, float).reshape(-1, 4, 4)
+    def refine(self, problem: Problem, T: Array) -> Refinement:
+        """Refine the poses ``T`` (k, 4, 4) of the object in the problem's frame."""
+        start = check_transforms(T, "start pose").reshape(-1, 4, 4)
         contact_filter = ContactFilter(problem, self.surface, self.objective, self.neighbours)
         # motions zeta and sinks of the gel are held by what was known before: what is not told stays where it was
         held = np.append(1 / self.spread.metres(problem.length), np.full(problem.contacts, 1 / problem.sink_std)) ** 2
-        known = np.zeros((len(start), len(held)))
-        known[:, 6:] = 0.0 if sinks is None else sinks
-        state, T, at_rest = known.copy(), start.copy(), np.zeros(len(start), bool)
+        state, T, at_rest = np.zeros((len(start), len(held))), start.copy(), np.zeros(len(start), bool)
         sigma, at_end = self.spread.radius(problem.length), 0
         going = np.arange(len(start))
         while len(going) and at_end < _STEPS_AT_END and len(problem.points) >= FEWEST:
@@ -62,7 +59,7 @@ class FilterReg:
             at_end += sigma == contact_filter.narrowest
             meeting = contact_filter.meet(T[going], state[going, 6:], sigma)
             supported = meeting.support >= FEWEST
-            slope = meeting.slope - held * (state - known)[going]
+            slope = meeting.slope - held * state[going]
             information = meeting.information + np.diag(held)
             if len(problem.around):
                 pull = contact_filter.pull(T[going], sigma)

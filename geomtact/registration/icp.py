@@ -17,7 +17,7 @@ from geomtact.registration.fit import FEWEST, judged, only_told
 from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.registration.rim import near_surface
-from geomtact.se3 import Array, inverse
+from geomtact.se3 import Array, check_transforms, inverse
 
 _MAX_ITERATIONS = 20
 
@@ -38,7 +38,7 @@ class Icp:
 
     def refine(self, problem: Problem, T: Array) -> Refinement:
         """Refine the poses ``T`` (k, 4, 4) of the object in the problem's frame, one after the other."""
-        start = np.asarray(T, float).reshape(-1, 4, 4)
+        start = check_transforms(T, "start pose").reshape(-1, 4, 4)
         with _one_thread():
             found = [self._register(problem, pose) for pose in start]
         met = np.array([pose is not None for pose in found], bool)

@@ -16,7 +16,6 @@ from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array, apply, exp, hat, inverse, log, transform
 
 _LEAST_TURN = 0.02  # rad
-_BELIEF = 0.5  # of the information, in covariances
 GAIN = 4 / 3  # information over what was known before from which a direction is told: to a quarter of the grid's step
 
 
@@ -86,12 +85,10 @@ def motion_of(start: Array, T: Array, problem: Problem) -> Array:
 def summary(T: Array, information: Array, spread: Spread, problem: Problem) -> tuple[Array, Array]:
     """Covariance (6, 6) of xi and the observable directions (r, 6), from the information (6, 6) about zeta.
 
-    The covariance joins what the contact tells with what was known before; nothing is unknown beyond ``spread``. What it tells
-    counts by ``_BELIEF``: the rest goes to what the model leaves out, as that the gel sinks more here than there.
+    The covariance joins what the contact tells with what was known before; nothing is unknown beyond ``spread``.
     """
     known = spread.metres(problem.length)
     measure, move, gain = told(information, spread, problem.length)
-    gain = _BELIEF * gain
     # in told directions the variance known**2 becomes known**2 / (1 + gain)
     covariance = np.diag(known**2) - (move * (gain / (1 + gain))) @ move.T
     to_zeta = zeta_of_xi(T, problem)

@@ -47,7 +47,7 @@ def make_problem(
     max_points : of the outline, of the heights, and of what lies inside and outside, at most
     outline_noise : how far the outline of a real mask strays, standard deviation along its normal [m]
     height_noise : standard deviation of heights [m]
-    correlation : over what length both stray the same way [m]
+    correlation : over what length both stray the same way [m]: to 1/e in a Gaussian field, as ``Noise.correlation``
     sink : how far below the membrane the object's surface lies at the outline [m]: 0 for a rigid gel, about 0.55 of the deepest
         for an elastic one
     sink_std : and how much more or less it may be [m]; by default both gels may be
@@ -55,7 +55,7 @@ def make_problem(
     contact: NDArray[np.bool_] = np.asarray(mask, bool)
     if height is not None:
         # of an elastic gel, what is not pressed in half as deep as the deepest may hang free of the object
-        depth = np.nan_to_num(np.asarray(height, float), nan=0.0)
+        depth = cv2.medianBlur(np.nan_to_num(np.asarray(height, np.float32), posinf=0.0, neginf=0.0), 3).astype(float)
         sink, sink_std = 0.5 * float(depth.max(where=contact, initial=0.0)), 0.0
         contact = contact & (depth > sink)
     pitch_xy = 2 * sensor.half_window / contact.shape[::-1]
@@ -68,32 +68,32 @@ def make_problem(
     rim = lifted(pixels)
     down = _down(rim, sensor)
     facing = np.concatenate([outward, np.zeros((len(outward), 1))], 1)
-    points = [rim + sink * down]
-    facings = [facing]
-    noises = [np.full(len(rim), np.hypot(outline_noise, 0.3 * pitch))]
-    weights = [np.full(len(rim), min(1.0, spacing / correlation))]
+    across = _unit(np.cross(down, facing))
+    points = rim + sink * down
+    noise = np.full(len(rim), np.hypot(outline_noise, 0.3 * pitch))
+    weight = np.full(len(rim), min(1.0, spacing / (np.sqrt(np.pi) * correlation)))
+    sinking = down
     if height is not None:
         uv, apart = _spaced(contact, pitch_xy, max_points)
         gel = lifted(uv)
-        points.append(gel + depth[tuple(uv.astype(int).T[::-1])][:, None] * _down(gel, sensor))
-        facings.append(_unit(_down(gel, sensor)))
-        noises.append(np.full(len(gel), np.hypot(height_noise, 0.1 * pitch)))
-        weights.append(np.full(len(gel), min(1.0, (apart / correlation) ** 2)))
-    within = [(0, len(gel)), (0, 0)] if height is not None else [(0, 0), (0, 0)]  # points that are on no outline
+        pressed = depth[tuple(uv.astype(int).T[::-1])][:, None] * _down(gel, sensor)
+        points, facing = np.concatenate([points, gel + pressed]), np.concatenate([facing, _unit(_down(gel, sensor))])
+        across, sinking = np.concatenate([across, np.zeros_like(gel)]), np.zeros_like(points)
+        noise = np.append(noise, np.full(len(gel), np.hypot(height_noise, 0.1 * pitch)))
+        weight = np.append(weight, np.full(len(gel), min(1.0, (apart / correlation) ** 2 / np.pi)))
     inside, outside = (lifted(uv) for uv in _inside_and_outside(contact, pitch_xy, max_points))
     # what the gel may have sunk to lies neither inside nor outside
     inside, outside = inside + sink * _down(inside, sensor), outside + (sink + sink_std) * _down(outside, sensor)
-    every = np.concatenate(points)
-    centre = every.mean(0) if len(every) else np.zeros(3)
-    length = float(np.sqrt(((every - centre) ** 2).sum(1).mean())) if len(every) else 0.0
+    centre = points.mean(0) if len(points) else np.zeros(3)
+    length = float(np.sqrt(((points - centre) ** 2).sum(1).mean())) if len(points) else 0.0
     return Problem(
-        points=every,
-        facing=np.concatenate(facings),
-        across=np.pad(_unit(np.cross(down, facing)), within),
-        sinking=np.pad(down if height is None else 0 * down, within),
-        noise=np.concatenate(noises),
-        weight=np.concatenate(weights),
-        contact=np.zeros(len(every), np.int64),
+        points=points,
+        facing=facing,
+        across=across,
+        sinking=sinking,
+        noise=noise,
+        weight=weight,
+        contact=np.zeros(len(points), np.int64),
         around=np.concatenate([inside, outside]),
         side=np.repeat([1, -1], [len(inside), len(outside)]),
         centre=centre,
