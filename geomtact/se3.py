@@ -64,6 +64,12 @@ def apply(T: ArrayLike, points: ArrayLike) -> Array:
     return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
 
+def unit(v: ArrayLike) -> Array:
+    """Vectors (..., 3) of length 1 along ``v`` (..., 3); 0 stays 0."""
+    v = np.asarray(v, float)
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
+
+
 def hat(w: ArrayLike) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     x, y, z = np.moveaxis(np.asarray(w, float), -1, 0)

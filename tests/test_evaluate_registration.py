@@ -224,8 +224,7 @@ def test_figures_from_the_grid_are_shares_of_what_they_say():
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_shapes_are_closed_and_face_outwards(name):
-    mesh = shape(name)
-    made = mesh.trimesh if hasattr(mesh, "trimesh") else SHAPES[name]()
+    made = SHAPES[name]()
     assert made.is_watertight and made.is_winding_consistent and made.volume > 0
 
 

@@ -96,7 +96,7 @@ def judge_registration(
         keep(done)
         tell(f"{mesh.name}: done")
     trials = [registration.Trial(**t) for part in content["parts"].values() for some in part["outcomes"] for t in some]
-    half_pixel = 0.5 * float(pressed.pixel_area(pressed.along((48, 64)))) ** 0.5
+    half_pixel = 0.5 * float(pressed.pixel_area(pressed.along(registration.MASK))) ** 0.5
     content["figures"] = plain(registration.summarise(trials, 1e3 * half_pixel))
     study_file.save(out, content)
     _print(content["figures"])

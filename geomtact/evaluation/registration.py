@@ -38,7 +38,7 @@ OWN = ("none", "icp", "filterreg", "both", "thesis")
 SUCCESS_MM = 0.5  # error in what the contact tells
 NOMINAL = (0.5, 0.8, 0.9, 0.95)
 _MASK_NEIGHBOURS = 200  # within a filled mask, the nearest points alone pull nowhere
-_MASK = (48, 64)  # half a pixel of such a mask is what a refined pose may lose
+MASK = (48, 64)  # half a pixel of such a mask is what a refined pose may lose
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def _thesis(space: ContactSpace, spread: Spread) -> Method:
 
     def refine(seen: Seen, start: Array) -> End:
         sensor = space.sensor
-        simulated = space.caster.depths(sensor, start[None], sensor.along(_MASK))[0] > 0
+        simulated = space.caster.depths(sensor, start[None], sensor.along(MASK))[0] > 0
         points, sensed = (_mask_points(mask, sensor) for mask in (simulated, seen.mask))
         if len(points) < 6 or len(sensed) < 6:
             return End(start, False)
@@ -277,11 +277,11 @@ def _thesis(space: ContactSpace, spread: Spread) -> Method:
 
 
 def _mask_points(mask: NDArray[np.bool_], sensor: Sensor) -> Array:
-    """The contact pixels of a mask, on a grid of ``_MASK``, as points (n, 3) of the membrane's plane."""
-    rows, cols = np.nonzero(to_grid(mask, sensor.along(_MASK)))
-    h, w = sensor.along(_MASK)
-    xy = (np.stack([cols, rows], 1) + 0.5) * (2 * sensor.half_window / [w, h]) - sensor.half_window
-    return np.column_stack([xy, np.zeros(len(xy))])
+    """The contact pixels of a mask, on a grid of ``MASK``, as points (n, 3) of the membrane's plane."""
+    shape = sensor.along(MASK)
+    rows, cols = np.nonzero(to_grid(mask, shape))
+    x, y = sensor.pixel_centres(shape)
+    return np.column_stack([x[cols], y[rows], np.zeros(len(rows))])
 
 
 def summarise(trials: Sequence[Trial], half_pixel_mm: float) -> dict[str, Any]:

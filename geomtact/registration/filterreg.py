@@ -11,18 +11,19 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geomtact.registration.fit import FEWEST, Meeting, judged, only_told
 from geomtact.registration.observability import Spread, jacobian, moved
 from geomtact.registration.protocol import Problem, Refinement, Surface
-from geomtact.se3 import Array, apply, check_transforms, inverse
+from geomtact.registration.rim import FLAT
+from geomtact.se3 import Array, apply, check_transforms, inverse, unit
 
 _FEWER = 2  # around points that are only inside or outside
 _OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
 _STEPS_AT_END = 8  # with the narrowest filter, at most
 _REST = 1.0  # standard deviations that the last step may be
 _SLOPE_NOISE = 0.3  # noise across the membrane, as a share of that along it
-_FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,7 @@ class FilterReg:
             if at_end > 1:
                 at_rest[going] = expected < _REST**2
                 going = going[~at_rest[going]]
-        sinks, sigma = state[:, 6:], contact_filter.narrowest
-        T = only_told(start, T, contact_filter.meet(T, sinks, sigma), self.spread, problem)
-        meeting = contact_filter.meet(T, sinks, sigma)
-        return judged(start, T, meeting, at_rest, self.spread, problem)
+        return contact_filter.judged(start, T, state[:, 6:], at_rest, self.spread)
 
 
 class ContactFilter:
@@ -84,14 +82,12 @@ class ContactFilter:
 
     Attributes
     ----------
-    noise : of the observed points, in the median [m]
-    narrowest : width of the filter that this noise and the gaps between the surface's points leave [m]
+    narrowest : width of the filter that the points' noise and the gaps between the surface's points leave [m]
     """
 
     def __init__(self, problem: Problem, surface: Surface, objective: str = "plane", neighbours: int = 6):
         self.problem, self.surface, self.objective, self.neighbours = problem, surface, objective, neighbours
-        self.noise = float(np.median(problem.noise)) if len(problem.noise) else problem.pitch
-        self.narrowest = float(np.hypot(self.noise, surface.spacing))
+        self.narrowest = float(np.hypot(problem.middle_noise, surface.spacing))
 
     def meet(self, T: Array, sinks: Array, sigma: float) -> Meeting:
         """Filter the surface at poses ``T`` (k, 4, 4) with width ``sigma`` [m], the gel sunk by ``sinks`` (k, c) [m]."""
@@ -122,6 +118,11 @@ class ContactFilter:
             support=(inlier > 0.5).sum(1),
         )
 
+    def judged(self, start: Array, T: Array, sinks: Array, at_rest: NDArray[np.bool_], spread: Spread) -> Refinement:
+        """``T`` (k, 4, 4) as far from ``start`` (k, 4, 4) as is told, where that can be believed (see ``fit``)."""
+        T = only_told(start, T, self.meet(T, sinks, self.narrowest), spread, self.problem)
+        return judged(start, T, self.meet(T, sinks, self.narrowest), at_rest, spread, self.problem)
+
     def pull(self, T: Array, sigma: float) -> tuple[Array, Array]:
         """Normal equations (k, 6, 6), (k, 6) of the membrane that is on the wrong side of the surface."""
         problem = self.problem
@@ -131,10 +132,10 @@ class ContactFilter:
         share = np.exp(-0.5 * (distance2 - distance2.min(-1, keepdims=True)) / sigma**2)
         share /= share.sum(-1, keepdims=True)
         above = np.einsum("kni,knij,knij->kn", share, normals, off)
-        normal = _unit(np.einsum("kni,knij->knj", share, normals)) @ np.swapaxes(T[:, :3, :3], 1, 2)
+        normal = unit(np.einsum("kni,knij->knj", share, normals)) @ np.swapaxes(T[:, :3, :3], 1, 2)
         wrong = problem.side * above > 0
         # all together weigh as much as the points; what is deeper on the wrong side than the filter is wide may itself be wrong
-        each = problem.weight.sum() / len(problem.around) / self.noise**2
+        each = problem.weight.sum() / len(problem.around) / problem.middle_noise**2
         return _normal_equations(
             jacobian(points, normal, problem), above, wrong * each / (1 + (above / (3 * sigma)) ** 2)
         )
@@ -147,12 +148,12 @@ class ContactFilter:
         face, lean = (np.einsum("knij,knj->kni", normals, v) for v in (facing, across))
         slope = np.hypot(face, lean)
         # a surface that faces another way, or runs along the membrane, has not made this part of the outline
-        alike = np.where(slope > _FLAT, np.clip(face / np.maximum(slope, _FLAT), 0, 1), 0)
+        alike = np.where(slope > FLAT, np.clip(face / np.maximum(slope, FLAT), 0, 1), 0)
         filtered = alike * np.exp(-0.5 * (off**2).sum(-1) / sigma**2)
         total = filtered.sum(-1)
         share = filtered / np.maximum(total, 1e-300)[..., None]
         target, normal = (np.einsum("kni,knij->knj", share, v) for v in (near, normals))
-        return apply(T, target), _unit(normal) @ np.swapaxes(R, 1, 2), total / (total + _OUTLIER)
+        return apply(T, target), unit(normal) @ np.swapaxes(R, 1, 2), total / (total + _OUTLIER)
 
     def _nearest(
         self, T: Array, points: Array, most: int, sigma: float, facing: Array | None = None
@@ -178,7 +179,3 @@ def _normal_equations(J: Array, error: Array, weight: Array) -> tuple[Array, Arr
     """(k, p, p) and (k, p) from the slopes (k, n, p) of errors (k, n) and their weights (k, n)."""
     weighted = np.swapaxes(J * weight[..., None], 1, 2)
     return weighted @ J, -(weighted @ error[..., None])[..., 0]
-
-
-def _unit(v: Array) -> Array:
-    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))

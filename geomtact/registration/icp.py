@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomtact.registration.filterreg import ContactFilter
-from geomtact.registration.fit import FEWEST, judged, only_told
+from geomtact.registration.fit import FEWEST
 from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.registration.rim import near_surface
@@ -42,12 +42,10 @@ class Icp:
         with _one_thread():
             found = [self._register(problem, pose) for pose in start]
         met = np.array([pose is not None for pose in found], bool)
-        ended = np.array([first if pose is None else pose for first, pose in zip(start, found, strict=True)])
+        ended = [first if pose is None else pose for first, pose in zip(start, found, strict=True)]
+        sinks = np.zeros((len(start), problem.contacts))
         contact_filter = ContactFilter(problem, self.surface)
-        sinks, sigma = np.zeros((len(start), problem.contacts)), contact_filter.narrowest
-        T = ended.reshape(-1, 4, 4)
-        T = only_told(start, T, contact_filter.meet(T, sinks, sigma), self.spread, problem)
-        return judged(start, T, contact_filter.meet(T, sinks, sigma), met, self.spread, problem)
+        return contact_filter.judged(start, np.reshape(ended, (-1, 4, 4)), sinks, met, self.spread)
 
     def _register(self, problem: Problem, start: Array) -> Array | None:
         reach = 3 * self.spread.radius(problem.length) + 2 * problem.pitch
@@ -72,7 +70,7 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
     cloud.points = o3d.utility.Vector3dVector(np.concatenate([points, anchors]) / unit)
     cloud.normals = o3d.utility.Vector3dVector(np.concatenate([normals, axes]))
     motion, found = np.eye(4), False
-    for within in (reach, 3 * float(np.median(problem.noise)) + problem.pitch):
+    for within in (reach, 3 * problem.middle_noise + problem.pitch):
         result = registration.registration_icp(
             rim,
             cloud,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
@@ -109,9 +109,10 @@ class Problem:
         """How many contacts there are."""
         return int(self.contact.max(initial=0)) + 1
 
-    def sunk(self, sink: Array | float) -> Problem:
-        """As observed with a gel that sinks by ``sink`` [m], one number or (n,), around the object."""
-        return replace(self, points=self.points + np.reshape(sink, (-1, 1)) * self.sinking)
+    @property
+    def middle_noise(self) -> float:
+        """Of the points, in the median; the pixels' pitch where there are none."""
+        return float(np.median(self.noise)) if len(self.noise) else self.pitch
 
     @staticmethod
     def joined(problems: list[Problem], T_world_sensor: Array) -> Problem:

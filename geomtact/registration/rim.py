@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.registration.protocol import Problem, Surface
-from geomtact.se3 import Array, apply, inverse
+from geomtact.se3 import Array, apply, inverse, unit
 from geomtact.sensing.sensor import Sensor
 
 SINK, SINK_STD = 0.2e-3, 0.35e-3  # m that a gel, rigid or elastic, is taken to sink around the object, give or take
 _FEWEST = 4  # points on a contour; shorter ones are specks
-_FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
+FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
 _CLEAR = 0.5e-3  # m that a point is off the outline to count as inside or outside of it
 _AROUND = 4e-3  # m from the contact within which points outside of it are taken
 
@@ -68,7 +68,7 @@ def make_problem(
     rim = lifted(pixels)
     down = _down(rim, sensor)
     facing = np.concatenate([outward, np.zeros((len(outward), 1))], 1)
-    across = _unit(np.cross(down, facing))
+    across = unit(np.cross(down, facing))
     points = rim + sink * down
     noise = np.full(len(rim), np.hypot(outline_noise, 0.3 * pitch))
     weight = np.full(len(rim), min(1.0, spacing / (np.sqrt(np.pi) * correlation)))
@@ -77,7 +77,7 @@ def make_problem(
         uv, apart = _spaced(contact, pitch_xy, max_points)
         gel = lifted(uv)
         pressed = depth[tuple(uv.astype(int).T[::-1])][:, None] * _down(gel, sensor)
-        points, facing = np.concatenate([points, gel + pressed]), np.concatenate([facing, _unit(_down(gel, sensor))])
+        points, facing = np.concatenate([points, gel + pressed]), np.concatenate([facing, unit(_down(gel, sensor))])
         across, sinking = np.concatenate([across, np.zeros_like(gel)]), np.zeros_like(points)
         noise = np.append(noise, np.full(len(gel), np.hypot(height_noise, 0.1 * pitch)))
         weight = np.append(weight, np.full(len(gel), min(1.0, (apart / correlation) ** 2 / np.pi)))
@@ -111,10 +111,6 @@ def _down(points: Array, sensor: Sensor) -> Array:
     return -(points - camera) / (points - camera)[:, 2:]
 
 
-def _unit(v: Array) -> Array:
-    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
-
-
 def near_surface(surface: Surface, problem: Problem, T: Array, reach: float) -> tuple[Array, Array]:
     """Points (s, 3) and normals (s, 3) of the surface, in the problem's frame at ``T``, within ``reach`` [m] of what was
     observed, as far as they may have made a single contact: not parallel to its membrane."""
@@ -128,7 +124,7 @@ def near_surface(surface: Surface, problem: Problem, T: Array, reach: float) -> 
         z = surface.points[index] @ T[2, :3] + T[2, 3]
         index = index[(z > problem.points[:, 2].min() - reach) & (z < problem.points[:, 2].max() + reach)]
         if problem.across.any(1).all():
-            index = index[np.abs(surface.normals[index] @ T[2, :3]) < np.sqrt(1 - _FLAT**2)]
+            index = index[np.abs(surface.normals[index] @ T[2, :3]) < np.sqrt(1 - FLAT**2)]
     return apply(T, surface.points[index]), surface.normals[index] @ T[:3, :3].T
 
 
