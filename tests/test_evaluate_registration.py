@@ -258,7 +258,7 @@ def observed(points):
     n, none = len(points), np.zeros((0, 3))
     return Problem(
         points, 0 * points, 0 * points, 0 * points, np.full(n, 0.2e-3), np.ones(n), np.zeros(n, int), none, np.zeros(0, int),
-        points.mean(0), length=5e-3, pitch=0.2e-3, sink_std=1e-4,
+        np.array([0.0, 0.0, 1.0]), points.mean(0), length=5e-3, pitch=0.2e-3, sink_std=1e-4,
     )  # fmt: skip
 
 

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from geomtact import se3
-from geomtact.errors import PoseError
+from geomtact.errors import MeshError, PoseError
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
-from geomtact.registration.observability import Spread
+from geomtact.registration.observability import Spread, motion_of
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.registration.rim import make_problem
 from geomtact.sensing.cast import Caster
+from geomtact.sensing.elastic import elastic_contact
 from geomtact.sensing.sensor import Sensor
 
 trimesh = pytest.importorskip("trimesh")
@@ -419,6 +420,91 @@ def test_heights_tell_what_the_outline_does_not(ball):
             found[name] = abs(result.T[0][2, 3] - T[2, 3]), np.sqrt(covariance[2, 2])
         assert found["heights"][0] < 0.05e-3 < found["outline"][0]
         assert found["heights"][1] < 0.5 * found["outline"][1]
+
+
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("size", [(8e-3, 6e-3, 10e-3), (2e-3, 2e-3, 10e-3)])
+def test_gel_that_hangs_free_beside_a_punch_moves_nothing_sideways(size, soft):
+    """Around a flat punch an elastic gel is half as deep only at twice its radius: nothing of the object is there."""
+    surface, caster = scene(trimesh.creation.box(size), 30000)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        T = facing_down(*rng.uniform(-3e-3, 3e-3, 2), 1e-3, 5e-3, rng.uniform(-0.03, 0.03, 2), rng.uniform(-3, 3))
+        depth = caster.depths(SENSOR, T[None])[0]
+        height = elastic_contact(depth, SENSOR.pixel_pitch)[1] if soft else np.maximum(depth, 0)
+        problem = make_problem(height > 3e-5, SENSOR, height)
+        start = se3.transform(np.eye(3), [0.5e-3, -0.4e-3, 0.3e-3]) @ T
+        result = FilterReg(surface, Spread(0.05, 0.7e-3)).refine(problem, start[None])
+        is_sound(result, 1)
+        top = [0, 0, 5e-3]
+        before, after = (1e3 * (se3.apply(pose, [top]) - se3.apply(T, [top]))[0] for pose in (start, result.T[0]))
+        assert np.linalg.norm(after[:2]) < np.linalg.norm(before[:2]) + 0.05
+        assert not result.converged[0] or abs(after[2]) < 0.15 < abs(before[2])
+
+
+def test_missing_heights_are_no_border_of_the_contact(block):
+    """Where heights are missing nothing is known: neither an outline nor membrane that was not met."""
+    _, caster = block
+    contact = caster.contact(SENSOR, facing_down(0, 0, 0.8e-3, 9e-3))
+    gap = np.zeros(contact.mask.shape, bool)
+    gap[:, 24:36] = True
+    problem = make_problem(contact.mask & ~gap, SENSOR, np.where(gap, np.nan, contact.height))
+    whole = make_problem(contact.mask, SENSOR, contact.height)
+    x = SENSOR.pixel_centres()[0][[24, 35]] * [1.02, 0.98]
+    for points in (problem.points, problem.around):
+        assert len(points) > 5 and ((points[:, 0] < x[0]) | (points[:, 0] > x[1])).all()
+    assert len(whole.points) > len(problem.points) - 10
+
+
+def test_heights_on_a_bulging_membrane_lie_on_the_object():
+    sensor = dataclasses.replace(SENSOR, membrane_radius=30e-3)
+    ball = trimesh.creation.icosphere(5, 8e-3)
+    _, caster = scene(ball)
+    T = se3.transform(np.eye(3), [4e-3, 2e-3, 8e-3 - 1.2e-3])
+    contact = caster.contact(sensor, T)
+    problem = make_problem(contact.mask, sensor, contact.height)
+    within = ~problem.across.any(1)
+    off = np.linalg.norm(problem.points[within] - T[:3, 3], axis=1) - 8e-3
+    assert within.sum() > 20 and np.abs(off).max() < 0.02e-3
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_an_approach_that_leaves_no_tilt_gets_none(refiner, block):
+    """Poses off an exact face would lie outside the contact pose space."""
+    surface, caster = block
+    spread = Spread.of_grid(np.radians(6), 1e-3, [((0, 0, 1), 0.0)])
+    believed = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        T = facing_down(*rng.uniform(-3e-3, 3e-3, 2), 0.8e-3, 9e-3, turn=rng.uniform(-3, 3))
+        start = se3.transform(np.eye(3), [0.3e-3, -0.2e-3, 0]) @ T
+        result = refiner(surface, spread).refine(make_problem(touch(caster, T), SENSOR), start[None])
+        is_sound(result, 1)
+        believed += result.converged[0]
+        assert abs(result.T[0][2, 2] - T[2, 2]) < 1e-12
+    assert believed > 7
+
+
+@pytest.mark.parametrize("refiner", REFINERS)
+def test_where_the_world_has_its_origin_changes_nothing(refiner, block):
+    surface, caster = block
+    T = facing_down(1e-3, -1e-3, 0.8e-3, 9e-3, turn=0.4)
+    problem = make_problem(touch(caster, T), SENSOR)
+    start = off(T, problem, np.random.default_rng(0))
+    here = refiner(surface, SPREAD).refine(problem, start[None])
+    far = se3.transform(se3.exp([0.3, -0.8, 2.0, 0, 0, 0])[:3, :3], [3.0, -2.0, 1.0])
+    there = refiner(surface, SPREAD).refine(Problem.joined([problem], far[None]), (far @ start)[None])
+    assert here.converged[0] and there.converged[0]
+    # Open3D's steps are not alike in all axes
+    close = 1e-6 if refiner is FilterReg else 0.05e-3
+    assert np.abs(motion_of(here.T[0], se3.inverse(far) @ there.T[0], problem)).max() < close
+
+
+def test_a_spread_of_zero_and_a_surface_of_one_point_are_refused():
+    with pytest.raises(PoseError, match="must be greater than 0"):
+        Spread(0.0, 1e-3)
+    with pytest.raises(MeshError, match="needs 2 points or more, got 1"):
+        Surface(np.zeros((1, 3)), np.ones((1, 3)))
 
 
 def test_contacts_of_two_sensors_tell_together_what_each_leaves_open():

@@ -116,6 +116,17 @@ def test_project_undoes_lift_for_every_optics():
                 assert (points[..., 2] == 0).all()
 
 
+def test_what_lies_below_the_membrane_is_lifted_along_its_camera_ray():
+    for radius in (0.0, 30.0):
+        for distance in (0.0, 20.0):
+            sensor = Sensor("s", (320, 240), (6e-5, 5e-5), distance / 1e3, 2e-3, radius / 1e3)
+            xy = np.stack(np.meshgrid(*sensor.pixel_centres()), -1)
+            depth = np.linspace(0, 2e-3, xy[..., 0].size).reshape(xy.shape[:2])
+            points = sensor.lift(xy, depth)
+            assert np.abs(sensor.project(points) - xy).max() < 1e-9
+            assert np.abs(-sensor.sag(points[..., 0], points[..., 1]) - points[..., 2] - depth).max() < 1e-9
+
+
 def test_projection_is_a_pinhole_camera(rng):
     sensor = Sensor.load("gelslim")
     points = rng.uniform(-5e-3, 5e-3, (50, 3))

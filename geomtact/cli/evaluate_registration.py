@@ -82,7 +82,7 @@ def judge_registration(
             "peers": versions("small_gicp", "probreg"),
         }
         found = content["parts"].get(mesh.name)
-        done = found["outcomes"] if found is not None and study_file.same(found, settings) else []
+        done = found.get("outcomes", []) if found is not None and study_file.same(found, settings) else []
 
         def keep(outcomes: list, name: str = mesh.name, settings: Mapping[str, Any] = settings) -> None:
             content["parts"][name] = plain({"settings": settings, "outcomes": outcomes})

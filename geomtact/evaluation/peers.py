@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from geomtact.registration.rim import near_surface
 from geomtact.se3 import Array, inverse
 
 _MM = 1e3
+_LOST = 10.0  # reaches from where it was, a contact is lost
 # moves the rim (n, 3) onto points (m, 3) with normals (m, 3), within a reach, all in mm: (4, 4), None where it gives up
 Align = Callable[[Array, Array, Array, float], Array | None]
 
@@ -94,9 +96,28 @@ def _probreg_plane(rim: Array, points: Array, normals: Array, reach: float) -> A
 def _probreg(rim: Array, points: Array, normals: Array | None, objective: str, reach: float) -> Array | None:
     from probreg import filterreg
 
-    result = filterreg.registration_filterreg(
-        rim, points, normals, objective_type=objective, sigma2=(reach / 3) ** 2, update_sigma2=True
-    )
+    def stop_when_lost(motion: Any) -> None:
+        # points far off, or nowhere, make its filter read memory that is not its own
+        if not np.linalg.norm(motion.rot @ middle + motion.t - middle) < _LOST * reach:
+            raise _Lost
+
+    middle = rim.mean(0)
+    try:
+        result = filterreg.registration_filterreg(
+            rim,
+            points,
+            normals,
+            objective_type=objective,
+            sigma2=(reach / 3) ** 2,
+            update_sigma2=True,
+            callbacks=[stop_when_lost],
+        )
+    except _Lost:
+        return None
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = result.transformation.rot, result.transformation.t
     return motion
+
+
+class _Lost(Exception):
+    """A registration that runs off."""

@@ -285,8 +285,8 @@ def _mask_points(mask: NDArray[np.bool_], sensor: Sensor) -> Array:
 
 
 def summarise(trials: Sequence[Trial], half_pixel_mm: float) -> dict[str, Any]:
-    """All figures: by method over all start errors, by method from the grid's poses, success by contact and start error, and
-    drift by contact.
+    """All figures: by method over all start errors, by method from the grid's poses, over all contacts and for each kind, success
+    by contact and start error, and drift by contact.
 
     Touches that tell nothing are left out of success and errors. ``lost`` names the cells in which FilterReg succeeds less
     often than the best of the other libraries, beyond what chance allows.
@@ -299,6 +299,10 @@ def summarise(trials: Sequence[Trial], half_pixel_mm: float) -> dict[str, Any]:
     out: dict[str, Any] = {
         "methods": {name: _over_all(some) for name, some in _grouped(basin, "method").items()},
         "from_grid": {name: _from_grid(some, half_pixel_mm) for name, some in _grouped(gridded, "method").items()},
+        "from_grid_by_contact": {
+            kind: {name: _from_grid(few, half_pixel_mm) for name, few in _grouped(some, "method").items()}
+            for kind, some in _grouped(gridded, "contact").items()
+        },
         "success": {t.contact: [] for t in trials},
         "drift": {},
         "lost": [],

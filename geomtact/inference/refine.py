@@ -23,7 +23,7 @@ from geomtact.sensing.contact import Contact
 from geomtact.sensing.moments import moments, without_specks
 
 _SURFACE_POINTS = 30_000  # of the object
-_TRUST = 0.5  # of a likelihood at one pose, in weighing the cells around several
+TRUST = 0.5  # of a likelihood at one pose, in weighing the cells around several
 _SHAPE = (36, 48)  # of the casts that judge a refinement
 
 
@@ -43,7 +43,7 @@ class Refinery:
         return self.space.sensor.along(_SHAPE)
 
     def _refiners(self, index: Index, thorough: bool) -> list[Refiner]:
-        spread = Spread.of_grid(index.angle_step, index.resolution.step)
+        spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
         filterreg, icp = FilterReg(self.surface, spread), Icp(self.surface, spread)
         return [filterreg, icp] if thorough else [filterreg]
 
@@ -80,7 +80,7 @@ class Refinery:
                 found = refinements[best - len(candidates)]
                 covariance, observable = found.covariance[i], found.observable[i]
             refined[int(cell)] = Refined(T, covariance, observable, problem.length, best > 0)
-        return replace(posterior.shared_anew(cells, _TRUST * likelihood), refined=refined)
+        return replace(posterior.shared_anew(cells, TRUST * likelihood), refined=refined)
 
     def _best(self, mask: NDArray[np.bool_], poses: Array) -> tuple[NDArray[np.int64], Array]:
         """At which of the poses (c, n, 4, 4) ``mask`` is most likely, for each of n modes, the first where none touches;

@@ -23,7 +23,7 @@ _FEWER = 2  # around points that are only inside or outside
 _OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
 _STEPS_AT_END = 8  # with the narrowest filter, at most
 _REST = 1.0  # standard deviations that the last step may be
-_SLOPE_NOISE = 0.3  # noise across the membrane, as a share of that along it
+_SLOPE_NOISE = 0.45  # noise across the membrane, as a share of that along it: a gel does not sink alike all around
 
 
 @dataclass(frozen=True)

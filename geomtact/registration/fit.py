@@ -13,7 +13,7 @@ from geomtact.se3 import Array
 
 FEWEST = 6  # points on the surface without which no pose is believed
 _SHARE = 0.3  # of the points that must lie on it
-_LOOSE = 3.0  # residual, in units of the noise, beyond which a pose is not believed
+_LOOSE = 1.5  # residual, in units of the noise, beyond which a pose is not believed
 _RAN = 4.0  # standard deviations of the start that a pose may move
 
 
@@ -52,8 +52,8 @@ def judged(
 
     A pose is believed that came to rest near its start, with what was observed on the surface.
     """
-    zeta = motion_of(start, T, problem).reshape(-1, 2, 3)
-    ran = np.linalg.norm(zeta, axis=2) / [spread.rotation * problem.length, spread.translation]
+    zeta = motion_of(start, T, problem) / spread.metres(problem.length)
+    ran = np.linalg.norm(zeta.reshape(-1, 2, 3), axis=2)
     believed = (
         at_rest
         & np.isfinite(T).all((1, 2))

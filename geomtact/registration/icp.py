@@ -63,11 +63,12 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
 
     registration = o3d.pipelines.registration
     rim, cloud = o3d.geometry.PointCloud(), o3d.geometry.PointCloud()
-    # Open3D's tolerances are absolute and made for metres of room: in units of a pixel they fit
+    # Open3D's tolerances are absolute, and about its origin, and made for metres of room: in units of a pixel about the
+    # contact's centre they fit
     unit = problem.pitch
     anchors, axes = _anchors(problem, reach)
-    rim.points = o3d.utility.Vector3dVector(np.concatenate([problem.points, anchors]) / unit)
-    cloud.points = o3d.utility.Vector3dVector(np.concatenate([points, anchors]) / unit)
+    rim.points = o3d.utility.Vector3dVector((np.concatenate([problem.points, anchors]) - problem.centre) / unit)
+    cloud.points = o3d.utility.Vector3dVector((np.concatenate([points, anchors]) - problem.centre) / unit)
     cloud.normals = o3d.utility.Vector3dVector(np.concatenate([normals, axes]))
     motion, found = np.eye(4), False
     for within in (reach, 3 * problem.middle_noise + problem.pitch):
@@ -84,7 +85,7 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
         motion, found = np.array(result.transformation), True
     if not found:
         return None
-    motion[:3, 3] *= unit
+    motion[:3, 3] = unit * motion[:3, 3] + problem.centre - motion[:3, :3] @ problem.centre
     return motion
 
 
@@ -107,6 +108,7 @@ def _anchors(problem: Problem, reach: float) -> tuple[Array, Array]:
     A wall tells nothing about the way along it; Open3D's normal equations are singular then, and its step is at random.
     Each anchor weighs as much as a rim point, which is little against the rim.
     """
-    angle = 2 * np.pi / 9 * np.arange(9)
-    ring = (reach + problem.length) * np.stack([np.cos(angle), np.sin(angle), np.zeros(9)], 1)
-    return problem.centre + ring - [0.0, 0.0, 2 * reach], np.tile(np.eye(3), (3, 1))
+    angle, up = 2 * np.pi / 9 * np.arange(9)[:, None], problem.outwards
+    axes = np.linalg.svd(up[None])[2]  # the first along ``up``
+    ring = (reach + problem.length) * (np.cos(angle) * axes[1] + np.sin(angle) * axes[2])
+    return problem.centre + ring - 2 * reach * up, np.tile(axes, (3, 1))

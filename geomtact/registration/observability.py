@@ -12,29 +12,49 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from geomtact.errors import PoseError
+from geomtact.geometry.approach import Approach
 from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array, apply, exp, hat, inverse, log, transform
 
 _LEAST_TURN = 0.02  # rad
+_NO_TILT = 1e-8  # rad that an exact approach leaves
 GAIN = 4 / 3  # information over what was known before from which a direction is told: to a quarter of the grid's step
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How far start poses may be off: standard deviations of rotation [rad] and of translation at the contact [m]."""
+    """How far start poses may be off: standard deviations, each greater than 0.
+
+    Attributes
+    ----------
+    rotation : about each axis [rad]
+    translation : of the contact, along each axis [m]
+    tilt : about the axes in the plane of the (first) membrane, where it is not as ``rotation`` [rad]
+    """
 
     rotation: float
     translation: float
+    tilt: float | None = None
+
+    def __post_init__(self) -> None:
+        if not min(self.metres(1.0)) > 0:
+            raise PoseError(f"the spread of start poses must be greater than 0, got {self}")
 
     @classmethod
-    def of_grid(cls, angle_step: float, step: float) -> Spread:
-        """Of poses uniform in a cell of ``angle_step`` [rad] and ``step`` [m]; where symmetry leaves no rotation to search,
-        registration is still free to turn a little."""
-        return cls(max(angle_step, _LEAST_TURN) / np.sqrt(12), step / np.sqrt(12))
+    def of_grid(cls, angle_step: float, step: float, approach: Approach | None = None) -> Spread:
+        """Of poses uniform in a cell of ``angle_step`` [rad] and ``step`` [m], no farther tilted than ``approach`` allows; where
+        symmetry leaves no rotation to search, registration is still free to turn a little."""
+        rotation, tilt = max(angle_step, _LEAST_TURN) / np.sqrt(12), None
+        if approach is not None:
+            tilt = min(rotation, max(_NO_TILT, 2 * max(half for _, half in approach) / np.sqrt(12)))
+        return cls(rotation, step / np.sqrt(12), tilt)
 
     def metres(self, length: float) -> Array:
         """(6,) standard deviations of zeta [m]."""
-        return np.repeat([self.rotation * length, self.translation], 3)
+        tilt = self.rotation if self.tilt is None else self.tilt
+        turned = np.array([tilt, tilt, self.rotation])
+        return np.concatenate([turned * length, np.full(3, self.translation)])
 
     def radius(self, length: float) -> float:
         """How far a point of the contact may be off, standard deviation along one axis [m]."""

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.se3 import Array
+from geomtact.errors import MeshError
+from geomtact.se3 import Array, unit
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
+_LEAST = 2  # points, between which there is a gap
 _FEWEST_POINTS = 2000  # by which a surface is made coarser still
 _DENSE = 1.5  # points per width of a filter, along a line
 _TURN = 2.0  # gaps between points that count as much as a normal which differs by 1
@@ -32,6 +34,10 @@ class Surface:
 
     points: Array
     normals: Array
+
+    def __post_init__(self) -> None:
+        if len(self.points) < _LEAST:
+            raise MeshError(f"a surface needs {_LEAST} points or more, got {len(self.points)}; sample it more densely")
 
     @cached_property
     def spacing(self) -> float:
@@ -84,6 +90,7 @@ class Problem:
     weight : (n,) share of each point that tells something new: neighbours err alike
     contact : (n,) which contact it belongs to
     around : (m, 3) points of the membranes that lie inside the object where ``side`` (m,) is 1, outside where it is -1
+    outwards : (3,) unit vector from the camera out of the membrane, in the mean over all contacts
     centre : (3,) of the contacts
     length : size of the contacts (rms distance from the centre); rotations are scaled by it
     pitch : of the images' pixels
@@ -99,6 +106,7 @@ class Problem:
     contact: NDArray[np.int64]
     around: Array
     side: NDArray[np.int64]
+    outwards: Array
     centre: Array
     length: float
     pitch: float
@@ -143,6 +151,9 @@ class Problem:
             contact=np.concatenate([p.contact + i for p, i in zip(problems, first, strict=False)]),
             around=placed("around"),
             side=strung("side").astype(np.int64),
+            outwards=unit(
+                np.mean([T[:3, :3] @ p.outwards for p, T in zip(problems, T_world_sensor, strict=True)], axis=0)
+            ),
             centre=centre,
             length=max(float(spread), *(p.pitch for p in problems)),
             pitch=max(p.pitch for p in problems),

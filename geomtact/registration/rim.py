@@ -4,7 +4,8 @@ Along the outline the object's surface crosses the membrane, so the outline is a
 around the object: its outline lies a little above the surface. That offset along z looks exactly like a smaller
 penetration, so the outline cannot tell the two apart: its expected size is given (``sink``), and what is not known of it
 (``sink_std``) is taken off what the outline tells about z. Membrane inside the outline lies within the object, membrane
-outside of it does not. Where the reading has heights, the gel lies on the object's surface all over the contact.
+outside of it does not. Where the reading has heights, the gel lies on the object's surface all over the contact, and nowhere
+in the object.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from geomtact.sensing.sensor import Sensor
 SINK, SINK_STD = 0.2e-3, 0.35e-3  # m that a gel, rigid or elastic, is taken to sink around the object, give or take
 _FEWEST = 4  # points on a contour; shorter ones are specks
 FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
+_STEEP = 1.0  # slope of the gel beside a wall
+_MARGIN = 2  # px beside missing heights that are not used
 _CLEAR = 0.5e-3  # m that a point is off the outline to count as inside or outside of it
 _AROUND = 4e-3  # m from the contact within which points outside of it are taken
 
@@ -43,7 +46,7 @@ def make_problem(
     mask : (H, W) bool, on any grid over the sensor's window
     sensor : whose membrane the contact lies on
     height : (H, W) how deep the gel is pressed in [m], where the reading tells; NaN tells nothing. The contact is then taken
-        to end where it is half of the deepest, and ``sink`` is not used
+        to be where it is more than half of the deepest, and ``sink`` is not used
     max_points : of the outline, of the heights, and of what lies inside and outside, at most
     outline_noise : how far the outline of a real mask strays, standard deviation along its normal [m]
     height_noise : standard deviation of heights [m]
@@ -53,54 +56,101 @@ def make_problem(
     sink_std : and how much more or less it may be [m]; by default both gels may be
     """
     contact: NDArray[np.bool_] = np.asarray(mask, bool)
-    if height is not None:
-        # of an elastic gel, what is not pressed in half as deep as the deepest may hang free of the object
-        depth = cv2.medianBlur(np.nan_to_num(np.asarray(height, np.float32), posinf=0.0, neginf=0.0), 3).astype(float)
-        sink, sink_std = 0.5 * float(depth.max(where=contact, initial=0.0)), 0.0
-        contact = contact & (depth > sink)
     pitch_xy = 2 * sensor.half_window / contact.shape[::-1]
     pitch = float(np.sqrt(pitch_xy.prod()))
+    outline_noise, height_noise = (
+        float(np.hypot(outline_noise, 0.3 * pitch)),
+        float(np.hypot(height_noise, 0.1 * pitch)),
+    )
 
-    def lifted(uv: Array) -> Array:
-        return sensor.lift((uv + 0.5) * pitch_xy - sensor.half_window)
+    def lifted(uv: Array, depth: ArrayLike = 0.0) -> Array:
+        return sensor.lift((uv + 0.5) * pitch_xy - sensor.half_window, depth)
 
-    pixels, outward, spacing = _outline(contact, pitch_xy, max_points)
-    rim = lifted(pixels)
-    down = _down(rim, sensor)
-    facing = np.concatenate([outward, np.zeros((len(outward), 1))], 1)
-    across = unit(np.cross(down, facing))
-    points = rim + sink * down
-    noise = np.full(len(rim), np.hypot(outline_noise, 0.3 * pitch))
-    weight = np.full(len(rim), min(1.0, spacing / (np.sqrt(np.pi) * correlation)))
-    sinking = down
-    if height is not None:
-        uv, apart = _spaced(contact, pitch_xy, max_points)
-        gel = lifted(uv)
-        pressed = depth[tuple(uv.astype(int).T[::-1])][:, None] * _down(gel, sensor)
-        points, facing = np.concatenate([points, gel + pressed]), np.concatenate([facing, unit(_down(gel, sensor))])
-        across, sinking = np.concatenate([across, np.zeros_like(gel)]), np.zeros_like(points)
-        noise = np.append(noise, np.full(len(gel), np.hypot(height_noise, 0.1 * pitch)))
-        weight = np.append(weight, np.full(len(gel), min(1.0, (apart / correlation) ** 2 / np.pi)))
-    inside, outside = (lifted(uv) for uv in _inside_and_outside(contact, pitch_xy, max_points))
-    # what the gel may have sunk to lies neither inside nor outside
-    inside, outside = inside + sink * _down(inside, sensor), outside + (sink + sink_std) * _down(outside, sensor)
+    if height is None:
+        uv, outward, spacing = _outline(contact, pitch_xy, max_points)
+        met = _on_outline(lifted(uv), outward, sink, outline_noise, spacing / (np.sqrt(np.pi) * correlation), sensor)
+        inside, outside = (lifted(uv) for uv in _inside_and_outside(contact, pitch_xy, max_points))
+        # what the gel may have sunk to lies neither inside nor outside
+        inside, outside = inside + sink * _down(inside, sensor), outside + (sink + sink_std) * _down(outside, sensor)
+    else:
+        sink_std = 0.0
+        depth, known, clear = _depths(height)
+        half = 0.5 * float(depth.max(where=contact, initial=0.0))
+        deep = contact & (depth > half)
+        uv, outward, spacing = _outline(deep, pitch_xy, max_points)
+        # of an elastic gel, what is not pressed in half as deep as the deepest may hang free of the object, far beside it
+        # even: only where the gel drops off steeply a wall is near
+        steep = _at(clear & (np.hypot(*np.gradient(depth, *pitch_xy[::-1])) > _STEEP), uv)
+        rim = _on_outline(
+            lifted(uv[steep]), outward[steep], half, outline_noise, spacing / (np.sqrt(np.pi) * correlation), sensor
+        )
+        uv, apart = _spaced(deep & known, pitch_xy, max_points)
+        gel = lifted(uv, _at(depth, uv))
+        met = _joined(rim, _on_gel(gel, height_noise, (apart / correlation) ** 2 / np.pi, sensor))
+        uv = _inside_and_outside(contact, pitch_xy, max_points)[1]
+        uv = uv[_at(clear, uv)]
+        inside, outside = np.zeros((0, 3)), lifted(uv, _at(depth, uv) + height_noise)
+    points = met["points"]
     centre = points.mean(0) if len(points) else np.zeros(3)
     length = float(np.sqrt(((points - centre) ** 2).sum(1).mean())) if len(points) else 0.0
     return Problem(
-        points=points,
-        facing=facing,
-        across=across,
-        sinking=sinking,
-        noise=noise,
-        weight=weight,
+        **met,
         contact=np.zeros(len(points), np.int64),
         around=np.concatenate([inside, outside]),
         side=np.repeat([1, -1], [len(inside), len(outside)]),
+        outwards=np.array([0.0, 0.0, 1.0]),
         centre=centre,
         length=max(length, pitch),
         pitch=pitch,
         sink_std=max(sink_std, 1e-9),
     )
+
+
+def _on_outline(
+    rim: Array, outward: Array, sink: float, noise: float, weight: float, sensor: Sensor
+) -> dict[str, Array]:
+    """Fields of a ``Problem`` for points (n, 3) of an outline on the membrane and its normals (n, 2) in the image's plane."""
+    down = _down(rim, sensor)
+    facing = np.concatenate([outward, np.zeros((len(outward), 1))], 1)
+    return {
+        "points": rim + sink * down,
+        "facing": facing,
+        "across": unit(np.cross(down, facing)),
+        "sinking": down,
+        "noise": np.full(len(rim), noise),
+        "weight": np.full(len(rim), min(1.0, weight)),
+    }
+
+
+def _on_gel(gel: Array, noise: float, weight: float, sensor: Sensor) -> dict[str, Array]:
+    """Fields of a ``Problem`` for points (n, 3) of a gel of known height that lie on the object."""
+    return {
+        "points": gel,
+        "facing": unit(_down(gel, sensor)),
+        "across": np.zeros_like(gel),
+        "sinking": np.zeros_like(gel),
+        "noise": np.full(len(gel), noise),
+        "weight": np.full(len(gel), min(1.0, weight)),
+    }
+
+
+def _joined(*parts: dict[str, Array]) -> dict[str, Array]:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _depths(height: ArrayLike) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Heights (H, W) without lone faults, 0 where they are missing; where (H, W) they are known; and where all around too."""
+    height = np.asarray(height, np.float32)
+    missing = ~np.isfinite(height)
+    depth = cv2.medianBlur(np.where(missing, 0, height).astype(np.float32), 3).astype(float)
+    size = 2 * _MARGIN + 1
+    return depth, ~missing, cv2.dilate(missing.astype(np.uint8), np.ones((size, size), np.uint8)) == 0
+
+
+def _at(values: NDArray, uv: Array) -> NDArray:
+    """Of an image (H, W), at the pixels (n,) nearest to (column, row) ``uv`` (n, 2)."""
+    column, row = np.rint(uv).astype(int).T
+    return values[row, column]
 
 
 def _down(points: Array, sensor: Sensor) -> Array:
@@ -121,10 +171,11 @@ def near_surface(surface: Surface, problem: Problem, T: Array, reach: float) -> 
     index = np.array(surface.tree.query_ball_point(centre, around, return_sorted=False), dtype=np.intp)
     if problem.contacts == 1:
         # few of these points lie close to the membrane: heights first
-        z = surface.points[index] @ T[2, :3] + T[2, 3]
-        index = index[(z > problem.points[:, 2].min() - reach) & (z < problem.points[:, 2].max() + reach)]
+        up = problem.outwards
+        z, met = surface.points[index] @ (T[:3, :3].T @ up) + T[:3, 3] @ up, problem.points @ up
+        index = index[(z > met.min() - reach) & (z < met.max() + reach)]
         if problem.across.any(1).all():
-            index = index[np.abs(surface.normals[index] @ T[2, :3]) < np.sqrt(1 - FLAT**2)]
+            index = index[np.abs(surface.normals[index] @ (T[:3, :3].T @ up)) < np.sqrt(1 - FLAT**2)]
     return apply(T, surface.points[index]), surface.normals[index] @ T[:3, :3].T
 
 

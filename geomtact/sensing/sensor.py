@@ -214,17 +214,16 @@ class Sensor:
             return p[..., :2].copy()
         return p[..., :2] * (self.camera_distance / np.maximum(self.camera_distance + p[..., 2:], 1e-9))
 
-    def lift(self, xy: ArrayLike) -> Array:
-        """The membrane points (..., 3) [m] seen through ``xy`` (..., 2) at z = 0: where each camera ray meets the gel."""
-        xy = np.asarray(xy, float)
+    def lift(self, xy: ArrayLike, depth: ArrayLike = 0.0) -> Array:
+        """The points (..., 3) [m] of the gel seen through ``xy`` (..., 2) at z = 0: where each camera ray meets the membrane, or
+        what lies ``depth`` (...) [m] below it."""
+        xy, depth = np.asarray(xy, float), np.asarray(depth, float)
         x, y = xy[..., 0], xy[..., 1]
-        sag = self.sag(x, y)
-        if self.camera_distance and self.membrane_radius:
-            for _ in range(20):
-                shrink = 1 - sag / self.camera_distance
-                sag = self.sag(x * shrink, y * shrink)
-        shrink = 1 - sag / self.camera_distance if self.camera_distance else np.ones_like(sag)
-        return np.stack([x * shrink, y * shrink, -sag], -1)
+        below, shrink = self.sag(x, y) + depth, np.ones(np.broadcast_shapes(x.shape, depth.shape))
+        for _ in range(20 if self.camera_distance and self.membrane_radius else bool(self.camera_distance)):
+            shrink = 1 - below / self.camera_distance
+            below = self.sag(x * shrink, y * shrink) + depth
+        return np.stack([x * shrink, y * shrink, np.broadcast_to(-below, shrink.shape)], -1)
 
     def to_pixels(self, xy: ArrayLike) -> Array:
         """Continuous pixel coordinates (column, row) (..., 2) of ``xy`` (..., 2) [m] at z = 0; pixel centres are whole."""
