@@ -20,9 +20,11 @@ from geomtact.errors import (
 )
 
 if TYPE_CHECKING:
+    from geomtact.contact_space.carry import RigStd
     from geomtact.geometry.mesh import Mesh, load_mesh
     from geomtact.inference.localizer import Localizer
     from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.planning.next_touch import Action, Probe, Touch
     from geomtact.sensing.contact import Contact
     from geomtact.sensing.local_shape import contact_mask
     from geomtact.sensing.sensor import Sensor
@@ -30,17 +32,22 @@ if TYPE_CHECKING:
     __version__: str
 
 _MODULE_OF = {
+    "Action": "geomtact.planning.next_touch",
     "Contact": "geomtact.sensing.contact",
     "Localizer": "geomtact.inference.localizer",
     "Mesh": "geomtact.geometry.mesh",
     "Mode": "geomtact.inference.posterior",
     "Posterior": "geomtact.inference.posterior",
+    "Probe": "geomtact.planning.next_touch",
+    "RigStd": "geomtact.contact_space.carry",
     "Sensor": "geomtact.sensing.sensor",
+    "Touch": "geomtact.planning.next_touch",
     "contact_mask": "geomtact.sensing.local_shape",
     "load_mesh": "geomtact.geometry.mesh",
 }
 
 __all__ = [
+    "Action",
     "CacheError",
     "Contact",
     "GeomtactError",
@@ -52,8 +59,11 @@ __all__ = [
     "Mode",
     "PoseError",
     "Posterior",
+    "Probe",
+    "RigStd",
     "Sensor",
     "SensorError",
+    "Touch",
     "UsageError",
     "__version__",
     "contact_mask",

@@ -45,7 +45,7 @@ def test_a_block_is_a_cell_of_the_next_coarser_grid(localizer):
     coarse = Directions.make(index.mesh.symmetry, index.approach, index.resolution.level - 1)
     _, k, j = coarse.lookup(transform(index.rotations, np.zeros(3)))
     parent = (coarse.first_turn[k] + j)[index.rotation]
-    x, y = index._lattice(index.shift.astype(float))
+    x, y = index.lattice(index.shift.astype(float))
     key = np.stack([parent, x // 2, y // 2], 1)
     block = np.repeat(np.arange(len(size)), size)
     for column in range(3):

@@ -50,7 +50,18 @@ def touched(tmp_path_factory):
 
 
 def test_help_and_lists(geomtact):
-    commands = {"localize", "prepare", "train", "simulate", "sensors", "objects", "cache", "evaluate"}
+    commands = {
+        "localize",
+        "prepare",
+        "train",
+        "simulate",
+        "sensors",
+        "objects",
+        "cache",
+        "evaluate",
+        "next-touch",
+        "track",
+    }
     assert {c.name or c.callback.__name__ for c in app.registered_commands} == commands
     assert all(name in geomtact("--help").stdout for name in commands)
     assert geomtact("--version").stdout.startswith("geomtact ")

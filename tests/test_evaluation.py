@@ -189,7 +189,7 @@ def test_a_file_that_is_no_study_is_left_alone(cache, tmp_path):
 
 
 def test_touches_are_described(tmp_path):
-    done = CliRunner().invoke(app, ["evaluate", "touches", "ball", "--sensor", "gelsight-mini", "--touches", "6"])
+    done = CliRunner().invoke(app, ["evaluate", "samples", "ball", "--sensor", "gelsight-mini", "--touches", "6"])
     assert done.exit_code == 0, done.output
     assert "geometric" in done.output and "elastic" in done.output
 

@@ -20,6 +20,7 @@ STAGES = [
     ["contact_space"],
     ["scoring"],
     ["registration"],
+    ["planning"],
     ["inference"],
     ["training"],
     ["evaluation", "report"],

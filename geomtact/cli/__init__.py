@@ -7,9 +7,11 @@ import typer
 from geomtact.cli.evaluate import evaluate
 from geomtact.cli.library import cache, objects, sensors
 from geomtact.cli.localize import localize
+from geomtact.cli.next_touch import next_touch
 from geomtact.cli.prepare import prepare
 from geomtact.cli.shell import one_line_errors
 from geomtact.cli.simulate import simulate
+from geomtact.cli.track import track
 from geomtact.cli.train import train
 
 app = typer.Typer(
@@ -18,8 +20,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Localize a known part from the shape of one tactile contact: the whole distribution of its pose.",
 )
-for command in (localize, prepare, train, simulate, evaluate, sensors, objects, cache):
+for command in (localize, track, prepare, train, simulate, evaluate, sensors, objects, cache):
     app.command()(one_line_errors(command))
+app.command("next-touch")(one_line_errors(next_touch))
 
 
 @app.callback(invoke_without_command=True)

@@ -22,14 +22,15 @@ if TYPE_CHECKING:
     from geomtact.sensing.noise import Noise
 
 SCHEMA = "geomtact/study/2"
-_SCORES_ONLY, _PICTURED = "Only for scores", "Only for scores and registration"
+_SCORES_ONLY, _PICTURED = "Only for scores", "Only for scores, registration and touches"
 
 
 class What(StrEnum):
-    touches = "touches"
+    samples = "samples"
     localize = "localize"
     scores = "scores"
     registration = "registration"
+    touches = "touches"
 
 
 class FeltName(StrEnum):
@@ -42,20 +43,21 @@ def evaluate(
     what: Annotated[
         What,
         typer.Argument(
-            help="touches: what is judged on; localize: the posteriors from it; scores: all scores side by side; "
-            "registration: from how far off refining finds home."
+            help="samples: what touches are judged on; localize: the posteriors from them; scores: all scores side by side; "
+            "registration: from how far off refining finds home; touches: what several sensors at once add."
         ),
     ],
     parts: Annotated[
         list[str] | None,
         typer.Argument(
             metavar="OBJECT...",
-            help="Parts or mesh files; for scores the thesis's four by default, for registration those and bare shapes.",
+            help="Parts or mesh files; for scores and touches the thesis's four by default, for registration those and bare "
+            "shapes.",
         ),
     ] = None,
     unit: Unit = None,
     sensor: Annotated[str, typer.Option(help="Name (see 'geomtact sensors') or TOML file.")] = "gelslim",
-    touches: Annotated[int, typer.Option(min=1, help="How many touches of each part.")] = 200,
+    touches: Annotated[int, typer.Option(min=1, help="How many touches of each part, or scenes of five.")] = 200,
     noise: Annotated[NoiseName, typer.Option(help="How strongly the masks are spoilt.")] = NoiseName.moderate,
     effort: Annotated[Effort, typer.Option(help="How much to compute.")] = Effort.balanced,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 1,
@@ -73,7 +75,7 @@ def evaluate(
     felt: Annotated[
         FeltName | None,
         typer.Option(
-            help="What the gel is; elastic by default for scores, both for registration.",
+            help="What the gel is; elastic by default for scores, both for registration and touches.",
             show_default=False,
             rich_help_panel=_PICTURED,
         ),
@@ -97,7 +99,7 @@ def evaluate(
     """
     from geomtact.errors import UsageError
 
-    pictured = (What.scores, What.registration)
+    pictured = (What.scores, What.registration, What.touches)
     options: dict[str, tuple[Any, tuple[What, ...]]] = {
         "--scores": (scores, (What.scores,)),
         "--max-poses": (max_poses, (What.scores,)),
@@ -134,9 +136,19 @@ def evaluate(
         names = parts or [*THESIS_PARTS, *SHAPES]
         judge_registration(names, unit, sensor, touches, str(noise), _noise(noise), elastic, seed, out, plot)
         return
+    if what is What.touches:
+        from geomtact.cli.evaluate_touches import judge_touches
+        from geomtact.evaluation.scores import FELT, THESIS_PARTS
+
+        elastic = FELT[str(felt or FeltName.both)]
+        names = parts or list(THESIS_PARTS)
+        judge_touches(
+            names, unit, sensor, touches, str(noise), _noise(noise), elastic, str(effort), seed, out, plot, cache_dir
+        )
+        return
     if not parts:
         raise UsageError(f"evaluate {what}: no OBJECT given; name a part (see 'geomtact objects') or a mesh file")
-    if what is What.touches:
+    if what is What.samples:
         print_touches(parts, unit, sensor, touches, noise, seed)
     else:
         judge(parts, unit, sensor, touches, noise, effort, seed, out, cache_dir)

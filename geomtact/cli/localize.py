@@ -30,7 +30,14 @@ class Effort(StrEnum):
 
 
 def localize(
-    image: Annotated[Path, typer.Argument(help="Contact mask, height map or RGB reading.", show_default=False)],
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="IMAGE...",
+            help="Contact mask, height map or RGB reading; several of them with --sensor-poses.",
+            show_default=False,
+        ),
+    ],
     object_name: Annotated[
         str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")
     ] = None,
@@ -38,6 +45,12 @@ def localize(
     sensor: SensorName = None,
     kind: Annotated[str, typer.Option(metavar="|".join(Kind), help="What the image is.")] = Kind.auto.value,
     background: Annotated[Path | None, typer.Option(help="Image of the untouched sensor, for readings.")] = None,
+    sensor_poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="JSON of where each sensor is in the world: T_world_sensor, a 4x4 for each image, in metres."
+        ),
+    ] = None,
     prior: Annotated[Path | None, typer.Option(help="posterior.npz of what is known before.")] = None,
     effort: Annotated[
         str | None,
@@ -53,14 +66,16 @@ def localize(
     ] = False,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Localize a part from one image: print the most probable poses and write a report.
+    """Localize a part from one image, or from those of several sensors: print the most probable poses and write a report.
 
     What is not given is taken from the nearest geomtact.toml (this folder or above), then from the image's metadata.
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in the image.
     """
     import time
+    from dataclasses import replace
 
     from geomtact.cli.project import resolve
+    from geomtact.cli.sensor_poses import read_sensor_poses
     from geomtact.sensing.reading import read_metadata, read_observation
 
     given = {
@@ -73,19 +88,34 @@ def localize(
     check_folder(out)
     if prior is not None and not prior.is_file():
         raise InputError(f"--prior {prior}: no such file; give a posterior.npz")
-    values, sources = resolve(given, read_metadata(image))
+    placed = read_sensor_poses(sensor_poses, len(images)) if sensor_poses is not None else None
+    if placed is None and len(images) > 1:
+        raise UsageError(f"{len(images)} images need --sensor-poses FILE.json; or localize them one at a time")
+    values, sources = resolve(given, read_metadata(images[0]))
     _check_name("kind", kind, Kind)
     chosen = values["effort"] or Effort.balanced.value
     _check_name("effort", chosen, Effort, sources.get("effort"))
 
     began = time.perf_counter()
-    if values["sensor"] is not None:
-        # a bad image is told before minutes go into an index
-        read_observation(image, values["sensor"], kind, values["background"])
-    localizer = open_localizer(values, sources, scorer, cache_dir)
+    gels = placed.sensor if placed is not None and placed.sensor is not None else [values["sensor"]] * len(images)
+    for image, gel in zip(images, gels, strict=True):
+        if gel is not None:
+            # a bad image is told before minutes go into an index
+            read_observation(image, gel, kind, values["background"])
+    opened = {gel: open_localizer({**values, "sensor": gel}, sources, scorer, cache_dir) for gel in dict.fromkeys(gels)}
+    localizer = opened[gels[0]]
+    if len(opened) > 1:
+        localizer = replace(localizer, others=tuple(opened[gel] for gel in gels[1:]))
     prepared = time.perf_counter()
     posterior = localizer.localize(
-        str(image), kind=kind, background=values["background"], prior=prior, effort=chosen, seed=seed
+        [str(image) for image in images],
+        kind=kind,
+        background=values["background"],
+        T_world_sensor=None if placed is None else placed.T_world_sensor,
+        prior=prior,
+        effort=chosen,
+        seed=seed,
+        rig=None if placed is None else placed.rig,
     )
     localized = time.perf_counter()
     modes = posterior.modes(MODES)
@@ -93,7 +123,7 @@ def localize(
         tell(f"warning: {warning}")
 
     settings = {
-        "image": str(image),
+        "image": str(images[0]) if len(images) == 1 else [str(image) for image in images],
         "kind": kind,
         "prior": prior and str(prior),
         **values,

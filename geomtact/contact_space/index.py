@@ -20,6 +20,7 @@ from geomtact.geometry.rotations import Directions
 from geomtact.se3 import Array, hat, transform
 from geomtact.sensing.sensor import Sensor
 
+_TURNED = 4  # rotations of a cell that stand for all of it
 _DRAWN = 30_000  # poses that stand for all
 
 
@@ -107,7 +108,7 @@ class Index:
         step = self.resolution.step
         # a place may lie up to half a step off the middle of its lattice cell
         k = np.arange(-int(np.ceil(reach / step + 0.5)), int(np.ceil(reach / step + 0.5)) + 1)
-        x, y = self._lattice(centre)
+        x, y = self.lattice(centre)
         ny, nx = self.table.shape[1:]
         x, y = (x[:, None] + k)[:, None, :], (y[:, None] + k)[:, :, None]
         on_lattice = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
@@ -122,7 +123,7 @@ class Index:
         level, row = np.nonzero(np.abs(self.height[:, place] - centre[owner, 2]) <= reach)
         return (level * self.places + place[row]).astype(np.int64)
 
-    def _lattice(self, centre: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def lattice(self, centre: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Column and row (n,) of the lattice cell that holds the object's centre (n, 2 or 3); maybe off the lattice."""
         ny, nx = self.table.shape[1:]
         step = self.resolution.step
@@ -157,7 +158,7 @@ class Index:
         rotation = self.directions.first_turn[k] + j
         centre = T[:, :2, :3] @ self.mesh.centre + T[:, :2, 3]
         ny, nx = self.table.shape[1:]
-        x, y = self._lattice(centre)
+        x, y = self.lattice(centre)
         place = self.table[rotation, np.clip(y, 0, ny - 1), np.clip(x, 0, nx - 1)].astype(np.int64)
         bins = len(self.resolution.penetrations)
         depth = np.asarray(penetration, float) / self.sensor.max_penetration
@@ -241,6 +242,12 @@ class Index:
         """First pose id and number of poses (P B,) of every block at every penetration."""
         first = np.arange(len(self.height))[:, None] * self.places + self.blocks[:-1]
         return first.ravel(), np.tile(np.diff(self.blocks), len(self.height)).astype(np.int64)
+
+    @cached_property
+    def turned_within(self) -> Array:
+        """A few rotations (4, M, 3, 3) drawn within the cell of every rotation of the grid; always the same ones."""
+        rng, every = np.random.default_rng(0), np.arange(len(self.rotations))
+        return np.stack([self.directions.draw(every, rng) for _ in range(_TURNED)])
 
     def at_places(self, places: NDArray[np.int64]) -> Index:
         """What is stored of some places (m,) alone, for scores; without a grid to look poses up in."""

@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from geomtact.contact_space.carry import RigStd
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import default_cache_dir, open_index
-from geomtact.errors import UsageError, nearest_name
+from geomtact.errors import InputError, UsageError, nearest_name
 from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.inference.fusion import fused_posterior
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
+from geomtact.planning.next_touch import Action, next_touch
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import Calibration, posterior_log_prob
 from geomtact.scoring.catalogue import DEFAULT_SCORER
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
-from geomtact.se3 import check_transforms
+from geomtact.se3 import Array, check_transforms
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
@@ -48,6 +53,7 @@ class Effort:
     thorough: bool = True
 
 
+_ROOM = 10.0  # m that two sensors on one object are never apart
 EFFORTS = {"fast": Effort("blocks", 0), "balanced": Effort("cells", 5, thorough=False), "exact": Effort("all", 25)}
 
 
@@ -60,19 +66,21 @@ class Localizer:
     index : every touch of the object on the sensor, simulated beforehand
     scorer : the calibrated score that compares a contact with them
     max_poses, cache_dir : as given to :meth:`prepare`
+    others : localizers of the same object on the second and further sensors, where they are not all alike
     """
 
     index: Index
     scorer: FittedScorer
     max_poses: int = MAX_POSES
     cache_dir: str | Path | None = None
+    others: tuple[Localizer, ...] = ()
 
     @classmethod
     def prepare(
         cls,
         mesh: str | Path | Mesh,
         unit: str | None = None,
-        sensor: str | Path | Sensor = "gelslim",
+        sensor: str | Path | Sensor | Sequence[str | Path | Sensor] = "gelslim",
         approach: Approach | None = None,
         *,
         scorer: str = DEFAULT_SCORER,
@@ -86,7 +94,8 @@ class Localizer:
         ----------
         mesh : name of a bundled part, path of a mesh file, or a Mesh
         unit : "mm", "cm", "m" or "inch"; needed for files that state none
-        sensor : name of a bundled sensor, path of a TOML file, or a Sensor
+        sensor : name of a bundled sensor, path of a TOML file, or a Sensor; or a list of them, one for each image that
+            :meth:`localize` is to be given at once
         approach : [(direction (3,), half angle)]: only touches whose direction from the object towards the sensor, in
             the object frame, lies within the angle [rad] of one of these; 0 means exactly that face
         scorer : how contacts are compared, one of ``geomtact.scoring.catalogue.SCORERS``, or weights (.safetensors)
@@ -98,6 +107,16 @@ class Localizer:
         ------
         MeshError, SensorError, UsageError, CacheError
         """
+        if not isinstance(sensor, str | Path | Sensor):
+            if not sensor:
+                raise UsageError("prepare: expected a sensor for every image, got an empty list")
+            options: dict[str, Any] = {"scorer": scorer, "max_poses": max_poses, "cache_dir": cache_dir}
+            sensors = [Sensor.load(each) for each in sensor]
+            alone = {
+                each: cls.prepare(mesh, unit, each, approach, **options, progress=progress)
+                for each in dict.fromkeys(sensors)
+            }
+            return replace(alone[sensors[0]], others=tuple(alone[each] for each in sensors[1:]))
         sensor = Sensor.load(sensor)
         part = load_mesh(mesh, unit, sensor=sensor)
         index = open_index(part, sensor, approach, max_poses, cache_dir, progress)
@@ -113,19 +132,22 @@ class Localizer:
         prior: Any = None,
         effort: str = "balanced",
         seed: int = 0,
+        rig: RigStd | None = None,
     ) -> Posterior:
-        """The distribution of the object's pose, given what the sensor shows (thesis 6.1 and 6.3).
+        """The distribution of the object's pose, given what one sensor shows, or several (thesis 6.1 to 6.3).
 
         Parameters
         ----------
-        image : path or array: a mask, a height map [m] or an RGB reading (see ``sensing.reading``)
+        image : path or array: a mask, a height map [m] or an RGB reading (see ``sensing.reading``); or a list of them, one for
+            each of several sensors that touch the object at the same time
         kind : "auto", "mask", "height" or "reading"
-        background : a reading without contact, for readings
-        T_world_sensor : (4, 4), or [(4, 4)] for one image: the posterior is then in the world frame
+        background : a reading without contact, for readings; or a list, one for each image
+        T_world_sensor : (4, 4), or one for each image (n, 4, 4): the posterior is then in the world frame
         prior : None, a Posterior, its path, a pair (poses, log weights) or a log density (see ``inference.prior``)
         effort : "fast" (the grid's blocks, nothing refined), "balanced" (its cells, five refined modes) or "exact" (every
             cell, the pixels counted too where that tells more, twenty-five refined modes)
-        seed : of the random choices made where credible levels tie
+        seed : of the random choices made where credible levels tie, and in refining
+        rig : how well the sensors' poses relative to each other are known
 
         Raises
         ------
@@ -133,13 +155,48 @@ class Localizer:
         """
         if effort not in EFFORTS:
             raise UsageError(f"no effort named {effort!r}{nearest_name(effort, EFFORTS)}")
+        images, frame, T_frame_sensor = _views(image, T_world_sensor)
+        backgrounds = background if isinstance(background, list | tuple) else [background] * len(images)
+        if len(backgrounds) != len(images):
+            raise UsageError(f"localize: expected one background, or {len(images)}, got {len(backgrounds)}")
+        if len(images) == 1:
+            touch = self._touch(images[0], kind, backgrounds[0], T_frame_sensor[0], frame, prior, effort, seed)
+            if not touch.contact:
+                return touch
+            with _timed(touch.timing_ms, "refine"):
+                contact = touch.observation.contact
+                return self._refinery.refine(touch, contact, EFFORTS[effort].modes, EFFORTS[effort].thorough)
+        localizers = (self, *self.others) if self.others else (self,) * len(images)
+        if len(localizers) != len(images):
+            raise UsageError(
+                f"localize: prepared for {len(localizers)} sensors, got {len(images)} images; give one for each"
+            )
+        touches = [
+            each._touch(shown, kind, empty, T, frame, None, effort, seed)
+            for each, shown, empty, T in zip(localizers, images, backgrounds, T_frame_sensor, strict=True)
+        ]
+        return fused_posterior(
+            touches, [each._refinery for each in localizers], prior, EFFORTS[effort].modes, rig, self.cache_dir
+        )
+
+    def _touch(
+        self,
+        image: Any,
+        kind: str,
+        background: Any,
+        T_frame_sensor: Array,
+        frame: str,
+        prior: Any,
+        effort: str,
+        seed: int,
+    ) -> Posterior:
+        """What one sensor tells, not refined."""
         timing: dict[str, float] = {}
-        frame, T_frame_sensor, image = _frame(image, T_world_sensor)
         settings = self._settings(effort, seed)
         with _timed(timing, "read"):
             observation = read_observation(image, self.sensor, kind, background)
         mask, warnings = observation.contact.mask, list(observation.warnings)
-        common = {
+        common: dict[str, Any] = {
             "frame": frame,
             "T_frame_sensor": T_frame_sensor,
             "seed": seed,
@@ -165,10 +222,6 @@ class Localizer:
             posterior = Posterior(self.index, rows.first, log_prob, runs=rows.runs, log_evidence=evidence, **common)
         if prior is None and self.scorer.witness.odd(evidence, likeliest):
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
-        with _timed(timing, "refine"):
-            posterior = self._refinery.refine(
-                posterior, observation.contact, EFFORTS[effort].modes, EFFORTS[effort].thorough
-            )
         return replace(posterior, warnings=warnings)
 
     def simulate(self, T_sensor_object: Any) -> Contact:
@@ -177,6 +230,18 @@ class Localizer:
         if T.shape != (4, 4):
             raise UsageError(f"simulate: expected one pose (4, 4), got shape {T.shape}")
         return self.space.caster.contact(self.sensor, T)
+
+    def track(
+        self, frames: Iterable[Any], T_world_sensor: Any = None, motion: Any = None, **options: Any
+    ) -> Iterator[Posterior]:
+        """A Posterior for each of a sequence of frames (thesis 8.1); options as of ``inference.sequence.track``."""
+        from geomtact.inference.sequence import track
+
+        return track(self, frames, T_world_sensor, motion, **options)
+
+    def next_touch(self, posterior: Posterior, actions: Any = None, seed: int = 0) -> list[Action]:
+        """Touches and probes by what they are expected to tell for their cost (thesis 8.2); see ``planning.next_touch``."""
+        return next_touch(posterior, actions, seed=seed)
 
     def __repr__(self) -> str:
         name = self.scorer.name
@@ -217,19 +282,32 @@ def _worth(scored_by: str, calibration: Calibration) -> dict[str, Any]:
     return {"scored_by": scored_by, "temperature": calibration.temperature, "floor": calibration.floor}
 
 
-def _frame(image: Any, T_world_sensor: Any) -> tuple[str, Any, Any]:
-    """The posterior's frame, the sensor's pose in it, and the image."""
-    several = isinstance(image, list | tuple)
-    if several and len(image) != 1:
-        raise UsageError(f"localize: expected one image, got {len(image)}; localize them one at a time")
-    if several:
-        image = image[0]
+def _views(image: Any, T_world_sensor: Any) -> tuple[list[Any], str, Array]:
+    """The images, the posterior's frame, and the sensors' poses (n, 4, 4) in it."""
+    images = list(image) if isinstance(image, list | tuple) else [image]
+    n = len(images)
+    if not n:
+        raise UsageError("localize: expected an image, got an empty list")
     if T_world_sensor is None:
-        return "sensor", np.eye(4), image
+        if n > 1:
+            raise UsageError(f"localize: {n} images need T_world_sensor, the pose (4, 4) of each sensor in the world")
+        return images, "sensor", np.eye(4)[None]
     T = check_transforms(T_world_sensor, "T_world_sensor")
-    if T.shape not in ((4, 4), (1, 4, 4)):
-        raise UsageError(f"T_world_sensor: expected one pose for one image, got shape {T.shape}")
-    return "world", T.reshape(4, 4), image
+    if T.shape not in ([(4, 4), (1, 4, 4)] if n == 1 else [(n, 4, 4)]):
+        raise UsageError(f"T_world_sensor: expected one pose for each of {n} images, ({n}, 4, 4), got shape {T.shape}")
+    T = T.reshape(n, 4, 4)
+    for i, j in combinations(range(n), 2):
+        apart = float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]))
+        if apart > _ROOM:
+            raise InputError(
+                f"T_world_sensor: sensors {i + 1} and {j + 1} are {apart:.3g} m apart; give translations in metres"
+            )
+        if np.abs(T[i] - T[j]).max() < 1e-6:
+            raise InputError(
+                f"T_world_sensor: sensors {i + 1} and {j + 1} are at the same pose; give each sensor its own, or follow "
+                "one sensor over time with track"
+            )
+    return images, "world", T
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.draw import draw_within
-from geomtact.contact_space.index import Index
+from geomtact.contact_space.index import Index, spelled_out
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import UsageError
 from geomtact.geometry.distance import PoseDistance, mode_radius
@@ -80,7 +80,8 @@ class Posterior:
     runs : (N,) how many cells from each of ``cells`` on share one density, as the cells of a block do where there is
         little mass; one each by default
     refined : what registration found, by pose id
-    observations, settings, timing_ms, warnings : how it came about
+    observations : what the sensors saw, that on whose cells it lives first
+    settings, timing_ms, warnings : how it came about
     """
 
     index: Index
@@ -154,14 +155,21 @@ class Posterior:
         found = self._grown(k, full=False) if self.contact and k > 0 else []
         return np.array([cell for cell, _ in found], np.int64)
 
-    def shared_anew(self, cells: NDArray[np.int64], log_likelihood: ArrayLike) -> Posterior:
+    def likeliest_cells(self, n: int) -> NDArray[np.int64]:
+        """Pose ids (m,) of the ``n`` most probable cells, the most probable first; no more than are looked at for modes."""
+        rows = self._top_rows()
+        return self._heart(rows[np.argsort(-self.log_prob[rows], kind="stable")[:n]])
+
+    def shared_anew(self, cells: NDArray[np.int64], log_likelihood: ArrayLike, doubt: float = 0.0) -> Posterior:
         """The posterior in which what the runs that hold ``cells`` (n,) have together is shared out among them again, each
-        getting what it had times exp(``log_likelihood``) (n,), up to a constant."""
+        getting what it had times exp(``log_likelihood``) (n,), up to a constant; all but a share ``doubt``, which stays."""
         row, first = np.unique(self._rows_of(cells)[0], return_index=True)
         before = self.log_prob[row].astype(float)
         after = before + np.asarray(log_likelihood, float)[first]
+        after += np.logaddexp.reduce(before) - np.logaddexp.reduce(after)
         log_prob = self.log_prob.copy()
-        log_prob[row] = after + np.logaddexp.reduce(before) - np.logaddexp.reduce(after)
+        with np.errstate(divide="ignore"):
+            log_prob[row] = np.logaddexp(after + np.log1p(-doubt), before + np.log(doubt))
         return replace(self, log_prob=log_prob)
 
     def log_density(self, T: ArrayLike) -> Any:
@@ -187,6 +195,17 @@ class Posterior:
         """Log density (n,) in the cells of pose ids (n,) of the index, relative to the uniform distribution."""
         row, held = self._rows_of(np.asarray(ids))
         return np.where(held, self._log_density_of(row), -np.inf)
+
+    @cached_property
+    def densities(self) -> NDArray[np.float32]:
+        """Density (N,) in every cell of the index, relative to the uniform distribution."""
+        out = np.zeros(len(self.index), np.float32)
+        density = np.exp(self._log_density.astype(np.float32))
+        if self.runs is None:
+            out[self.cells] = density
+        else:
+            out[spelled_out(self.cells, self.runs)] = np.repeat(density, self.runs)
+        return out
 
     def credible_level(self, T: ArrayLike) -> Any:
         """Smallest highest-density mass in [0, 1] whose region holds ``T`` (4, 4) or (n, 4, 4).

@@ -1,0 +1,221 @@
+"""Several sensors on one object: the product of what each says (thesis 6.2 and its appendix).
+
+    P(T | LS_1 .. LS_N)  is proportional to  P(T) P(LS_1 | T) .. P(LS_N | T)
+
+Each sensor's posterior, relative to the uniform distribution on its own contact pose space, is its likelihood up to a
+constant. All are brought onto the cells of one sensor, the first that has contact. A sensor that feels nothing speaks too:
+against the poses at which the object would touch it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.carry import Carry, RigStd
+from geomtact.errors import InputError
+from geomtact.inference.posterior import Posterior
+from geomtact.inference.prior import prior_log_density, prior_log_mass
+from geomtact.inference.refine import Refinery
+from geomtact.inference.refine_together import View, refine_together
+from geomtact.scoring.calibration import normalised
+from geomtact.se3 import Array, inverse
+
+_UNFELT = 0.1  # share of touching poses at which a sensor may yet show nothing: a contact too small or too shallow
+# what a cell's width hides of the pose it hides from all sensors, so that they err alike: so many touches of one object tell
+# as much as N / (1 + (N - 1) correlation) independent ones (measured on the pin, 24 scenes of two, three and five sensors)
+_CORRELATION = 0.2
+_DISAGREES = -2.0  # nats by which the other sensors may make a reading less likely than chance does
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """The product of several posteriors.
+
+    Attributes
+    ----------
+    cells : (n,) of the index of the first sensor that has contact
+    log_prob : (n,) log probability of each, normalised
+    first : which sensor that is
+    log_evidence : log of the mean over the uniform distribution, on the first sensor's space, of the product of densities
+    support : (N,) for each sensor, by how many nats the others make its reading likelier than the uniform does; 0 for one
+    """
+
+    cells: NDArray[np.int64]
+    log_prob: NDArray[np.floating]
+    first: int
+    log_evidence: float
+    support: Array
+
+
+def fuse(
+    posteriors: Sequence[Posterior], log_prior: NDArray[np.floating] | None = None, rig: RigStd | None = None
+) -> Fused:
+    """The product of the posteriors of N sensors that touch, or do not touch, one object at the same time.
+
+    Parameters
+    ----------
+    posteriors : of the single sensors under the uniform prior, all in the world frame, one of them with contact
+    log_prior : (M,) log mass of every cell of the first index with contact, the uniform's where it is None
+    rig : how well the sensors' poses relative to each other are known
+
+    Raises
+    ------
+    InputError
+        No pose of the object agrees with all sensors; the one that disagrees is named where it can be told.
+    """
+    first = next(i for i, posterior in enumerate(posteriors) if posterior.contact)
+    base = posteriors[first]
+    cells = base.index.possible if log_prior is None else np.flatnonzero(np.isfinite(log_prior))
+    prior = np.exp((base.index.log_weight if log_prior is None else log_prior)[cells]).astype(float)
+    order, chance = [first], [1.0]
+    densities: list[NDArray[np.floating]] = [base.densities[cells]]
+    for i, other in enumerate(posteriors):
+        if i != first:
+            carry = Carry(base.index, other.index, inverse(other.T_frame_sensor) @ base.T_frame_sensor, rig or RigStd())
+            density, uniform = (np.tile(each, len(base.index.height))[cells] for each in _seen(carry, other))
+            order.append(i)
+            densities.append(density)
+            chance.append(float(prior @ uniform))
+    total, *rest = (float(_product(prior, densities, out).sum()) for out in (None, *range(len(order))))
+    if not total > 0:
+        raise InputError(_excluded(base.mesh.name, order, rest))
+    support = np.zeros(len(order))
+    with np.errstate(divide="ignore"):
+        support[order] = np.log(total) - np.log(np.array(rest) * chance)
+        log_prob = normalised(np.log(prior) + _counted([p.contact for p in posteriors], order, densities))
+    return Fused(cells, log_prob, first, float(np.log(total)), support)
+
+
+def fused_posterior(
+    touches: Sequence[Posterior],
+    refineries: Sequence[Refinery],
+    prior: Any,
+    modes: int,
+    rig: RigStd | None = None,
+    cache_dir: str | Path | None = None,
+) -> Posterior:
+    """The posterior of all sensors together, on the cells of the first that has contact, its leading modes refined.
+
+    Parameters
+    ----------
+    touches : what each sensor tells under the uniform prior, not refined, in the world frame
+    refineries : of the object on each sensor
+    prior : as in ``Localizer.localize``
+    modes : how many are refined
+
+    Raises
+    ------
+    InputError
+        As :func:`fuse`.
+    """
+    if not any(touch.contact for touch in touches):
+        return _nothing_felt(touches, prior, cache_dir)
+    first = next(touch for touch in touches if touch.contact)
+    timing = {stage: sum(t.timing_ms.get(stage, 0.0) for t in touches) for stage in ("read", "score", "posterior")}
+    began = time.perf_counter()
+    log_prior = None
+    if prior is not None:
+        log_prior = prior_log_mass(first.index, prior, first.T_frame_sensor, first.frame, cache_dir)
+    fused = fuse(touches, log_prior, rig)
+    timing["fuse"] = 1e3 * (time.perf_counter() - began)
+    each = [f"sensor {i + 1}: {warning}" for i, touch in enumerate(touches) for warning in touch.warnings]
+    against = disagreement(fused)
+    posterior = replace(
+        first,
+        cells=fused.cells,
+        log_prob=fused.log_prob,
+        runs=None,
+        log_evidence=sum(t.log_evidence for t in touches) + fused.log_evidence,
+        observations=first.observations + [o for touch in touches if touch is not first for o in touch.observations],
+        settings=first.settings | {"T_world_sensor": [t.T_frame_sensor.tolist() for t in touches]},
+        timing_ms=timing,
+        warnings=each + ([against] if against else []),
+    )
+    if modes:
+        views = [
+            View(
+                refinery,
+                touch.observation.contact if touch.contact else None,
+                inverse(touch.T_frame_sensor) @ first.T_frame_sensor,
+            )
+            for touch, refinery in zip(touches, refineries, strict=True)
+        ]
+        began = time.perf_counter()
+        posterior = refine_together(posterior, views, modes, first.seed)
+        timing["refine"] = 1e3 * (time.perf_counter() - began)
+    return posterior
+
+
+def _nothing_felt(touches: Sequence[Posterior], prior: Any, cache_dir: str | Path | None) -> Posterior:
+    """The posterior when no sensor feels anything: what was known before, where none is touched."""
+    first, others = touches[0], touches[1:]
+    before = prior_log_density(prior, first.mesh, first.frame, cache_dir)
+
+    def elsewhere(T: Array) -> Array:
+        density = before(T) if before is not None else np.zeros(len(T))
+        return density + np.sum([other.log_density(T) for other in others], axis=0)
+
+    return replace(first, elsewhere=elsewhere, observations=[o for touch in touches for o in touch.observations])
+
+
+def disagreement(fused: Fused) -> str | None:
+    """Which sensors the others contradict, in words; None where all agree."""
+    against = np.flatnonzero(fused.support < _DISAGREES)
+    if not len(against):
+        return None
+    if len(fused.support) == 2:
+        return (
+            "the two sensors disagree: hardly any pose agrees with both; check T_world_sensor, or whether one of them "
+            "touches something else"
+        )
+    worst = int(against[fused.support[against].argmin()])
+    return (
+        f"sensor {worst + 1} of {len(fused.support)} disagrees with the others: they make what it shows less likely than chance "
+        "does; check its T_world_sensor, or whether it touches something else"
+    )
+
+
+def _seen(carry: Carry, other: Posterior) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Likelihood (n,) of what ``other`` shows at each place of ``carry.here``, and of its showing any contact, or none."""
+    if not other.contact:
+        free = 1 - (1 - _UNFELT) * carry.reached()
+        return free, free
+    return carry.mean(other.densities)
+
+
+def _product(prior: Array, densities: Sequence[NDArray[np.floating]], left_out: int | None) -> Array:
+    """The product (n,) of all densities but one, with the prior."""
+    out = prior.copy()
+    for i, density in enumerate(densities):
+        if i != left_out:
+            out *= density
+    return out
+
+
+def _counted(contact: Sequence[bool], order: Sequence[int], densities: Sequence[NDArray[np.floating]]) -> Array:
+    """Log likelihood (n,) of what all sensors show: of N that feel something each counts by 1 / (1 + (N - 1) correlation)."""
+    share = 1 / (1 + _CORRELATION * (sum(contact) - 1))
+    return np.sum(
+        [(share if contact[i] else 1.0) * np.log(density) for i, density in zip(order, densities, strict=True)], axis=0
+    )
+
+
+def _excluded(name: str, order: Sequence[int], rest: Sequence[float]) -> str:
+    """What to say when no pose agrees with all sensors; ``rest`` is the mass that all but one of them leave."""
+    possible = [i for i, mass in zip(order, rest, strict=True) if mass > 0]
+    if len(order) > 2 and len(possible) == 1:
+        return (
+            f"T_world_sensor: no pose of {name} agrees with sensor {possible[0] + 1} and with all others, which agree among "
+            "themselves; check that sensor's pose (metres) and image"
+        )
+    return (
+        f"T_world_sensor: no pose of {name} agrees with all {len(order)} sensors; check their poses (metres, sensor to world) "
+        "and that they touch the same object"
+    )

@@ -1,0 +1,237 @@
+"""Several sensors at once: products, shares of cells, sensors that feel nothing, and sensors that disagree."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from geomtact import Localizer, se3
+from geomtact.cli import app
+from geomtact.contact_space.carry import Carry, RigStd
+from geomtact.errors import InputError, UsageError
+from geomtact.evaluation.touches import random_touches
+from geomtact.inference.fusion import disagreement, fuse
+from geomtact.sensing.reading import write_image
+
+
+def world(touches, rng):
+    """A random pose of the object in the world, and those of the sensors that feel ``touches``."""
+    T = se3.transform(se3.random_rotations(1, rng)[0], rng.uniform(-0.2, 0.2, 3))
+    return T, np.stack([T @ se3.inverse(touch.T_sensor_object) for touch in touches])
+
+
+def single(localizer, touch, T):
+    return localizer.localize(touch.mask, "mask", T_world_sensor=T, effort="fast")
+
+
+def test_a_sensor_in_the_same_place_sees_each_cell_in_itself(plug):
+    """Carried nowhere, a cell lies in its own place: that one's heights and no other's are asked."""
+    index = plug.index
+    cells = index.possible[:: max(1, len(index.possible) // 500)]
+    place, share = Carry(index, index, np.eye(4)).shares(cells)
+    assert (place == cells % index.places).mean() > 0.95
+    # a height is known to the grid's own coarseness: of the band a share is left, never more than all
+    assert (share.sum(0) > 0).all() and (share.sum(0) <= 1 + 1e-6).all()
+
+
+def test_shares_are_what_happens(plug, rng):
+    """Of poses drawn within cells, as many touch a second sensor as the cells' shares say, within a factor of two."""
+    index, space = plug.index, plug.space
+    expected, happened = [], []
+    T, _ = space.sample(24, rng)
+    for here, there in zip(T[::2], T[1::2], strict=True):
+        carry = Carry(index, index, there @ se3.inverse(here))
+        share = carry.mean(np.ones(len(index)))[1]
+        cells = rng.choice(index.possible, 400)
+        drawn, depth = index.draw(cells, rng)
+        settled, ok = space.settle(drawn, depth)
+        expected.append(share[cells % index.places][ok].mean())
+        happened.append(np.isfinite(space.penetration(carry.T_there_here @ settled[ok])).mean())
+    assert 0.5 < np.mean(expected) / np.mean(happened) < 2.0
+
+
+def test_a_rig_known_less_well_spreads_the_shares(plug, rng):
+    T, _ = plug.space.sample(2, rng)
+    carried = T[1] @ se3.inverse(T[0])
+    exact, loose = (Carry(plug.index, plug.index, carried, rig) for rig in (RigStd(), RigStd(0.05, 5e-3)))
+    lever = np.linalg.norm(carried[:3, 3])
+    assert loose.std**2 == pytest.approx(exact.std**2 + (5e-3) ** 2 + (0.05 * lever) ** 2)
+    density = np.ones(len(plug.index))
+    assert (loose.mean(density)[1] > 0).mean() > (exact.mean(density)[1] > 0).mean()
+
+
+def test_each_more_sensor_tells_more_of_the_true_pose(plug):
+    gains = []
+    touches = random_touches(plug, 36, 3)
+    for i in range(12):
+        rng = np.random.default_rng(i)
+        some = touches[3 * i : 3 * i + 3]
+        T, sensors = world(some, rng)
+        for n in (1, 2, 3):
+            posterior = plug.localize([t.mask for t in some[:n]], "mask", None, sensors[:n], seed=i)
+            assert posterior.frame == "world" and len(posterior.observations) == n
+            assert np.exp(posterior.log_prob).sum() == pytest.approx(1, abs=1e-4)
+            gains.append(posterior.log_density(T))
+            for mode in posterior.modes(3):
+                assert np.isfinite(posterior.log_density(mode.T))
+    gains = np.reshape(gains, (12, 3))
+    assert np.isfinite(gains).all()
+    assert gains[:, 0].mean() + 0.5 < gains[:, 1].mean() < gains[:, 2].mean() - 0.5
+
+
+def test_the_order_of_the_others_changes_nothing_and_the_world_is_anywhere(plug):
+    touches = random_touches(plug, 3, 5)
+    _, sensors = world(touches, np.random.default_rng(0))
+    alone = [single(plug, touch, T) for touch, T in zip(touches, sensors, strict=True)]
+    straight, swapped = fuse(alone), fuse([alone[0], alone[2], alone[1]])
+    np.testing.assert_allclose(straight.log_prob, swapped.log_prob, atol=1e-5)
+    np.testing.assert_allclose(straight.support, swapped.support[[0, 2, 1]], atol=1e-5)
+    elsewhere = se3.transform(se3.exp([0.4, 1.0, -2.0, 0, 0, 0])[:3, :3], [0.5, -0.2, 1.0])
+    moved = fuse([single(plug, touch, elsewhere @ T) for touch, T in zip(touches, sensors, strict=True)])
+    np.testing.assert_allclose(straight.log_prob, moved.log_prob, atol=1e-2)
+
+
+def test_a_sensor_that_feels_nothing_speaks_against_poses_that_would_touch_it(plug, rng):
+    touch = random_touches(plug, 1, 7)[0]
+    T, sensors = world([touch], rng)
+    # a sensor at the object's other side, and one far away
+    back = np.diag([1.0, -1.0, -1.0, 1.0])
+    centre = T @ se3.transform(np.eye(3), plug.mesh.centre)
+    near = sensors[0].copy()
+    near[:3, 3] = 2 * centre[:3, 3] - sensors[0][:3, 3]
+    near = near @ back
+    far = se3.transform(np.eye(3), [0, 0, 1.0]) @ near
+    empty = np.zeros_like(touch.mask)
+    alone = single(plug, touch, sensors[0])
+    beside, away = (
+        plug.localize([touch.mask, empty], "mask", None, np.stack([sensors[0], other]), effort="fast")
+        for other in (near, far)
+    )
+    before = alone.densities
+    assert np.abs(np.log(away.densities[before > 0] / before[before > 0])).max() < 1e-3
+    ratio = np.log(beside.densities[before > 0] / before[before > 0])
+    share = np.tile(
+        Carry(plug.index, plug.index, se3.inverse(near) @ sensors[0]).reached(),
+        len(plug.index.height),
+    )[before > 0]
+    # the more of a cell would touch, the less of it is left
+    assert np.corrcoef(share, ratio)[0, 1] < -0.9 and ratio[share.argmin()] > 0 > ratio[share.argmax()]
+
+
+def test_no_contact_anywhere_leaves_what_touches_nothing(plug, rng):
+    touches = random_touches(plug, 2, 8)
+    T, sensors = world(touches, rng)
+    empty = np.zeros_like(touches[0].mask)
+    posterior = plug.localize([empty, empty], "mask", None, sensors)
+    assert not posterior.contact and posterior.modes() == []
+    assert posterior.log_density(T) == -np.inf
+    assert posterior.log_density(se3.transform(np.eye(3), [0, 0, 5.0]) @ T) == 0
+
+
+def test_sensors_that_exclude_each_other_are_named(plug, rng):
+    touches = random_touches(plug, 3, 9)
+    T, sensors = world(touches, rng)
+    wrong = sensors.copy()
+    wrong[2, :3, 3] += [0.0, 0.0, 0.5]
+    with pytest.raises(InputError, match="agrees with sensor 3 and with all others"):
+        plug.localize([t.mask for t in touches], "mask", None, wrong)
+    with pytest.raises(InputError, match="no pose of connector_plug agrees with all 2 sensors"):
+        plug.localize([t.mask for t in touches[1:]], "mask", None, wrong[1:])
+
+
+def test_a_sensor_that_is_hardly_possible_is_told(plug, rng):
+    """Support far below chance is said in words; agreement is not."""
+    touches = random_touches(plug, 3, 10)
+    _, sensors = world(touches, rng)
+    fused = fuse([single(plug, touch, T) for touch, T in zip(touches, sensors, strict=True)])
+    assert disagreement(fused) is None
+    against = type(fused)(fused.cells, fused.log_prob, 0, -9.0, np.array([1.0, -4.0, 2.0]))
+    assert disagreement(against).startswith("sensor 2 of 3 disagrees")
+
+
+def test_a_prior_counts_once(plug, rng):
+    touches = random_touches(plug, 2, 11)
+    T, sensors = world(touches, rng)
+    images = [t.mask for t in touches]
+    near = plug.localize(images, "mask", None, sensors, prior=(T[None], np.zeros(1)), effort="fast")
+    assert (near.densities > 0).sum() == 1 and near.log_density(T) > 5
+    flat = plug.localize(images, "mask", None, sensors, prior=lambda T: np.zeros(len(T)), effort="fast")
+    plain = plug.localize(images, "mask", None, sensors, effort="fast")
+    np.testing.assert_allclose(flat.densities, plain.densities, rtol=0.2, atol=1e-6)
+
+
+def test_saved_and_loaded_it_says_the_same(plug, rng, tmp_path, cache_dir):
+    touches = random_touches(plug, 2, 12)
+    T, sensors = world(touches, rng)
+    posterior = plug.localize([t.mask for t in touches], "mask", None, sensors)
+    posterior.save(tmp_path / "p.npz")
+    again = type(posterior).load(tmp_path / "p.npz", cache_dir)
+    assert again.log_density(T) == pytest.approx(posterior.log_density(T), abs=1e-3)
+    np.testing.assert_allclose([m.T for m in again.modes(3)], [m.T for m in posterior.modes(3)], atol=1e-9)
+
+
+def test_bad_rigs_are_refused(plug):
+    mask = np.zeros(plug.sensor.image_size_px[::-1], bool)
+    T = np.stack([np.eye(4), se3.transform(np.eye(3), [0.1, 0, 0])])
+    cases = [
+        (UsageError, "2 images need T_world_sensor", {}),
+        (UsageError, "expected one pose for each of 2 images", {"T_world_sensor": T[0]}),
+        (InputError, "sensors 1 and 2 are at the same pose", {"T_world_sensor": np.stack([T[0], T[0]])}),
+        (InputError, "100 m apart; give translations in metres", {"T_world_sensor": T * [[1, 1, 1, 1e3]] * 3 + T * 0}),
+    ]
+    millimetres = T.copy()
+    millimetres[1, 0, 3] = 100.0
+    cases[3] = (*cases[3][:2], {"T_world_sensor": millimetres})
+    for error, words, options in cases:
+        with pytest.raises(error, match=words):
+            plug.localize([mask, mask], "mask", **options)
+    with pytest.raises(UsageError, match="expected one background, or 2, got 3"):
+        plug.localize([mask, mask], "mask", [None] * 3, T)
+    with pytest.raises(UsageError, match="an empty list"):
+        plug.localize([], "mask")
+
+
+def test_sensors_may_differ(make_localizer, plug, cache_dir, rng):
+    """The second sensor has another window and other optics."""
+    other = make_localizer("connector_plug", "gelsight-mini", max_poses=20_000, touches=240)
+    both = type(plug)(plug.index, plug.scorer, plug.max_poses, plug.cache_dir, (other,))
+    gains = []
+    for i in range(16):
+        touches = [random_touches(plug, 1, 20 + i)[0], random_touches(other, 1, 40 + i)[0]]
+        T, sensors = world(touches, rng)
+        together = both.localize([t.mask for t in touches], "mask", None, sensors, effort="fast")
+        assert together.sensor.name == "gelslim"
+        gains.append(together.log_density(T) - single(plug, touches[0], sensors[0]).log_density(T))
+    assert np.mean(gains) > 0.5
+    with pytest.raises(UsageError, match="prepared for 2 sensors, got 3 images"):
+        both.localize([touches[0].mask] * 3, "mask", None, np.stack([*sensors, se3.transform(np.eye(3), [1, 0, 0])]))
+
+
+def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
+    touches = random_touches(plug, 2, 14)
+    T, sensors = world(touches, rng)
+    paths = []
+    for i, touch in enumerate(touches):
+        paths.append(str(tmp_path / f"{i}.png"))
+        write_image(paths[-1], touch.mask)
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps({"T_world_sensor": sensors.tolist(), "std_mm": 0.5}))
+    monkeypatch.setattr(Localizer, "prepare", classmethod(lambda cls, *args, **options: plug))
+    args = ["localize", *paths, "--object", "connector_plug", "--sensor", "gelslim"]
+    done = CliRunner().invoke(app, [*args, "--sensor-poses", str(poses), "--json", "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    content = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))
+    assert content["frame"] == "world" and len(content["settings"]["T_world_sensor"]) == 2 and content["modes"]
+    for text, words in [
+        ("{}", "expected {"),
+        (json.dumps({"T_world_sensor": sensors[:1].tolist()}), "for each of 2 images, got 1"),
+        (json.dumps({"T_world_sensor": (2 * sensors).tolist()}), "no rotation"),
+        (json.dumps({"T_world_sensor": sensors.tolist(), "std": 1}), "unknown key 'std'"),
+        (json.dumps({"T_world_sensor": sensors.tolist(), "std_mm": -1}), "std_mm must be a number >= 0"),
+    ]:
+        poses.write_text(text)
+        done = CliRunner().invoke(app, [*args, "--sensor-poses", str(poses)])
+        assert done.exit_code == 3 and words in done.output and "\n" not in done.output.strip()
+    done = CliRunner().invoke(app, args)
+    assert done.exit_code == 2 and "2 images need --sensor-poses" in done.output
