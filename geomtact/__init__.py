@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh, load_mesh
     from geomtact.inference.localizer import Localizer
     from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.inference.prior import GaussianPrior
     from geomtact.planning.next_touch import Action, Probe, Touch
     from geomtact.sensing.contact import Contact
     from geomtact.sensing.local_shape import contact_mask
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 _MODULE_OF = {
     "Action": "geomtact.planning.next_touch",
     "Contact": "geomtact.sensing.contact",
+    "GaussianPrior": "geomtact.inference.prior",
     "Localizer": "geomtact.inference.localizer",
     "Mesh": "geomtact.geometry.mesh",
     "Mode": "geomtact.inference.posterior",
@@ -50,6 +52,7 @@ __all__ = [
     "Action",
     "CacheError",
     "Contact",
+    "GaussianPrior",
     "GeomtactError",
     "ImageError",
     "InputError",

@@ -58,12 +58,11 @@ def test_help_and_lists(geomtact):
         "sensors",
         "objects",
         "cache",
-        "evaluate",
         "next-touch",
         "track",
     }
     assert {c.name or c.callback.__name__ for c in app.registered_commands} == commands
-    assert all(name in geomtact("--help").stdout for name in commands)
+    assert all(name in geomtact("--help").stdout for name in {*commands, "evaluate"})
     assert geomtact("--version").stdout.startswith("geomtact ")
     assert "gelsight-mini" in geomtact("sensors").stdout
     listed = geomtact("objects").stdout
@@ -98,6 +97,13 @@ def test_bad_input_exits_3_with_one_line(geomtact, tmp_path):
     assert "'gelslim'" in geomtact("prepare", "pin", "--sensor", "gelslem", status=3).stderr
     (tmp_path / "geomtact.toml").write_text('objekt = "pin"')
     assert "'object'" in geomtact("prepare", status=3).stderr
+
+
+def test_every_study_tells_a_wrong_part_in_one_line(geomtact):
+    (evaluate,) = app.registered_groups
+    for study in evaluate.typer_instance.registered_commands:
+        assert study.name in geomtact("evaluate", status=2).output
+        assert "pim" in geomtact("evaluate", study.name, "pim", status=3).stderr
 
 
 def test_wrong_names_and_paths_are_told_before_any_work(geomtact, touched, tmp_path):

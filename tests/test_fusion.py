@@ -11,7 +11,7 @@ from geomtact.cli import app
 from geomtact.contact_space.carry import Carry, RigStd
 from geomtact.errors import InputError, UsageError
 from geomtact.evaluation.touches import random_touches
-from geomtact.inference.fusion import disagreement, fuse
+from geomtact.inference.fusion import _shares, disagreement, fuse
 from geomtact.sensing.reading import write_image
 
 
@@ -59,6 +59,35 @@ def test_a_rig_known_less_well_spreads_the_shares(plug, rng):
     assert loose.std**2 == pytest.approx(exact.std**2 + (5e-3) ** 2 + (0.05 * lever) ** 2)
     density = np.ones(len(plug.index))
     assert (loose.mean(density)[1] > 0).mean() > (exact.mean(density)[1] > 0).mean()
+
+
+def test_doubtful_places_are_carried_roughly_but_without_bias(plug, rng):
+    T, _ = plug.space.sample(32, rng)
+    density, places = np.ones(len(plug.index)), plug.index.places
+    some = rng.random(places) < 0.5
+    sums = []
+    for here, there in zip(T[::2], T[1::2], strict=True):
+        carry = Carry(plug.index, plug.index, there @ se3.inverse(here))
+        exact, rough, mixed = (carry.mean(density, doubtful)[1] for doubtful in (None, np.ones(places, bool), some))
+        np.testing.assert_array_equal(mixed, np.where(some, rough, exact))
+        sums.append((exact.sum(), rough.sum()))
+    exact, rough = np.sum(sums, 0)
+    assert rough == pytest.approx(exact, rel=0.1)
+
+
+def test_sensors_that_vary_alike_count_as_one(rng):
+    log_prior, fields = np.full(5000, -np.log(5000.0)), rng.normal(size=(3, 5000))
+    three = np.ones(3, bool)
+    # told apart by what they say, they count all but in full, as do sensors without contact
+    np.testing.assert_allclose(_shares(log_prior, fields, three), 1 / 1.2, atol=0.03)
+    np.testing.assert_allclose(_shares(log_prior, fields[[0, 0, 0]], three), 1 / 3, atol=1e-6)
+    np.testing.assert_allclose(_shares(log_prior, fields[[0, 1, 0]], three), 1 / np.array([2.1, 1.2, 2.1]), atol=0.05)
+    np.testing.assert_allclose(
+        _shares(log_prior, fields[[0, 0, 1]], three & [True, False, True]), [1 / 1.1, 1, 1 / 1.1], atol=0.03
+    )
+    # what is impossible, and where a scale is, does not matter
+    fields[0, :2500] = -np.inf
+    np.testing.assert_allclose(_shares(log_prior, 1e-3 * fields + 7, three), _shares(log_prior, 1e-3 * fields, three))
 
 
 def test_each_more_sensor_tells_more_of_the_true_pose(plug):

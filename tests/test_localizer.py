@@ -12,7 +12,7 @@ from geomtact.geometry.approach import approach_of
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import load_mesh
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import prior_log_mass
+from geomtact.inference.prior import GaussianPrior, prior_log_mass
 from geomtact.registration.rim import SINK
 from geomtact.se3 import exp, transform
 
@@ -196,6 +196,27 @@ def test_weighted_poses_as_prior_gather_the_mass(localizer, a_touch, uniform_pos
     assert again.log_prob == pytest.approx(posterior.log_prob, abs=1e-5)
     best = posterior.modes(1)[0]
     assert distance.mean(best.T, own).min() <= radius
+
+
+def test_a_gaussian_prior_is_where_it_says(localizer, uniform_poses):
+    index, T = localizer.index, uniform_poses(localizer)[0][0]
+    wide = prior_log_mass(index, GaussianPrior(T, 1e6 * np.eye(6)), np.eye(4), "sensor")
+    assert np.exp(wide) == pytest.approx(np.exp(index.log_weight), abs=1e-4)
+    T_world_sensor = exp([0.3, -0.2, 0.5, 0.1, 0.2, 0.3])
+    narrow = GaussianPrior(T_world_sensor @ T, 1e-8 * np.eye(6))
+    mass = np.exp(prior_log_mass(index, narrow, T_world_sensor, "world"))
+    off = PoseDistance(localizer.mesh, 128).mean(T, index.poses(np.arange(len(index))))
+    within = np.sqrt(np.sum((index.angle_step * localizer.mesh.radius_rms) ** 2 + 2 * index.resolution.step**2))
+    assert mass @ (off < 1.5 * within) > 0.9
+    turned = T_world_sensor @ T @ localizer.mesh.symmetry.sampled(5)[-1]
+    again = np.exp(prior_log_mass(index, GaussianPrior(turned, narrow.covariance), T_world_sensor, "world"))
+    assert mass @ (again > 0.2 * mass) > 0.9  # an image under the symmetry says the same, up to the turns asked at
+
+
+@pytest.mark.parametrize("covariance", [np.eye(3), np.zeros((6, 6)), np.arange(36).reshape(6, 6)])
+def test_what_is_no_covariance_is_told(covariance):
+    with pytest.raises(InputError, match="positive definite covariance"):
+        GaussianPrior(np.eye(4), covariance)
 
 
 def test_poses_that_do_not_touch_carry_no_prior(ball, a_touch):

@@ -13,6 +13,7 @@ from geomtact.cli.next_touch import next_touch as next_touch_command
 from geomtact.cli.shell import one_line_errors
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError, InputError, PoseError, UsageError
+from geomtact.evaluation import next_touch_study
 from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.planning.next_touch import (
     LEAST,
@@ -28,6 +29,7 @@ from geomtact.planning.next_touch import (
     next_touch,
 )
 from geomtact.se3 import exp, inverse, transform
+from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.sensor import Sensor
 
 MM = 1e-3
@@ -435,3 +437,40 @@ def test_command_refuses_what_is_no_posterior_or_has_no_contact(command, plug, t
     plug.localize(np.zeros(plug.sensor.image_size_px[::-1], bool)).save(nothing)
     assert "without contact" in command(nothing, status=3).stderr
     assert "no such file" in command(nothing, "--actions", tmp_path / "nowhere.json", status=3).stderr
+
+
+# The study
+
+
+def test_touching_until_sure_starts_alike_and_stops_when_sure(flat_nut, monkeypatch):
+    monkeypatch.setattr(next_touch_study, "MOST", 1)
+    ((best, random),) = next_touch_study.touch_until_sure(flat_nut, 1, 3, MODERATE)
+    assert (best.policy, random.policy) == next_touch_study.POLICIES
+    assert best.gains[0] == random.gains[0]
+    for run in (best, random):
+        assert 0 <= run.touches <= 1
+        assert run.probability >= next_touch_study.SURE or run.touches == 1
+
+
+def test_figures_of_runs_made_by_hand():
+    def run(scene, policy, touches, probability=0.97, mssd_mm=1.0):
+        return next_touch_study.Run(scene, policy, touches, probability, mssd_mm, [0.0])
+
+    runs = [run(0, "best", 1), run(1, "best", 2, mssd_mm=30.0), run(0, "random", 2), run(1, "random", 10, 0.5)]
+    figures = next_touch_study.summarise(runs)
+    assert figures["best"]["touches_mean"] == 1.5
+    assert figures["random"]["sure"] == 0.5
+    assert figures["best"]["wrong"] == 0.5
+    assert figures["best"]["sure_after"][:3] == [0.0, 0.5, 1.0]
+    ratio, low, high = figures["ratio"]
+    assert ratio == pytest.approx(0.25) and low <= ratio <= high
+
+
+@pytest.mark.parametrize("part", ["connector_plug", "bracket"])
+def test_a_part_lies_on_its_lowest_side(part):
+    mesh = load_mesh(part)
+    up = next_touch_study.upwards(mesh)
+    assert np.linalg.norm(up) == pytest.approx(1)
+    # lying on a facet: three of its corners, at least, are down
+    height = mesh.vertices @ up
+    assert (height < height.min() + 1e-6).sum() >= 3

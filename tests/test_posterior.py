@@ -405,3 +405,6 @@ def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_
         assert q[row].sum() == pytest.approx(p[row].sum(), rel=1e-5)
         others = np.setdiff1d(np.arange(len(p)), row)
         assert (after.log_prob[others] == before.log_prob[others]).all()
+        halved = np.exp(before.shared_anew(before.cells[row], likelihood, elsewhere=0.5).log_prob.astype(float))
+        assert halved.sum() == pytest.approx(q.sum(), rel=1e-5)
+        assert halved[others].sum() / halved[row].sum() == pytest.approx(0.5 * q[others].sum() / q[row].sum(), rel=1e-4)

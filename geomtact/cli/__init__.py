@@ -20,9 +20,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Localize a known part from the shape of one tactile contact: the whole distribution of its pose.",
 )
-for command in (localize, track, prepare, train, simulate, evaluate, sensors, objects, cache):
+for command in (localize, track, prepare, train, simulate, sensors, objects, cache):
     app.command()(one_line_errors(command))
 app.command("next-touch")(one_line_errors(next_touch))
+app.add_typer(evaluate, name="evaluate")
 
 
 @app.callback(invoke_without_command=True)

@@ -2,40 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli import study_file
+from geomtact.cli import study_file, study_options
+from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import print_table, tell
+from geomtact.cli.simulate import NoiseName
 
 if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
     from geomtact.registration.protocol import Surface
-    from geomtact.sensing.noise import Noise
     from geomtact.sensing.sensor import Sensor
 
 SCHEMA = "geomtact/registration/2"
 
 
 def judge_registration(
-    parts: Sequence[str],
-    unit: str | None,
-    sensor: str,
-    touches: int,
-    noise_name: str,
-    noise: Noise,
-    elastic: bool | None,
-    seed: int,
-    out: Path | None = None,
-    plot: Path | None = None,
-) -> dict[str, Any]:
-    """Refine poses off by known amounts, by every method on the same starts; print the figures and write them to ``out``.
+    parts: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="OBJECT...",
+            help="Parts, mesh files or bare shapes; the thesis's four and all shapes by default.",
+            show_default=False,
+        ),
+    ] = None,
+    unit: Unit = None,
+    sensor: study_options.SensorName = "gelslim",
+    touches: Annotated[int, typer.Option("--touches", min=1, help="How many touches of each part.")] = 200,
+    noise: study_options.NoiseLevel = NoiseName.moderate,
+    felt: study_options.Felt = study_options.FeltName.both,
+    seed: study_options.Seed = 1,
+    out: study_options.Out = None,
+    plot: study_options.Plot = None,
+) -> None:
+    """Judge registration: from how far off each way of refining a pose finds home, all from the same starts.
 
-    ``elastic`` as in ``touches.random_touches``; ``plot`` is the PNG of how often each method finds home.
+    Prints success, errors and times of each method, and writes them and every trial to --out.
     """
     from types import SimpleNamespace
 
@@ -44,6 +50,8 @@ def judge_registration(
     from geomtact.contact_space.space import ContactSpace
     from geomtact.evaluation import registration
     from geomtact.evaluation.peers import peers
+    from geomtact.evaluation.scores import FELT, THESIS_PARTS
+    from geomtact.evaluation.shapes import SHAPES
     from geomtact.evaluation.touches import random_touches
     from geomtact.geometry.rotations import Directions
     from geomtact.inference.refine import Refinery
@@ -54,8 +62,8 @@ def judge_registration(
 
     content = study_file.load(out, SCHEMA)
     content.pop("figures", None)
-    pressed = Sensor.load(sensor)
-    for mesh in [_mesh(part, unit, pressed).with_symmetry() for part in parts]:
+    pressed, strength = Sensor.load(sensor), study_options.noise_named(noise)
+    for mesh in [_mesh(part, unit, pressed).with_symmetry() for part in parts or [*THESIS_PARTS, *SHAPES]]:
         space = ContactSpace(mesh, pressed)
         resolution = choose_resolution(mesh, pressed, None, MAX_POSES)
         assert mesh.symmetry is not None
@@ -73,24 +81,22 @@ def judge_registration(
             "sensor": pressed.name,
             "sensor_sha256": pressed.sha256,
             "touches": touches,
-            "noise": {"name": noise_name, **asdict(noise)},
-            "elastic": elastic,
+            "noise": {"name": noise.value, **asdict(strength)},
+            "elastic": FELT[felt],
             "seed": seed,
             "grid": resolution.to_json(),
             "methods": list(methods(grid.spread)),
             "success_mm": registration.SUCCESS_MM,
             "peers": versions("small_gicp", "probreg"),
         }
-        found = content["parts"].get(mesh.name)
-        done = found.get("outcomes", []) if found is not None and study_file.same(found, settings) else []
+        done = study_file.earlier(content["parts"].get(mesh.name), settings)
 
         def keep(outcomes: list, name: str = mesh.name, settings: Mapping[str, Any] = settings) -> None:
-            content["parts"][name] = plain({"settings": settings, "outcomes": outcomes})
-            study_file.save(out, content)
+            study_file.keep(out, content, name, settings=settings, outcomes=outcomes)
 
         if len(done) < touches:
-            pressed_at = random_touches(SimpleNamespace(space=space), touches, seed, elastic, noise)
-            more = registration.trials(space, pressed_at, methods, grid, noise, seed, first=len(done))
+            pressed_at = random_touches(SimpleNamespace(space=space), touches, seed, FELT[felt], strength)
+            more = registration.trials(space, pressed_at, methods, grid, strength, seed, first=len(done))
             outcomes = ([asdict(trial) for trial in some] for some in more)
             done = study_file.collect(done, outcomes, touches, f"registering {mesh.name}", keep)
         keep(done)
@@ -104,7 +110,6 @@ def judge_registration(
         from geomtact.report.registration_plot import draw_registration
 
         study_file.draw(draw_registration(content), plot)
-    return content
 
 
 def _mesh(part: str, unit: str | None, sensor: Sensor) -> Mesh:

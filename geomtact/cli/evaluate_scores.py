@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli import study_file
+from geomtact.cli import study_file, study_options
+from geomtact.cli.library import CacheDir
+from geomtact.cli.localize import Effort
+from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import print_table, progress_bar, tell
+from geomtact.cli.simulate import NoiseName
 
 if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
-    from geomtact.sensing.noise import Noise
     from geomtact.sensing.sensor import Sensor
 
 SCHEMA = "geomtact/scores/2"
@@ -26,19 +29,19 @@ class Options:
 
     sensor: Sensor
     touches: int
-    noise_name: str
-    noise: Noise
+    noise: str
     felt: str
     effort: str
     seed: int
     max_poses: int
 
     def __str__(self) -> str:
-        return f"{self.touches} touches on {self.sensor.name}, {self.felt}, {self.noise_name} noise"
+        return f"{self.touches} touches on {self.sensor.name}, {self.felt}, {self.noise} noise"
 
     def settings(self) -> dict[str, Any]:
         """As they stand in the file."""
-        named = {"sensor": self.sensor.name, "noise": {"name": self.noise_name, **asdict(self.noise)}}
+        strength = study_options.noise_named(self.noise)
+        named = {"sensor": self.sensor.name, "noise": {"name": self.noise, **asdict(strength)}}
         return named | {key: getattr(self, key) for key in ("touches", "felt", "effort", "seed", "max_poses")}
 
 
@@ -76,34 +79,58 @@ def _is_score(name: str, known: Sequence[str]) -> bool:
 
 
 def judge_scores(
-    parts: Sequence[str],
-    unit: str | None,
-    names: Sequence[str],
-    options: Options,
-    out: Path | None = None,
-    plot: Path | None = None,
-    cache_dir: Path | None = None,
-) -> dict[str, Any]:
-    """Judge the scores ``names`` on the same touches of each part, print the figures and write them to ``out``.
+    parts: study_options.ThesisParts = None,
+    unit: Unit = None,
+    scores: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SCORE...",
+            help="Scores to judge, by name or weights file; fast, balanced or exact is the default score at that effort.",
+        ),
+    ] = None,
+    sensor: study_options.SensorName = "gelslim",
+    touches: Annotated[int, typer.Option("--touches", min=1, help="How many touches of each part.")] = 200,
+    noise: study_options.NoiseLevel = NoiseName.moderate,
+    felt: study_options.Felt = study_options.FeltName.elastic,
+    effort: study_options.EffortLevel = Effort.balanced,
+    seed: study_options.Seed = 1,
+    max_poses: study_options.MaxPoses = None,
+    out: study_options.Out = None,
+    plot: study_options.Plot = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Judge scores, all by default, side by side on the same touches: what they tell and what they cost.
 
-    ``plot`` is the PNG that shows what they tell against what they cost.
+    Prints gain, coverage, pose errors and times of each, and writes them and every outcome to --out.
     """
+    from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.errors import InputError
     from geomtact.geometry.mesh import load_mesh
     from geomtact.report.result import plain
+    from geomtact.sensing.sensor import Sensor
 
+    chosen, names = sort_words(parts or [], scores or [])
+    options = Options(
+        sensor=Sensor.load(sensor),
+        touches=touches,
+        noise=noise.value,
+        felt=felt.value,
+        effort=effort.value,
+        seed=seed,
+        max_poses=max_poses or MAX_POSES,
+    )
     content = study_file.load(out, SCHEMA)
     settings = plain(options.settings())
     if content.setdefault("settings", settings) != settings:
         other = ", ".join(key for key in settings if content["settings"].get(key) != settings[key])
         raise InputError(f"{out}: holds a study with other settings ({other}); give another file with --out")
     content.pop("overall", None)
-    meshes = [load_mesh(part, unit, sensor=options.sensor) for part in parts]  # a wrong name is told before hours pass
+    meshes = [load_mesh(part, unit, sensor=options.sensor) for part in chosen]  # a wrong name is told before hours pass
     for mesh in meshes:
         part = _part(content, mesh, options.sensor)
-        touches: list = []  # made when first needed, and the same ones for every score
+        made: list = []  # touches, when first needed, and the same ones for every score
         for name in names:
-            _judge(part, mesh, name, options, touches, lambda: study_file.save(out, content), cache_dir)
+            _judge(part, mesh, name, options, made, lambda: study_file.save(out, content), cache_dir)
             _compare(part, options.touches)
         _print(f"{mesh.name}: {options}", part["scores"])
     content["overall"] = plain(_overall(content["parts"]))
@@ -119,7 +146,6 @@ def judge_scores(
         from geomtact.report.score_plot import draw_scores
 
         study_file.draw(draw_scores(content), plot)
-    return content
 
 
 def _part(content: dict[str, Any], mesh: Mesh, sensor: Sensor) -> dict[str, Any]:
@@ -170,8 +196,8 @@ def _judge(
         save()
 
     if len(outcomes) < options.touches and not touches:
-        elastic = scores.FELT[options.felt]
-        touches += study.make_touches(localizer, options.touches, options.seed, options.noise, elastic=elastic)
+        elastic, strength = scores.FELT[options.felt], study_options.noise_named(options.noise)
+        touches += study.make_touches(localizer, options.touches, options.seed, strength, elastic=elastic)
     todo = scores.judged(localizer, touches[len(outcomes) :], effort, options.seed)
     keep(study_file.collect(outcomes, todo, options.touches, f"judging {mesh.name}, {name}", keep))
     tell(f"{mesh.name}, {name}: done")

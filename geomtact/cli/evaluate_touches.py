@@ -2,67 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
 import typer
 
-from geomtact.cli import study_file
-from geomtact.cli.shell import print_table, progress_bar, tell
-
-if TYPE_CHECKING:
-    from geomtact.sensing.noise import Noise
+from geomtact.cli import study_file, study_options
+from geomtact.cli.library import CacheDir
+from geomtact.cli.localize import Effort
+from geomtact.cli.prepare import Unit
+from geomtact.cli.shell import print_table, tell
+from geomtact.cli.simulate import NoiseName
 
 SCHEMA = "geomtact/touches/1"
 
 
 def judge_touches(
-    parts: Sequence[str],
-    unit: str | None,
-    sensor: str,
-    scenes: int,
-    noise_name: str,
-    noise: Noise,
-    elastic: bool | None,
-    effort: str,
-    seed: int,
-    out: Path | None = None,
-    plot: Path | None = None,
-    cache_dir: Path | None = None,
-) -> dict[str, Any]:
-    """Localize each part from one to five sensors at once, print the figures and write them to ``out``; ``plot`` is a PNG.
+    parts: study_options.ThesisParts = None,
+    unit: Unit = None,
+    sensor: study_options.SensorName = "gelslim",
+    scenes: Annotated[
+        int, typer.Option("--touches", min=1, help="How many scenes of five touches of each part.")
+    ] = 200,
+    noise: study_options.NoiseLevel = NoiseName.moderate,
+    felt: study_options.Felt = study_options.FeltName.both,
+    effort: study_options.EffortLevel = Effort.balanced,
+    seed: study_options.Seed = 1,
+    out: study_options.Out = None,
+    plot: study_options.Plot = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Judge several sensors: what each more adds to the posterior of a part that one to five touch at once.
 
-    ``elastic`` as in ``touches.random_touches``.
+    Prints gain, coverage and pose errors for each number of sensors, and writes them and every outcome to --out.
     """
     from geomtact.evaluation import multitouch, study
-    from geomtact.inference.localizer import Localizer
-    from geomtact.report.result import plain
+    from geomtact.evaluation.scores import FELT
 
-    content = study_file.load(out, SCHEMA)
-    for part in parts:
-        with progress_bar(f"preparing {part}") as progress:
-            localizer = Localizer.prepare(part, unit=unit, sensor=sensor, cache_dir=cache_dir, progress=progress)
+    content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
+    for localizer in study_options.localizers(parts, unit, sensor, cache_dir):
         settings = study.describe(localizer) | {
             "scenes": scenes,
-            "noise": {"name": noise_name, **asdict(noise)},
-            "elastic": elastic,
-            "effort": effort,
+            "noise": {"name": noise.value, **asdict(strength)},
+            "elastic": FELT[felt],
+            "effort": effort.value,
             "seed": seed,
         }
         name = localizer.mesh.name
-        found = content["parts"].get(name)
-        done = found["outcomes"] if found is not None and study_file.same(found, settings) else []
+        done = study_file.earlier(content["parts"].get(name), settings)
 
         def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
-            flat = [multitouch.Fused(**_numbers(o)) for some in outcomes for o in some]
+            flat = [multitouch.Fused(**study_file.numbers(o)) for some in outcomes for o in some]
             figures = multitouch.summarise(flat)
-            content["parts"][name] = plain({"settings": settings, "figures": figures, "outcomes": outcomes})
-            study_file.save(out, content)
+            study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=outcomes)
 
         if len(done) < scenes:
-            made = multitouch.make_scenes(localizer, scenes, seed, noise, elastic)
+            made = multitouch.make_scenes(localizer, scenes, seed, strength, FELT[felt])
             more = multitouch.fuse_scenes(localizer, made, effort, seed, first=len(done))
             done = study_file.collect(
                 done, ([asdict(o) for o in some] for some in more), scenes, f"fusing {name}", keep
@@ -74,13 +70,6 @@ def judge_touches(
         from geomtact.report.touches_plot import draw_touches
 
         study_file.draw(draw_touches(content), plot)
-    return content
-
-
-def _numbers(outcome: Mapping[str, Any]) -> dict[str, Any]:
-    """An outcome as written, null standing for what JSON has no number for."""
-    missing = {"gain": -float("inf")}
-    return {key: missing.get(key, float("inf")) if value is None else value for key, value in outcome.items()}
 
 
 def _print(parts: Mapping[str, Any]) -> None:
@@ -89,7 +78,7 @@ def _print(parts: Mapping[str, Any]) -> None:
     for name, part in parts.items():
         for f in part["figures"]:
             more = "" if "more" not in f else "{:+.2f} ({:+.2f} to {:+.2f})".format(*f["more"])
-            lengths = [f"{f[f'{key}_median']:.1f}" for key in ("mssd_mm", "add_s_mm", "add10_mm")]
+            lengths = [study_file.length(f[f"{key}_median"]) for key in ("mssd_mm", "add_s_mm", "add10_mm")]
             share = f"{f['probability_median']:.3f}"
             rows.append(
                 [name, str(f["sensors"]), f"{f['gain_mean']:.2f}", more, f"{f['claimed_mean']:.2f}", *lengths, share]

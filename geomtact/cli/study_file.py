@@ -29,9 +29,11 @@ def load(out: Path | None, schema: str) -> dict[str, Any]:
     return content
 
 
-def earlier(entry: dict[str, Any] | None, settings: dict[str, Any], kind: Callable[..., Any]) -> list:
-    """The outcomes, each a ``kind``, of an earlier run with the very same settings."""
-    return outcomes(entry, kind) if entry is not None and same(entry, settings) else []
+def earlier(entry: dict[str, Any] | None, settings: dict[str, Any], kind: Callable[..., Any] | None = None) -> list:
+    """The outcomes, each a ``kind`` or as written, of an earlier run with the very same settings."""
+    if entry is None or not same(entry, settings):
+        return []
+    return outcomes(entry, kind) if kind is not None else entry.get("outcomes", [])
 
 
 def same(entry: dict[str, Any], settings: dict[str, Any]) -> bool:
@@ -44,15 +46,14 @@ def same(entry: dict[str, Any], settings: dict[str, Any]) -> bool:
 
 
 def outcomes(entry: dict[str, Any], kind: Callable[..., Any]) -> list:
-    """The outcomes of an entry, each a ``kind``.
+    """The outcomes of an entry, each a ``kind``."""
+    return [kind(**numbers(outcome)) for outcome in entry["outcomes"]]
 
-    Null stands for what JSON has no number for: no contact was found, so the pose is infinitely wrong.
-    """
+
+def numbers(outcome: Mapping[str, Any]) -> dict[str, Any]:
+    """An outcome as written; null stands for what JSON has no number for: no contact was found, the pose is infinitely wrong."""
     without = {"gain": -math.inf}
-    return [
-        kind(**{key: without.get(key, math.inf) if value is None else value for key, value in outcome.items()})
-        for outcome in entry["outcomes"]
-    ]
+    return {key: without.get(key, math.inf) if value is None else value for key, value in outcome.items()}
 
 
 def collect(done: list, more: Iterable, total: int, title: str, keep: Callable[[list], None]) -> list:
@@ -64,6 +65,14 @@ def collect(done: list, more: Iterable, total: int, title: str, keep: Callable[[
             if len(done) % _SAVE_EVERY == 0:
                 keep(done)
     return done
+
+
+def keep(out: Path | None, content: dict[str, Any], part: str, **entry: Any) -> None:
+    """Put what is known of a part into ``content``, and that into the file."""
+    from geomtact.report.result import plain
+
+    content["parts"][part] = plain(entry)
+    save(out, content)
 
 
 def save(out: Path | None, content: dict[str, Any]) -> None:
@@ -85,6 +94,11 @@ def draw(picture: bytes, path: Path) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, lambda temporary: temporary.write_bytes(picture))
+
+
+def length(mm: float | None) -> str:
+    """A length of a study's figures as text; null stands for infinity."""
+    return "inf" if mm is None else f"{mm:.1f}"
 
 
 def masses() -> list[str]:

@@ -54,6 +54,7 @@ def track(
     tum: Annotated[
         Path | None, typer.Option(help="Write the first modes as a TUM trajectory: timestamp tx ty tz qx qy qz qw.")
     ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write one HTML file that plays the sequence.")] = None,
     fps: Annotated[float, typer.Option(min=1e-6, help="Images a second, for the timestamps of a folder.")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     cache_dir: CacheDir = None,
@@ -83,13 +84,14 @@ def track(
     frames = _frames(source, follow)
     localizer = open_localizer(values, sources, scorer, cache_dir)
 
-    from geomtact.inference.sequence import UniformBall
+    from geomtact.inference.motion import UniformBall
     from geomtact.inference.sequence import track as posteriors
 
     options: dict[str, Any] = {"kind": kind, "background": values["background"], "prior": prior, "effort": chosen}
     options |= {"motion": UniformBall(1e-3 * motion_mm), "most": most, "on_error": "skip" if skip_broken else "raise"}
     times: deque[float | None] = deque()
     lines: list[str] = []
+    shown: list[dict[str, Any]] = []
     touched = False
     try:
         for n, posterior in enumerate(posteriors(localizer, _images(frames, times), seed=seed, **options), 1):
@@ -99,15 +101,27 @@ def track(
             typer.echo(_json(line))
             if line["T"] is not None:
                 lines.append(_tum(n / fps if told is None else told, line))
+            if report is not None:
+                from geomtact.report.sequence_page import sequence_frame
+
+                shown.append(sequence_frame(posterior, line, localizer.simulate))
     except KeyboardInterrupt:
         tell("stopped")
     if tum is not None:
-        from geomtact.files import write_whole
+        _write(tum, "".join(lines))
+    if report is not None and shown:
+        from geomtact.report.sequence_page import sequence_page
 
-        write_whole(tum, lambda path: path.write_text("".join(lines), "utf-8"))
+        _write(report, sequence_page(localizer.mesh.name, localizer.sensor.name, shown))
     if not touched:
         tell("no contact found in any image; give a --background, or say what they are with --kind")
         raise typer.Exit(NO_CONTACT)
+
+
+def _write(path: Path, text: str) -> None:
+    from geomtact.files import write_whole
+
+    write_whole(path, lambda temporary: temporary.write_text(text, "utf-8"))
 
 
 def _line(n: int, posterior: Posterior) -> dict[str, Any]:

@@ -18,8 +18,10 @@ from scipy.special import ndtr
 from geomtact.contact_space.index import Index
 from geomtact.se3 import Array, transform
 
-# which of the places asked for, where each falls (place, height of the centre [m], how far beside it [m])
-Placed = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]
+# which places of the one sensor, the place of the other that each falls into, and the object's centre (3, n) there [m]
+Placed = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
+# the rotation of the other sensor that each of the one falls into, and a shift (3,) in the other sensor's frame [m]
+Draw = tuple[NDArray[np.int32], NDArray[np.float32]]
 _CHUNK = 1 << 15  # places worked on at a time
 _FAR = 3.0  # standard deviations beyond which nothing of a cell touches
 _SPREAD = 1.2  # of heights over the other sensor, in units of what the steps of both grids come to
@@ -68,35 +70,43 @@ class Carry:
         """The place (n,) of ``there`` that the pose of each of ``cells`` (n,) falls into, and which share (P, n) of the cell
         touches there at each of the P penetrations."""
         rotation = self._rotations_there(self.here.rotations)
-        near, found, z, beside = self._near(*self._placed(slice(None), rotation, np.zeros(3, np.float32)))
+        everywhere = np.arange(len(self._within_reach[0]))
+        near, found, centre = self._near(*self._placed(everywhere, rotation, np.zeros(3, np.float32)))
         place = np.zeros(self.here.places, np.int64)
         share = np.zeros((len(self.there.height), self.here.places), np.float32)
-        place[near], share[:, near] = found, self._shares(self.there.height[:, found].T, z, beside).T
+        place[near], share[:, near] = found, self._shares(self.there.height[:, found].T, found, centre).T
         share[:, near] *= self.there.weight[:, found] > 0
         at = cells % self.here.places
         return place[at], share[:, at]
 
-    def mean(self, density: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def mean(
+        self, density: NDArray[np.floating], doubtful: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Mean over each place of ``here`` (n,) of a density (P m,) over the poses of ``there``, 0 where those do not touch; and
         the share (n,) of each place that touches.
 
-        All penetrations of a place count as its middle one: they differ by less than a cell spreads.
+        All penetrations of a place count as its middle one: they differ by less than a cell spreads. Where ``doubtful`` (n,), one
+        pose within a place stands for all.
         """
         n, bins = self.here.places, len(self.there.height)
         # what belongs to one place stands together
-        height = np.ascontiguousarray(self.there.height.T)
         weight = (self.there.weight.T > 0).astype(np.float32)
-        weighed = np.ascontiguousarray(density.reshape(bins, -1).T.astype(np.float32) * weight)
+        weighed = density.reshape(bins, -1).T.astype(np.float32) * weight
+        rows = np.concatenate([self.there.height.T, weighed, weight], 1)
         total, touching = np.zeros(n, np.float32), np.zeros(n, np.float32)
 
-        def work(part: slice) -> None:
-            for rotation, shift in self._draws:
-                near, found, z, beside = self._near(*self._placed(part, rotation, shift))
-                share = self._shares(height[found], z, beside)
-                total[part][near] += np.einsum("nl,nl->n", share, weighed[found]) / len(self._draws)
-                touching[part][near] += np.einsum("nl,nl->n", share, weight[found]) / len(self._draws)
+        def work(part: NDArray[np.int64], draws: list[Draw]) -> None:
+            for rotation, shift in draws:
+                near, found, centre = self._near(*self._placed(part, rotation, shift))
+                height, weighed, weight = np.split(rows.take(found, 0), 3, 1)
+                share = self._shares(height, found, centre)
+                total[near] += np.einsum("nl,nl->n", share, weighed) / len(draws)
+                touching[near] += np.einsum("nl,nl->n", share, weight) / len(draws)
 
-        self._over_all(work)
+        rough = np.zeros(n, bool) if doubtful is None else doubtful
+        rough = rough[self._within_reach[0]]
+        self._in_parts(np.flatnonzero(rough), lambda part: work(part, self._draws[:1]))
+        self._in_parts(np.flatnonzero(~rough), lambda part: work(part, self._draws))
         return total, touching
 
     def reached(self) -> NDArray[np.float32]:
@@ -104,79 +114,82 @@ class Carry:
         out = np.zeros(self.here.places, np.float32)
         top = self.there.height[0] + np.float32(self.there.sensor.max_penetration / len(self.there.height) / 2)
 
-        def work(part: slice) -> None:
+        def work(part: NDArray[np.int64]) -> None:
             for rotation, shift in self._draws:
-                inside, found, z, beside = self._placed(part, rotation, shift)
-                share = ndtr((top[found] - z) / self.std) * np.exp(-0.5 * (beside / self.std) ** 2)
-                out[part][inside] += share / len(self._draws)
+                inside, found, centre = self._placed(part, rotation, shift)
+                share = ndtr((top[found] - centre[2]) / self.std) * self._overlap(found, centre)
+                out[inside] += share / len(self._draws)
 
-        self._over_all(work)
+        self._in_parts(np.arange(len(self._within_reach[0])), work)
         return out
 
-    def _over_all(self, work: Callable[[slice], None]) -> None:
-        """Do ``work`` on all places, some at a time."""
-        parts = [slice(i, i + _CHUNK) for i in range(0, self.here.places, _CHUNK)]
+    def _in_parts(self, rows: NDArray[np.int64], work: Callable[[NDArray[np.int64]], None]) -> None:
+        """Do ``work`` on ``rows`` (m,) of :attr:`_within_reach`, some at a time."""
+        parts = [rows[i : i + _CHUNK] for i in range(0, len(rows), _CHUNK)]
         with ThreadPoolExecutor(2 if len(parts) > 1 else 1) as pool:
             list(pool.map(work, parts))
 
-    def _placed(self, part: slice, rotation_there: NDArray[np.int32], shift: NDArray[np.float32]) -> Placed:
-        """Those of the places in ``part`` (m,) that lie over the other sensor, the places (m,) of ``there`` they fall into, the
-        height (m,) of the object's centre, and how far (m,) that lies beside the place's cell.
+    def _placed(self, part: NDArray[np.int64], rotation_there: NDArray[np.int32], shift: NDArray[np.float32]) -> Placed:
+        """Those of the rows ``part`` of :attr:`_within_reach` that lie over the other sensor (m,), the places (m,) of ``there``
+        they fall into, and the object's centre (3, m) in the other sensor's frame.
 
         Poses are turned so that they fall into ``rotation_there`` (M,), and moved by ``shift`` (3,).
         """
         there, step = self.there, np.float32(self.there.resolution.step)
-        x, y, z = (each[part] + by for each, by in zip(self._centres, shift, strict=True))
+        place, rotation, centres = self._within_reach
+        centre = centres.take(part, 1) + shift[:, None]
         ny, nx = there.table.shape[1:]
-        column = np.rint(x / -step).astype(np.int32) + nx // 2
-        row = np.rint(y / -step).astype(np.int32) + ny // 2
-        cell = (rotation_there[self.here.rotation[part]] * ny + row) * nx + column
+        column, row = np.rint(centre[:2] / -step).astype(np.int32) + np.array([[nx // 2], [ny // 2]], np.int32)
+        cell = (rotation_there[rotation[part]] * ny + row) * nx + column
         inside = np.flatnonzero((column >= 0) & (column < nx) & (row >= 0) & (row < ny))
-        found = there.table.reshape(-1)[cell[inside]]
-        off = np.abs(np.stack([x[inside], y[inside]], 1) - there.shift[found]) - np.float32(0.5) * step
-        return inside, found, z[inside], np.sqrt((np.maximum(off, 0) ** 2).sum(1))
+        return place[part[inside]], there.table.reshape(-1)[cell[inside]], centre[:, inside]
 
-    def _near(
-        self,
-        inside: NDArray[np.int64],
-        found: NDArray[np.int32],
-        z: NDArray[np.float32],
-        beside: NDArray[np.float32],
-    ) -> Placed:
+    def _near(self, places: NDArray[np.int64], found: NDArray[np.int32], centre: NDArray[np.float32]) -> Placed:
         """Of what is placed over the other sensor, what may touch: most poses are far above it, or would be deep in it."""
-        gap = self.there.height[0][found] - z
-        near = (gap > -_FAR * self.std) & (gap < _FAR * self.std + self.there.sensor.max_penetration)
-        return inside[near], found[near], z[near], beside[near]
+        gap = self.there.height[0].take(found) - centre[2]
+        near = np.flatnonzero((gap > -_FAR * self.std) & (gap < _FAR * self.std + self.there.sensor.max_penetration))
+        return places[near], found[near], centre[:, near]
 
     def _shares(
-        self, height: NDArray[np.float32], z: NDArray[np.float32], beside: NDArray[np.float32]
+        self, height: NDArray[np.float32], found: NDArray[np.int32], centre: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Share (n, P) of cells that touches at each penetration of places whose heights are ``height`` (n, P), when the
-        object's centre is expected at height ``z`` (n,), ``beside`` (n,) the place."""
+        """Share (n, P) of cells that touches at each penetration of the places ``found`` (n,), whose heights are ``height``
+        (n, P), when the object's centre is expected at ``centre`` (3, n)."""
         width = self.there.sensor.max_penetration / height.shape[1]
         variance = self.std**2 + width**2 / 12
+        out: NDArray[np.float32] = np.exp((height - centre[2][:, None]) ** 2 * np.float32(-0.5 / variance))
         # a place may stand for a neighbour that does not touch
-        squares = (height - z[:, None]) ** 2 + (beside**2)[:, None]
-        out: NDArray[np.float32] = np.exp(squares * np.float32(-0.5 / variance)) * np.float32(
-            width / np.sqrt(2 * np.pi * variance)
-        )
-        return out
+        return out * (self._overlap(found, centre) * np.float32(width / np.sqrt(2 * np.pi * variance)))[:, None]
+
+    def _overlap(self, found: NDArray[np.int32], centre: NDArray[np.float32]) -> NDArray[np.float32]:
+        """How much (n,) the cells of places ``found`` count when the object's centre (3, n) lies beside them: 1 within."""
+        off = np.abs(centre[:2].T - self.there.shift.take(found, 0)) - np.float32(0.5 * self.there.resolution.step)
+        beside = np.maximum(off, 0)
+        return np.exp(np.float32(-0.5 / self.std**2) * (beside[:, 0] ** 2 + beside[:, 1] ** 2))
 
     @cached_property
-    def _centres(self) -> NDArray[np.float32]:
-        """The object's centre (3, n) in the other sensor's frame, at the middle penetration of every place of ``here``."""
-        here, T = self.here, self.T_there_here
+    def _within_reach(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+        """The places (m,) of ``here`` that may lie over the other sensor, their rotations (m,), and the object's centre (3, m) in
+        the other sensor's frame, at the middle penetration. Most lie beside its window, or far above it."""
+        here, there, T = self.here, self.there, self.T_there_here.astype(np.float32)
         local = np.stack([*here.shift.T, here.height[len(here.height) // 2]])
-        return (T[:3, :3].astype(np.float32) @ local + T[:3, 3:].astype(np.float32)).astype(np.float32)
+        centres = T[:3, :3] @ local + T[:3, 3:]
+        ny, nx = there.table.shape[1:]
+        margin = 0.5 * here.resolution.step
+        beside = np.abs(centres[:2]) - 0.5 * there.resolution.step * np.array([[nx], [ny]])
+        above = centres[2] - there.height.max() - _FAR * self.std
+        place = np.flatnonzero((beside < margin).all(0) & (above < margin))
+        return place, np.asarray(here.rotation[place]), np.ascontiguousarray(centres[:, place])
 
     @cached_property
-    def _draws(self) -> list[tuple[NDArray[np.int32], NDArray[np.float32]]]:
+    def _draws(self) -> list[Draw]:
         """Draws within all cells: for each the rotations of ``there`` (M,) that those of ``here`` fall into, and a shift (3,) in
         the other sensor's frame."""
-        quarter = self.here.resolution.step / 4
-        corners = quarter * np.array([[-1, -1, 0], [1, 1, 0], [-1, 1, 0], [1, -1, 0]])
         turned = [self._rotations_there(rotations) for rotations in self.here.turned_within]
-        return list(zip(turned, (corners @ self.T_there_here[:3, :3].T).astype(np.float32), strict=True))
+        # evenly over the lattice cell (Roberts, R2 sequence)
+        even = (0.5 + np.outer(np.arange(len(turned)), [0.7548776662466927, 0.5698402909980532])) % 1 - 0.5
+        shifts = self.here.resolution.step * even @ self.T_there_here[:3, :2].T
+        return list(zip(turned, shifts.astype(np.float32), strict=True))
 
     def _rotations_there(self, rotations: Array) -> NDArray[np.int32]:
         """The rotation of ``there`` (M,) that each of ``rotations`` (M, 3, 3) of ``here`` falls into."""

@@ -20,7 +20,7 @@ from geomtact.geometry.rotations import Directions
 from geomtact.se3 import Array, hat, transform
 from geomtact.sensing.sensor import Sensor
 
-_TURNED = 4  # rotations of a cell that stand for all of it
+_TURNED = 8  # rotations of a cell that stand for all of it
 _DRAWN = 30_000  # poses that stand for all
 
 

@@ -20,6 +20,7 @@ from geomtact.sensing.noise import Noise
 
 SENSORS = 5
 _RESAMPLES = 2000
+_POINTS = 20_000  # for ADD-S, which says no less than the distance between points (0.3 mm on the pin)
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def fuse_scenes(
     localizer: Localizer, scenes: Sequence[Scene], effort: str, seed: int, first: int = 0
 ) -> Iterator[list[Fused]]:
     """Each scene from ``first`` on localized from its first sensor, its first two, and so on."""
-    distance, points = PoseDistance(localizer.mesh), localizer.mesh.surface_points(500)
+    distance, points = PoseDistance(localizer.mesh), localizer.mesh.surface_points(_POINTS)
     for number, scene in enumerate(scenes[first:], first):
         out = []
         for n in range(1, len(scene.touches) + 1):

@@ -9,6 +9,7 @@ against the poses at which the object would touch it.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,9 +29,12 @@ from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, inverse
 
 _UNFELT = 0.1  # share of touching poses at which a sensor may yet show nothing: a contact too small or too shallow
-# what a cell's width hides of the pose it hides from all sensors, so that they err alike: so many touches of one object tell
-# as much as N / (1 + (N - 1) correlation) independent ones (measured on the pin, 24 scenes of two, three and five sensors)
-_CORRELATION = 0.2
+_CORRELATION = (
+    0.1  # of what two sensors show, at least: what a cell's width hides of the pose it hides from all of them
+)
+_DOUBTFUL = (
+    0.1  # density relative to the uniform distribution below which the first sensor's places are carried roughly
+)
 _DISAGREES = -2.0  # nats by which the other sensors may make a reading less likely than chance does
 
 
@@ -71,26 +75,38 @@ def fuse(
         No pose of the object agrees with all sensors; the one that disagrees is named where it can be told.
     """
     first = next(i for i, posterior in enumerate(posteriors) if posterior.contact)
-    base = posteriors[first]
-    cells = base.index.possible if log_prior is None else np.flatnonzero(np.isfinite(log_prior))
-    prior = np.exp((base.index.log_weight if log_prior is None else log_prior)[cells]).astype(float)
-    order, chance = [first], [1.0]
-    densities: list[NDArray[np.floating]] = [base.densities[cells]]
-    for i, other in enumerate(posteriors):
-        if i != first:
-            carry = Carry(base.index, other.index, inverse(other.T_frame_sensor) @ base.T_frame_sensor, rig or RigStd())
-            density, uniform = (np.tile(each, len(base.index.height))[cells] for each in _seen(carry, other))
-            order.append(i)
-            densities.append(density)
-            chance.append(float(prior @ uniform))
-    total, *rest = (float(_product(prior, densities, out).sum()) for out in (None, *range(len(order))))
+    base, others = posteriors[first], [i for i in range(len(posteriors)) if i != first]
+    index = base.index
+    log_prior = index.log_weight if log_prior is None else log_prior
+    density = base.densities.reshape(len(index.height), -1)
+    prior = np.exp(log_prior.astype(np.float32)).reshape(density.shape)
+    # what the other sensors say is the same at all penetrations of a place
+    touched = prior.sum(0, dtype=float)
+    felt = np.einsum("pn,pn->n", prior, density).astype(float)
+    doubtful = felt < _DOUBTFUL * touched
+    seen, uniform = [], []
+    for i in others:
+        T_other_first = inverse(posteriors[i].T_frame_sensor) @ base.T_frame_sensor
+        both = _seen(Carry(index, posteriors[i].index, T_other_first, rig or RigStd()), posteriors[i], doubtful)
+        seen.append(both[0].astype(float))
+        uniform.append(both[1])
+    total = float(_product(felt, seen).sum())
+    rest = [
+        float(each.sum()) for each in (_product(touched, seen), *(_product(felt, seen, i) for i in range(len(seen))))
+    ]
+    order = [first, *others]
     if not total > 0:
         raise InputError(_excluded(base.mesh.name, order, rest))
+    chance = [1.0, *(float(touched @ each) for each in uniform)]
     support = np.zeros(len(order))
     with np.errstate(divide="ignore"):
         support[order] = np.log(total) - np.log(np.array(rest) * chance)
-        log_prob = normalised(np.log(prior) + _counted([p.contact for p in posteriors], order, densities))
-    return Fused(cells, log_prob, first, float(np.log(total)), support)
+        logs = np.log([np.divide(felt, touched, out=np.zeros_like(felt), where=touched > 0), *seen])
+        share = _shares(np.log(touched), logs, np.array([posteriors[i].contact for i in order]))
+        log_prob = np.float32(share[0]) * np.log(density) + (share[1:, None] * logs[1:]).sum(0).astype(np.float32)
+    log_prob = log_prob.reshape(-1) + log_prior
+    cells = np.flatnonzero(np.isfinite(log_prior))
+    return Fused(cells, normalised(log_prob[cells]), first, float(np.log(total)), support)
 
 
 def fused_posterior(
@@ -182,29 +198,41 @@ def disagreement(fused: Fused) -> str | None:
     )
 
 
-def _seen(carry: Carry, other: Posterior) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def _seen(
+    carry: Carry, other: Posterior, doubtful: NDArray[np.bool_]
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Likelihood (n,) of what ``other`` shows at each place of ``carry.here``, and of its showing any contact, or none."""
     if not other.contact:
         free = 1 - (1 - _UNFELT) * carry.reached()
         return free, free
-    return carry.mean(other.densities)
+    return carry.mean(other.densities, doubtful)
 
 
-def _product(prior: Array, densities: Sequence[NDArray[np.floating]], left_out: int | None) -> Array:
-    """The product (n,) of all densities but one, with the prior."""
-    out = prior.copy()
-    for i, density in enumerate(densities):
-        if i != left_out:
-            out *= density
-    return out
+def _shares(log_prior: Array, logs: Array, felt: NDArray[np.bool_]) -> Array:
+    """By how much each of N sensors counts (N,), given the log density (N, n) that each gives n places.
+
+    Sensors that vary alike over the places still possible say the same twice, be it the truth or an error that a place repeats to
+    all. So each counts by one over the number of sensors that it speaks for, 1 + the sum of its correlations with the others. One
+    without contact counts in full.
+    """
+    share, logs = np.ones(len(logs)), logs[felt]
+    possible = np.isfinite(logs).all(0) & np.isfinite(log_prior)
+    if len(logs) < 2 or not possible.any():
+        return share
+    logs = logs[:, possible]
+    weight = np.exp(normalised(log_prior[possible] + logs.mean(0)))
+    off = (logs - (logs @ weight)[:, None]) * np.sqrt(weight)
+    covariance = off @ off.T
+    std = np.sqrt(np.maximum(covariance.diagonal(), 1e-12))
+    correlation = np.clip(covariance / np.outer(std, std), _CORRELATION, 1)
+    np.fill_diagonal(correlation, 1)
+    share[felt] = 1 / correlation.sum(1)
+    return share
 
 
-def _counted(contact: Sequence[bool], order: Sequence[int], densities: Sequence[NDArray[np.floating]]) -> Array:
-    """Log likelihood (n,) of what all sensors show: of N that feel something each counts by 1 / (1 + (N - 1) correlation)."""
-    share = 1 / (1 + _CORRELATION * (sum(contact) - 1))
-    return np.sum(
-        [(share if contact[i] else 1.0) * np.log(density) for i, density in zip(order, densities, strict=True)], axis=0
-    )
+def _product(mass: Array, densities: Sequence[Array], left_out: int | None = None) -> Array:
+    """``mass`` (n,) times all ``densities`` (n,) but one."""
+    return math.prod((each for i, each in enumerate(densities) if i != left_out), start=mass)
 
 
 def _excluded(name: str, order: Sequence[int], rest: Sequence[float]) -> str:

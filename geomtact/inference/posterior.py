@@ -160,16 +160,21 @@ class Posterior:
         rows = self._top_rows()
         return self._heart(rows[np.argsort(-self.log_prob[rows], kind="stable")[:n]])
 
-    def shared_anew(self, cells: NDArray[np.int64], log_likelihood: ArrayLike, doubt: float = 0.0) -> Posterior:
+    def shared_anew(
+        self, cells: NDArray[np.int64], log_likelihood: ArrayLike, doubt: float = 0.0, elsewhere: float = 1.0
+    ) -> Posterior:
         """The posterior in which what the runs that hold ``cells`` (n,) have together is shared out among them again, each
-        getting what it had times exp(``log_likelihood``) (n,), up to a constant; all but a share ``doubt``, which stays."""
+        getting what it had times exp(``log_likelihood``) (n,), up to a constant; all but a share ``doubt``, which stays. Of what
+        all other runs have, a share ``elsewhere`` counts."""
         row, first = np.unique(self._rows_of(cells)[0], return_index=True)
         before = self.log_prob[row].astype(float)
         after = before + np.asarray(log_likelihood, float)[first]
-        after += np.logaddexp.reduce(before) - np.logaddexp.reduce(after)
-        log_prob = self.log_prob.copy()
+        held = np.logaddexp.reduce(before)
+        after += held - np.logaddexp.reduce(after)
         with np.errstate(divide="ignore"):
+            log_prob = self.log_prob + self.log_prob.dtype.type(np.log(elsewhere))
             log_prob[row] = np.logaddexp(after + np.log1p(-doubt), before + np.log(doubt))
+        log_prob -= np.log(elsewhere + (1 - elsewhere) * np.exp(held))
         return replace(self, log_prob=log_prob)
 
     def log_density(self, T: ArrayLike) -> Any:
@@ -200,10 +205,10 @@ class Posterior:
     def densities(self) -> NDArray[np.float32]:
         """Density (N,) in every cell of the index, relative to the uniform distribution."""
         out = np.zeros(len(self.index), np.float32)
-        density = np.exp(self._log_density.astype(np.float32))
         if self.runs is None:
-            out[self.cells] = density
+            out[self.cells] = np.exp(self.log_prob.astype(np.float32) - self.index.log_weight[self.cells])
         else:
+            density = np.exp(self._log_density.astype(np.float32))
             out[spelled_out(self.cells, self.runs)] = np.repeat(density, self.runs)
         return out
 

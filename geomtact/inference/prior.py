@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,65 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring.calibration import normalised
-from geomtact.se3 import Array, check_transforms, inverse
+from geomtact.se3 import Array, check_transforms, hat, inverse, log
 
 LogDensity = Callable[[Array], Array]
 
 _CHUNK = 1 << 16
 _EXPECTED = (
-    "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)) or a function of "
-    "poses, got {}"
+    "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)), a GaussianPrior or a "
+    "function of poses, got {}"
 )
 _TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianPrior:
+    """A pose known with an uncertainty, T exp(xi^) with xi ~ N(0, covariance): a vision system's, or that of a ``Mode``.
+
+    Where it is narrower than a cell, it is widened to a cell's own spread.
+
+    Attributes
+    ----------
+    T : (4, 4), in the posterior's frame
+    covariance : (6, 6) of xi = (rx, ry, rz, tx, ty, tz), in the object's frame [rad, m], positive definite
+
+    Raises
+    ------
+    PoseError, InputError
+    """
+
+    T: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        T, C = check_transforms(self.T, "GaussianPrior"), np.asarray(self.covariance, float)
+        if T.shape != (4, 4):
+            raise InputError(f"GaussianPrior: expected one pose (4, 4), got shape {T.shape}")
+        if C.shape != (6, 6) or not np.allclose(C, C.T) or not (np.linalg.eigvalsh(C) > 0).all():
+            raise InputError(
+                "GaussianPrior: expected a symmetric positive definite covariance (6, 6), variances in radians and metres "
+                "squared"
+            )
+        object.__setattr__(self, "T", T)
+        object.__setattr__(self, "covariance", C)
+
+    def __call__(self, T: Array) -> Array:
+        """Log density (n,), not normalised, at poses (n, 4, 4)."""
+        xi = log(inverse(self.T) @ T)
+        return np.asarray(-0.5 * np.einsum("ni,ni->n", xi, np.linalg.solve(self.covariance, xi.T).T))
+
+    def over_cells(self, index: Index, T_frame_sensor: Array) -> GaussianPrior:
+        """As it is told by the cells of ``index`` and by the images under a symmetry that stand for all."""
+        symmetry = index.mesh.symmetry
+        assert symmetry is not None
+        spread = index.cell_covariance(inverse(T_frame_sensor) @ self.T)
+        free = np.zeros((3, 3)) if symmetry.axis is None else np.outer(symmetry.axis, symmetry.axis) / _TURNS**2
+        if symmetry.kind == "sphere":
+            free = np.eye(3) / _ROTATIONS**2
+        about_centre = np.vstack([np.eye(3), hat(symmetry.centre)])
+        spread = spread + about_centre @ free @ about_centre.T * (2 * np.pi) ** 2 / 12
+        return GaussianPrior(self.T, self.covariance + spread)
 
 
 def prior_log_mass(
@@ -36,8 +86,8 @@ def prior_log_mass(
     Parameters
     ----------
     prior : None, a Posterior or the path of one, a pair (poses (N, 4, 4), log masses (N,)) each of which is spread
-        over one grid cell, or a function of poses (N, 4, 4) giving the log density relative to the uniform. Poses are
-        in ``frame``.
+        over one grid cell, a :class:`GaussianPrior`, or a function of poses (N, 4, 4) giving the log density relative to the
+        uniform. Poses are in ``frame``.
 
     Raises
     ------
@@ -52,6 +102,8 @@ def prior_log_mass(
     if isinstance(prior, Posterior):
         density = _of_posterior(index, prior, T_frame_sensor, frame)
     elif callable(prior):
+        if isinstance(prior, GaussianPrior):
+            prior = prior.over_cells(index, T_frame_sensor)
         density = _over_images(index, lambda T: _checked(prior(T_frame_sensor @ T), len(T)))
     elif isinstance(prior, tuple | list) and len(prior) == 2:
         return normalised(_of_poses(index, prior[0], prior[1], T_frame_sensor))

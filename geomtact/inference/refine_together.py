@@ -33,7 +33,9 @@ _PER_MODE = 5  # of these cells are searched for each mode that is asked for
 _KEPT = 3  # poses of a cell that are registered
 _ROUNDS, _AROUND = 3, 12  # of the last search, each in half the width of the one before
 _CHECKED = 8  # of the poses tried for each cell, whether they touch
-_DOUBT = 0.1  # share of their mass that cells keep, whatever is likely within them
+# Shares of their mass that cells keep where a pose was found that explains all: those looked into, whatever is likely within
+# them, and all others, in which as good a one may lie. Chosen on scenes that the study does not judge (docs/several-sensors.md)
+_DOUBT, _ELSEWHERE = 0.03, 0.5
 # nats, for each sensor, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 _ALIKE, _UNLIKE = 3.0, 8.0
 _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: so unlikely as one standard deviation, and at most
@@ -106,7 +108,8 @@ def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: i
     np.maximum.at(likely, np.searchsorted(judged, home), merit)
     unexplained = (search.most.sum() - merit.max(initial=-np.inf)) / len(views)
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
-    posterior = posterior.shared_anew(judged, TRUST * likely, doubt=1 - (1 - _DOUBT) * explains)
+    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, _ELSEWHERE))
+    posterior = posterior.shared_anew(judged, TRUST * likely, doubt, elsewhere)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: len(chosen)]
     return replace(posterior, refined=search.told(home[leading], poses[leading]))

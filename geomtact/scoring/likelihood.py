@@ -65,10 +65,10 @@ def cast_log_likelihood(depths: NDArray[np.floating], seen: NDArray[np.bool_], a
     """
     deepest = np.maximum(depths.max((1, 2)), 0)[:, None, None]
     weight = _independent(area)
+    sign = np.where(seen, 1, -1).astype(depths.dtype)  # not felt is as likely as felt with the object as far above
     each = []
     for t, s in product(THRESHOLDS, SOFTNESS):
-        yes = _felt(depths - t * deepest, s)
-        each.append(weight * np.where(seen, np.log(yes), np.log1p(-yes)).sum((1, 2)))
+        each.append(weight * np.log(_felt(sign * (depths - t * deepest), s)).sum((1, 2)))
     return np.asarray(_log_mean_exp(np.stack(each, 1)), float)
 
 

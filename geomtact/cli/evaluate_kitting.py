@@ -1,0 +1,80 @@
+"""``geomtact evaluate kitting``: parts grasped, localized and placed in a fixture, in simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import typer
+
+from geomtact.cli import study_file, study_options
+from geomtact.cli.library import CacheDir
+from geomtact.cli.prepare import Unit
+from geomtact.cli.shell import print_table, tell
+from geomtact.cli.simulate import NoiseName
+
+SCHEMA = "geomtact/kitting/1"
+
+
+def judge_kitting(
+    parts: study_options.ThesisParts = None,
+    unit: Unit = None,
+    sensor: study_options.SensorName = "gelslim",
+    runs: Annotated[int, typer.Option("--touches", min=1, help="How many of each part to place.")] = 200,
+    noise: study_options.NoiseLevel = NoiseName.moderate,
+    seed: study_options.Seed = 1,
+    out: study_options.Out = None,
+    plot: study_options.Plot = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Judge kitting: how many parts, grasped anyhow and localized, are placed right in a fixture, placed wrong and refused.
+
+    Prints them for each clearance and number of touches, and writes them and every run to --out.
+    """
+    from geomtact.evaluation import kitting, kitting_study, study
+    from geomtact.evaluation.touches import PENETRATION
+
+    content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
+    for localizer in study_options.localizers(parts, unit, sensor, cache_dir):
+        settings = study.describe(localizer) | {
+            "noise": {"name": noise.value, **asdict(strength)},
+            "penetration_mm": [1e3 * depth for depth in PENETRATION],
+            "sure": kitting.SURE,
+            "clearances_mm": [1e3 * clearance for clearance in kitting_study.CLEARANCES],
+            "goal_mm": 1e3 * kitting_study.GOAL,
+            "thorough": kitting_study.THOROUGH,
+            "touches": kitting_study.TOUCHES,
+            "seed": seed,
+        }
+        name = localizer.mesh.name
+        done = study_file.earlier(content["parts"].get(name), settings, kitting_study.Outcome)
+
+        def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
+            figures = kitting_study.summarise(outcomes)
+            flat = [asdict(outcome) for outcome in outcomes]
+            study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=flat)
+
+        if len(done) < runs:
+            more = kitting_study.run_cell(localizer, runs, seed, strength, first=len(done))
+            done = study_file.collect(done, more, runs, f"kitting {name}", keep)
+        keep(done)
+        tell(f"{name}: done")
+    _print(content["parts"])
+    if plot is not None:
+        from geomtact.report.kitting_plot import draw_kitting
+
+        study_file.draw(draw_kitting(content), plot)
+
+
+def _print(parts: Mapping[str, Any]) -> None:
+    rows = []
+    for name, part in parts.items():
+        for f in part["figures"]:
+            low, high = (100 * share for share in f["interval"])
+            right = f"{f['right']} ({low:.0f}-{high:.0f} %)"
+            counts = [str(f[key]) for key in ("wrong", "refused")]
+            rows.append([name, f"{f['clearance_mm']:g}", str(f["touches"]), str(f["n"]), right, *counts])
+    headings = ("part", "clearance [mm]", "touches", "n", "placed right", "placed wrong", "refused")
+    typer.echo("Parts placed right, with the 95 % interval of their share, placed wrong, and refused")
+    print_table(headings, rows, headings[1:])

@@ -1,0 +1,83 @@
+"""The options that the studies of ``geomtact evaluate`` share, and what they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from geomtact.cli.localize import Effort
+from geomtact.cli.shell import progress_bar
+from geomtact.cli.simulate import NoiseName
+
+if TYPE_CHECKING:
+    from geomtact.geometry.approach import Approach
+    from geomtact.geometry.mesh import Mesh
+    from geomtact.inference.localizer import Localizer
+    from geomtact.sensing.noise import Noise
+
+
+class FeltName(StrEnum):
+    elastic = "elastic"
+    rigid = "rigid"
+    both = "both"
+
+
+Parts = Annotated[list[str], typer.Argument(metavar="OBJECT...", help="Parts (see 'geomtact objects') or mesh files.")]
+ThesisParts = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="OBJECT...", help="Parts or mesh files; the thesis's four by default.", show_default=False),
+]
+SensorName = Annotated[str, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
+NoiseLevel = Annotated[NoiseName, typer.Option("--noise", help="How strongly the masks are spoilt.")]
+Felt = Annotated[FeltName, typer.Option("--felt", help="What the gel is.")]
+EffortLevel = Annotated[Effort, typer.Option("--effort", help="How much to compute.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
+MaxPoses = Annotated[
+    int | None,
+    typer.Option("--max-poses", min=1, help="About how many poses; 1.2 million by default.", show_default=False),
+]
+Out = Annotated[
+    Path | None, typer.Option("--out", help="JSON file for all figures; a study that it holds in part is resumed.")
+]
+Plot = Annotated[Path | None, typer.Option("--plot", help="PNG that shows the figures.")]
+
+
+def noise_named(name: str) -> Noise:
+    """What a :class:`NoiseName` stands for."""
+    from geomtact.sensing import noise
+
+    return {"none": noise.CLEAN, "moderate": noise.MODERATE, "heavy": noise.HEAVY}[name]
+
+
+def localizers(
+    parts: Sequence[str | Path] | None,
+    unit: str | None,
+    sensor: str,
+    cache_dir: Path | None,
+    max_poses: int | None = None,
+    approach: Callable[[Mesh], Approach] | None = None,
+) -> Iterator[Localizer]:
+    """A localizer for each part, the thesis's four by default, prepared when its turn comes."""
+    from geomtact.contact_space.resolution import MAX_POSES
+    from geomtact.evaluation.scores import THESIS_PARTS
+    from geomtact.geometry.mesh import load_mesh
+    from geomtact.inference.localizer import Localizer
+    from geomtact.sensing.sensor import Sensor
+
+    gel = Sensor.load(sensor)
+    meshes = [load_mesh(part, unit, sensor=gel) for part in parts or THESIS_PARTS]  # a wrong name is told at once
+    for mesh in meshes:
+        with progress_bar(f"preparing {mesh.name}") as progress:
+            localizer = Localizer.prepare(
+                mesh,
+                sensor=gel,
+                approach=approach and approach(mesh),
+                max_poses=max_poses or MAX_POSES,
+                cache_dir=cache_dir,
+                progress=progress,
+            )
+        yield localizer

@@ -1,0 +1,35 @@
+"""A picture of how soon touches make sure, chosen or random, drawn from the study's JSON alone."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+_STYLES = {"best": ("#0072B2", "-", "the most expected information"), "random": ("#D55E00", "--", "at random")}
+
+
+def draw_touches_until_sure(content: Mapping[str, Any]) -> bytes:
+    """A PNG: for each part, the share of runs that are sure after so many touches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    parts = content["parts"]
+    figure = Figure(figsize=(3.1 * len(parts), 3.6), dpi=110, layout="constrained", facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    for axes, (name, part) in zip(
+        figure.subplots(1, len(parts), squeeze=False, sharey=True)[0], parts.items(), strict=True
+    ):
+        for policy, (colour, line, label) in _STYLES.items():
+            share = part["figures"][policy]["sure_after"]
+            axes.step(range(len(share)), [100 * s for s in share], line, where="post", color=colour, label=label)
+        axes.set_title("{} (touches: {:.2f} x)".format(name, part["figures"]["ratio"][0]), fontsize=10)
+        axes.set_xlabel("touches after the first")
+        axes.set_ylim(0, 102)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("runs in which one mode holds 95 % [%]")
+    figure.axes[0].legend(frameon=False, fontsize=8, loc="lower right", title="touches chosen for", title_fontsize=8)
+    out = io.BytesIO()
+    canvas.print_png(out)
+    return out.getvalue()

@@ -1,0 +1,179 @@
+"""A sequence as one HTML file that plays it, readable without a network, in light and in dark."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.report.figure import OBSERVED, SIMULATED, _displayable, _rgb
+from geomtact.report.page import _STYLE
+from geomtact.report.result import plain
+from geomtact.report.summary import percent
+from geomtact.se3 import Array, inverse
+from geomtact.sensing.contact import Contact
+
+if TYPE_CHECKING:
+    from geomtact.inference.posterior import Posterior
+
+_WIDTH = 320  # px of the pictures, at most
+_CURVE = 640, 160  # width and height of the entropy's curve, in units of its own
+_EXTRA = """
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(16rem, 1fr)); gap: 1rem; margin: 1rem 0; }
+figure { margin: 0; } figure img { width: 100%; image-rendering: pixelated; } figcaption { font-size: .9rem; }
+.player { display: flex; gap: .8rem; align-items: center; } .player input { flex: 1; }
+.player button { font: inherit; width: 5rem; } svg { width: 100%; height: auto; overflow: visible; }
+svg text { font-size: 12px; fill: currentColor; } #told { min-height: 3.2rem; font-variant-numeric: tabular-nums; }
+"""
+_SCRIPT = """
+const slider = document.getElementById("frame"), play = document.getElementById("play");
+const element = id => document.getElementById(id);
+let timer = null;
+function show(i) {
+  const f = FRAMES[i];
+  slider.value = i;
+  element("number").textContent = `frame ${f.frame} of ${FRAMES.length}`;
+  for (const name of ["image", "contact"]) {
+    element(name).style.visibility = f[name] ? "visible" : "hidden";
+    if (f[name]) element(name).src = "data:image/png;base64," + f[name];
+  }
+  element("told").textContent = f.told;
+  element("mark").setAttribute("x1", f.x);
+  element("mark").setAttribute("x2", f.x);
+  element("warnings").replaceChildren(...f.warnings.map(text => {
+    const p = document.createElement("p");
+    p.className = "warning";
+    p.textContent = text;
+    return p;
+  }));
+}
+function stop() { clearInterval(timer); timer = null; play.textContent = "Play"; }
+slider.oninput = () => { stop(); show(Number(slider.value)); };
+play.onclick = () => {
+  if (timer) return stop();
+  if (Number(slider.value) === FRAMES.length - 1) show(0);
+  play.textContent = "Pause";
+  timer = setInterval(() => {
+    const next = Number(slider.value) + 1;
+    if (next < FRAMES.length) show(next); else stop();
+  }, 300);
+};
+show(0);
+"""
+
+
+def sequence_frame(
+    posterior: Posterior, line: Mapping[str, Any], simulate: Callable[[Array], Contact]
+) -> dict[str, Any]:
+    """What the page shows of one frame.
+
+    Parameters
+    ----------
+    posterior : after the frame
+    line : what is printed of it, with ``T`` (4, 4) of the most probable pose or None
+    simulate : the contact at a pose T_sensor_object, without noise
+    """
+    out: dict[str, Any] = {key: line[key] for key in ("frame", "entropy_nats", "surprise_nats", "warnings")}
+    out |= {"image": None, "contact": None, "told": _told(line)}
+    for observation in posterior.observations[:1]:
+        shown = _displayable(observation.image)
+        colours = np.repeat(shown[..., None], 3, 2) if shown.ndim == 2 else shown
+        out["image"] = _png(colours)
+        mask = observation.contact.mask
+        drawn = np.ones((*mask.shape, 3))
+        if line["T"] is not None:
+            drawn[simulate(inverse(posterior.T_frame_sensor) @ line["T"]).mask] = _rgb(SIMULATED)
+        drawn[_border(mask)] = _rgb(OBSERVED)
+        out["contact"] = _png(drawn)
+    return out
+
+
+def sequence_page(name: str, sensor: str, frames: Sequence[Mapping[str, Any]]) -> str:
+    """The text of the page that plays ``frames``, as of :func:`sequence_frame`."""
+    curve, places = _curve([frame["entropy_nats"] for frame in frames])
+    data = json.dumps(plain([{**frame, "x": x} for frame, x in zip(frames, places, strict=True)]), allow_nan=False)
+    title = escape(f"{name} on {sensor}: {len(frames)} frames")
+    body = f"""<h1>{title}</h1>
+<div class="player"><button id="play">Play</button>
+<input id="frame" type="range" min="0" max="{len(frames) - 1}" value="0" aria-label="frame"><span id="number"></span></div>
+<p id="told"></p>
+<div id="warnings"></div>
+<div class="pictures">
+<figure><img id="image" alt="the image"><figcaption>The image</figcaption></figure>
+<figure><img id="contact" alt="contact simulated at the most probable pose, and the observed outline">
+<figcaption><span style="color: {SIMULATED}">&#9632;</span> contact simulated at the most probable pose,
+<span style="color: {OBSERVED}">&#9632;</span> observed outline</figcaption></figure>
+</div>
+<h2>What is known, frame by frame</h2>
+{curve}"""
+    # a closing tag inside a string would end the script
+    script = f"const FRAMES = {data.replace('</', '<' + chr(92) + '/')};{_SCRIPT}"
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{_STYLE}{_EXTRA}</style>\n'
+        f"</head>\n<body>\n{body}\n<script>\n{script}</script>\n</body>\n</html>\n"
+    )
+
+
+def _told(line: Mapping[str, Any]) -> str:
+    if line["T"] is None:
+        return "No contact."
+    where = ", ".join(f"{x:.1f}" for x in line["translation_mm"])
+    known = f"{max(0.0, -line['entropy_nats']):.1f} nats are known. The first mode holds {percent(line['probability'])}"
+    surprise = line["surprise_nats"]
+    expected = f" What was known before makes the frame likelier by {surprise:+.1f} nats." if surprise else ""
+    return f"{known}, with the part's origin at ({where}) mm.{expected}"
+
+
+def _curve(entropy: Sequence[float | None]) -> tuple[str, list[float]]:
+    """An SVG of the nats known in each frame, and where along x each frame is."""
+    wide, high = _CURVE
+    known = [None if e is None else max(0.0, -e) for e in entropy]
+    top = max([1.0, *(k for k in known if k is not None)])
+    x = np.linspace(0, wide, len(known)) if len(known) > 1 else np.array([wide / 2])
+    pieces, pen = [], "M"
+    for place, k in zip(x, known, strict=True):
+        if k is not None:
+            pieces.append(f"{pen}{place:.1f},{high * (1 - k / top):.1f}")
+        pen = "M" if k is None else "L"
+    dots = "".join(
+        f'<circle cx="{place:.1f}" cy="{high * (1 - k / top):.1f}" r="2.5" fill="{SIMULATED}"/>'
+        for place, k in zip(x, known, strict=True)
+        if k is not None
+    )
+    svg = (
+        f'<svg viewBox="-40 -20 {wide + 56} {high + 52}" role="img" aria-label="nats known in each frame">'
+        f'<path d="M0,0V{high}H{wide}" fill="none" stroke="var(--line)"/>'
+        f'<path d="{"".join(pieces)}" fill="none" stroke="{SIMULATED}" stroke-width="2"/>{dots}'
+        f'<line id="mark" y1="0" y2="{high}" x1="0" x2="0" stroke="{OBSERVED}" stroke-width="1.5"/>'
+        f'<text x="-6" y="4" text-anchor="end">{top:.1f}</text><text x="-6" y="{high + 4}" text-anchor="end">0</text>'
+        f'<text x="0" y="{high + 16}">1</text><text x="{wide}" y="{high + 16}" text-anchor="end">{len(known)}</text>'
+        f'<text x="{wide / 2}" y="{high + 28}" text-anchor="middle">frame</text>'
+        '<text x="0" y="-4">nats known</text></svg>'
+    )
+    return svg, [round(float(place), 1) for place in x]
+
+
+def _border(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The pixels of a contact (H, W) that touch what is not."""
+    import cv2
+
+    border = mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    return np.asarray(cv2.dilate(border.astype(np.uint8), np.ones((2, 2), np.uint8)), bool)
+
+
+def _png(colours: Array) -> str:
+    """A picture (H, W, 3) in 0..1, made small enough, as base64."""
+    from PIL import Image
+
+    image = Image.fromarray(np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8))
+    image.thumbnail((_WIDTH, _WIDTH))
+    out = io.BytesIO()
+    image.save(out, "PNG", optimize=True)
+    return base64.b64encode(out.getvalue()).decode("ascii")
