@@ -34,6 +34,10 @@ class PoseError(InputError):
     """An array that should hold rigid transforms does not."""
 
 
+class NoPoseAgreesError(InputError):
+    """No pose of the object agrees with what all sensors show."""
+
+
 class CacheError(InputError):
     """The cache folder cannot be read or written."""
 

@@ -35,7 +35,7 @@ space, mesh, rng = localizer.space, localizer.mesh, np.random.default_rng(option
 fixture, clearance = Fixture(mesh), 1e-3 * options.clearance_mm
 truth = draw_part(space, rng)  # only the simulated fingers know it, and the check at the end
 
-steps = []
+steps = []  # where no pose agrees with all touches, the next one raises geomtact.errors.NoPoseAgreesError
 for step in kit(localizer, fixture, truth, [clearance], rng, options.touches):
     steps.append(step)
     decision = step.decisions[0]

@@ -24,6 +24,8 @@ Placed = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
 Draw = tuple[NDArray[np.int32], NDArray[np.float32]]
 _CHUNK = 1 << 15  # places worked on at a time
 _FAR = 3.0  # standard deviations beyond which nothing of a cell touches
+# share of poses whose height is far from their cell's: where a limb of the object leaves the window, the rest sinks
+_JUMPS = 0.02
 _SPREAD = 1.2  # of heights over the other sensor, in units of what the steps of both grids come to
 
 
@@ -92,16 +94,20 @@ class Carry:
         # what belongs to one place stands together
         weight = (self.there.weight.T > 0).astype(np.float32)
         weighed = density.reshape(bins, -1).T.astype(np.float32) * weight
-        rows = np.concatenate([self.there.height.T, weighed, weight], 1)
+        rows, anywhere = np.concatenate([self.there.height.T, weighed, weight], 1), (weighed.sum(1), weight.sum(1))
         total, touching = np.zeros(n, np.float32), np.zeros(n, np.float32)
+        jump = np.float32(_JUMPS * self.there.sensor.max_penetration / bins / self.there.mesh.diameter)
 
         def work(part: NDArray[np.int64], draws: list[Draw]) -> None:
-            for rotation, shift in draws:
-                near, found, centre = self._near(*self._placed(part, rotation, shift))
+            for draw in draws:
+                placed = self._placed(part, *draw)
+                for out, each in zip((total, touching), anywhere, strict=True):
+                    out[placed[0]] += jump * each.take(placed[1]) / len(draws)
+                places, found, centre = self._near(*placed)
                 height, weighed, weight = np.split(rows.take(found, 0), 3, 1)
                 share = self._shares(height, found, centre)
-                total[near] += np.einsum("nl,nl->n", share, weighed) / len(draws)
-                touching[near] += np.einsum("nl,nl->n", share, weight) / len(draws)
+                total[places] += np.einsum("nl,nl->n", share, weighed) / len(draws)
+                touching[places] += np.einsum("nl,nl->n", share, weight) / len(draws)
 
         rough = np.zeros(n, bool) if doubtful is None else doubtful
         rough = rough[self._within_reach[0]]

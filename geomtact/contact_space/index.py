@@ -245,7 +245,7 @@ class Index:
 
     @cached_property
     def turned_within(self) -> Array:
-        """A few rotations (4, M, 3, 3) drawn within the cell of every rotation of the grid; always the same ones."""
+        """A few rotations (k, M, 3, 3) drawn within the cell of every rotation of the grid; always the same ones."""
         rng, every = np.random.default_rng(0), np.arange(len(self.rotations))
         return np.stack([self.directions.draw(every, rng) for _ in range(_TURNED)])
 

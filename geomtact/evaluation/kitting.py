@@ -130,7 +130,8 @@ def touch_with_jaw(
 ) -> Felt:
     """The jaw closes at ``T_world_jaw`` (4, 4), each finger until the part presses 0.3 to 1.5 mm into it: nobody is told.
 
-    Where neither finger meets the part, that one of them met nothing is felt, at the jaw's origin.
+    Where neither finger meets the part, that one of them met nothing is felt, at the jaw's origin. A finger stopped by too small
+    a contact tells nothing.
     """
     stopped, touches = close_jaw(space, T_world_part, T_world_jaw, rng.uniform(*PENETRATION, 2))
     T, masks = [], []
@@ -139,9 +140,9 @@ def touch_with_jaw(
         if mask is not None:
             T.append(T_world_sensor)
             masks.append(spoilt(mask, space, noise, rng))
-    if not masks:
+    if not touches.any():
         return Felt(T_world_jaw[None], [np.zeros(space.sensor.image_size_px[::-1], bool)])
-    return Felt(np.stack(T), masks)
+    return Felt(np.array(T).reshape(-1, 4, 4), masks)
 
 
 def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.random.Generator) -> Belief:
@@ -212,10 +213,12 @@ def kit(
     Raises
     ------
     InputError
-        Nothing was felt, or no pose agrees with all that was.
+        Nothing was felt.
+    NoPoseAgreesError
+        No pose agrees with all that was felt.
     """
     felt = touch_with_jaw(localizer.space, T_world_part, np.eye(4), elastic, noise, rng)
-    if not felt.masks[0].any():
+    if not felt.masks or not felt.masks[0].any():
         raise InputError("kit: no finger felt the part")
     for touch in range(1, touches + 1):
         posterior = localizer.localize(felt.masks, "mask", T_world_sensor=felt.T_world_sensor)

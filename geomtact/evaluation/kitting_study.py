@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from geomtact.errors import InputError
+from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.fixture import Fixture
 from geomtact.evaluation.kitting import SURE, draw_part, kit
 from geomtact.inference.localizer import Localizer
@@ -56,8 +56,8 @@ def run_cell(localizer: Localizer, runs: int, seed: int, noise: Noise, first: in
                 asked = [d for d, c in zip(step.decisions, CLEARANCES, strict=True) if run % THOROUGH == 0 or c >= GOAL]
                 if all(decision.sure for decision in asked):
                     break
-        except InputError:
-            pass  # refused: no pose agrees with what was felt
+        except NoPoseAgreesError:
+            pass  # refused
         yield Outcome(run, run % 2 == 1, probability, needed)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from geomtact.errors import InputError
+from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.pose_error import add_s, mssd
 from geomtact.evaluation.study import MODES, coverage_figures
 from geomtact.evaluation.touches import Touch, random_touches
@@ -89,7 +89,7 @@ def fuse_scenes(
             images = [touch.mask for touch in scene.touches[:n]]
             try:
                 posterior = localizer.localize(images, "mask", None, scene.T_world_sensor[:n], effort=effort, seed=seed)
-            except InputError:
+            except NoPoseAgreesError:
                 out.append(Fused(number, n, -np.inf, 0.0, 1.0, np.inf, np.inf, np.inf, np.inf, 0.0, True, 0.0))
                 continue
             ms = 1e3 * (time.perf_counter() - began)

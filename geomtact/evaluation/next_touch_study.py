@@ -15,7 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from geomtact.contact_space.touch import felt_mask, spoilt
-from geomtact.errors import InputError
+from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.pose_error import mssd
 from geomtact.evaluation.touches import PENETRATION, Touch, random_touches
 from geomtact.geometry.mesh import Mesh
@@ -86,7 +86,7 @@ def _run(localizer: Localizer, scene: int, first: Touch, policy: str, seed: int,
         images.append(image)
         try:
             posterior = localizer.localize(images, "mask", None, stops, seed=scene)
-        except InputError:  # no pose agrees with all touches
+        except NoPoseAgreesError:
             return Run(scene, policy, MOST, 0.0, np.inf, [*gains, -np.inf])
         gains.append(float(posterior.log_density(T_world_object)))
     mode = posterior.modes(1)[0]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from geomtact.errors import InputError
+from geomtact.errors import InputError, NoPoseAgreesError
 from geomtact.evaluation.pose_error import add_s
 from geomtact.evaluation.study import coverage_figures
 from geomtact.inference.localizer import Localizer
@@ -166,7 +166,7 @@ def _localized(localizer: Localizer, triplet: Triplet, shown: str, n: int, effor
     began = time.perf_counter()
     try:
         posterior = localizer.localize(images, kind, background, T, effort=effort, seed=seed)
-    except InputError:  # no pose agrees with all sensors
+    except NoPoseAgreesError:
         return _outcome(localizer, triplet, shown, n, None, gain=-np.inf, level=1.0, warned=True)
     ms = 1e3 * (time.perf_counter() - began)
     modes = posterior.modes(1)

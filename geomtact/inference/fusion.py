@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.carry import Carry, RigStd
-from geomtact.errors import InputError
+from geomtact.errors import NoPoseAgreesError
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
@@ -71,7 +71,7 @@ def fuse(
 
     Raises
     ------
-    InputError
+    NoPoseAgreesError
         No pose of the object agrees with all sensors; the one that disagrees is named where it can be told.
     """
     first = next(i for i, posterior in enumerate(posteriors) if posterior.contact)
@@ -96,7 +96,7 @@ def fuse(
     ]
     order = [first, *others]
     if not total > 0:
-        raise InputError(_excluded(base.mesh.name, order, rest))
+        raise NoPoseAgreesError(_excluded(base.mesh.name, order, rest))
     chance = [1.0, *(float(touched @ each) for each in uniform)]
     support = np.zeros(len(order))
     with np.errstate(divide="ignore"):
@@ -128,7 +128,7 @@ def fused_posterior(
 
     Raises
     ------
-    InputError
+    NoPoseAgreesError
         As :func:`fuse`.
     """
     if not any(touch.contact for touch in touches):

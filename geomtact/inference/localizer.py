@@ -53,7 +53,7 @@ class Effort:
     thorough: bool = True
 
 
-_ROOM = 10.0  # m that two sensors on one object are never apart
+_ROOM = 10.0  # m between two sensors from which translations are taken to be in millimetres
 EFFORTS = {"fast": Effort("blocks", 0), "balanced": Effort("cells", 5, thorough=False), "exact": Effort("all", 25)}
 
 
@@ -143,7 +143,8 @@ class Localizer:
         kind : "auto", "mask", "height" or "reading"
         background : a reading without contact, for readings; or a list, one for each image
         T_world_sensor : (4, 4), or one for each image (n, 4, 4): the posterior is then in the world frame
-        prior : None, a Posterior, its path, a pair (poses, log weights) or a log density (see ``inference.prior``)
+        prior : None, a Posterior, its path, a pair (poses, log weights), a GaussianPrior or a log density (see
+            ``inference.prior``)
         effort : "fast" (the grid's blocks, nothing refined), "balanced" (its cells, five refined modes) or "exact" (every
             cell, the pixels counted too where that tells more, twenty-five refined modes)
         seed : of the random choices made where credible levels tie, and in refining

@@ -38,7 +38,7 @@ _CHECKED = 8  # of the poses tried for each cell, whether they touch
 _DOUBT, _ELSEWHERE = 0.03, 0.5
 # nats, for each sensor, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 _ALIKE, _UNLIKE = 3.0, 8.0
-_NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: so unlikely as one standard deviation, and at most
+_NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
 _UNFELT = np.log(0.1)  # that a sensor shows nothing where the object would touch it
 
 
