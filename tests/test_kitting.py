@@ -139,7 +139,7 @@ def steps(plug):
 
 def test_the_robot_touches_again_with_one_finger_or_two(steps):
     first, second = (len(step.felt.masks) for step in steps)
-    assert 1 <= first <= 2 and first < second <= first + 2
+    assert 1 <= first <= 2 and first <= second <= first + 2  # one stopped by too small a contact tells nothing
     for step in steps:
         assert step.decisions[1].sure  # nothing is wider off than a metre
         assert step.decisions[0].probability <= step.decisions[1].probability

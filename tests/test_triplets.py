@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from geomtact import contact_mask, load_mesh
 from geomtact.cli import app
 from geomtact.contact_space.space import ContactSpace
-from geomtact.errors import InputError
+from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import triplets
 from geomtact.evaluation.triplets import Outcome, judge, read_triplets, summarise, touching
 from geomtact.se3 import inverse, transform
@@ -110,7 +110,7 @@ def test_no_pose_that_agrees_is_infinitely_wrong(marker):
     localizer, some = marker
 
     def contradicted(*args, **options):
-        raise InputError("no pose agrees")
+        raise NoPoseAgreesError("no pose agrees")
 
     localizer.localize = contradicted
     (outcomes,) = judge(localizer, some[:1], "balanced", 1)

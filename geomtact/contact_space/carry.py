@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from geomtact.contact_space.index import Index
+from geomtact.geometry.approach import allowed, approach_of
 from geomtact.se3 import Array, transform
 
 # which places of the one sensor, the place of the other that each falls into, and the object's centre (3, n) there [m]
@@ -146,8 +147,9 @@ class Carry:
         centre = centres.take(part, 1) + shift[:, None]
         ny, nx = there.table.shape[1:]
         column, row = np.rint(centre[:2] / -step).astype(np.int32) + np.array([[nx // 2], [ny // 2]], np.int32)
-        cell = (rotation_there[rotation[part]] * ny + row) * nx + column
-        inside = np.flatnonzero((column >= 0) & (column < nx) & (row >= 0) & (row < ny))
+        there_turned = rotation_there[rotation[part]]
+        cell = (there_turned * ny + row) * nx + column
+        inside = np.flatnonzero((there_turned >= 0) & (column >= 0) & (column < nx) & (row >= 0) & (row < ny))
         return place[part[inside]], there.table.reshape(-1)[cell[inside]], centre[:, inside]
 
     def _near(self, places: NDArray[np.int64], found: NDArray[np.int32], centre: NDArray[np.float32]) -> Placed:
@@ -198,7 +200,12 @@ class Carry:
         return list(zip(turned, shifts.astype(np.float32), strict=True))
 
     def _rotations_there(self, rotations: Array) -> NDArray[np.int32]:
-        """The rotation of ``there`` (M,) that each of ``rotations`` (M, 3, 3) of ``here`` falls into."""
-        R = self.T_there_here[:3, :3] @ rotations
-        _, direction, turn = self.there.directions.lookup(transform(R, np.zeros(3)))
-        return (self.there.directions.first_turn[direction] + turn).astype(np.int32)
+        """The rotation of ``there`` (M,) that each of ``rotations`` (M, 3, 3) of ``here`` falls into; -1 where the approach rules
+        it out by more than half a cell."""
+        directions = self.there.directions
+        T, direction, turn = directions.lookup(transform(self.T_there_here[:3, :3] @ rotations, np.zeros(3)))
+        out = (directions.first_turn[direction] + turn).astype(np.int32)
+        if directions.cones is not None:
+            wider = [(v, half + 0.5 * self.there.angle_step) for v, half in directions.cones]
+            out[~allowed(approach_of(T[:, :3, :3]), wider)] = -1
+        return out

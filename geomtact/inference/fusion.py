@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,16 +92,16 @@ def fuse(
         seen.append(both[0].astype(float))
         uniform.append(both[1])
     total = float(_product(felt, seen).sum())
-    rest = [
-        float(each.sum()) for each in (_product(touched, seen), *(_product(felt, seen, i) for i in range(len(seen))))
-    ]
+    without = [_product(touched, seen), *(_product(felt, seen, i) for i in range(len(seen)))]
     order = [first, *others]
     if not total > 0:
-        raise NoPoseAgreesError(_excluded(base.mesh.name, order, rest))
-    chance = [1.0, *(float(touched @ each) for each in uniform)]
-    support = np.zeros(len(order))
+        raise NoPoseAgreesError(_excluded(base.mesh.name, order, [float(each.sum()) for each in without]))
     with np.errstate(divide="ignore"):
-        support[order] = np.log(total) - np.log(np.array(rest) * chance)
+        support = np.zeros(len(order))
+        support[order] = [
+            np.log(total / without[0].sum()),
+            *map(partial(_support, total, touched), without[1:], uniform),
+        ]
         logs = np.log([np.divide(felt, touched, out=np.zeros_like(felt), where=touched > 0), *seen])
         share = _shares(np.log(touched), logs, np.array([posteriors[i].contact for i in order]))
         log_prob = np.float32(share[0]) * np.log(density) + (share[1:, None] * logs[1:]).sum(0).astype(np.float32)
@@ -228,6 +229,22 @@ def _shares(log_prior: Array, logs: Array, felt: NDArray[np.bool_]) -> Array:
     np.fill_diagonal(correlation, 1)
     share[felt] = 1 / correlation.sum(1)
     return share
+
+
+def _support(total: float, touched: Array, without: Array, uniform: Array) -> float:
+    """By how many nats the others make a sensor's reading likelier than the uniform does where it is touched; that it is touched
+    tells against it, if the others make that less likely than chance does, but not in its favour.
+
+    Parameters
+    ----------
+    total : mass of the product of all densities
+    touched : (n,) prior mass of the places
+    without : (n,) the product of all but this sensor's
+    uniform : (n,) share of each place that touches it, or does not, as it shows
+    """
+    expected = float(without @ uniform)
+    by_touch = np.log(expected / without.sum() / float(touched @ uniform))
+    return float(np.log(total / expected) + min(0.0, by_touch))
 
 
 def _product(mass: Array, densities: Sequence[Array], left_out: int | None = None) -> Array:

@@ -166,9 +166,13 @@ class Posterior:
         """The posterior in which what the runs that hold ``cells`` (n,) have together is shared out among them again, each
         getting what it had times exp(``log_likelihood``) (n,), up to a constant; all but a share ``doubt``, which stays. Of what
         all other runs have, a share ``elsewhere`` counts."""
-        row, first = np.unique(self._rows_of(cells)[0], return_index=True)
+        row, which = np.unique(self._rows_of(cells)[0], return_inverse=True)
+        likeliest = np.full(len(row), -np.inf)
+        np.maximum.at(likeliest, which, np.asarray(log_likelihood, float))
+        if not np.isfinite(likeliest).any():
+            return self
         before = self.log_prob[row].astype(float)
-        after = before + np.asarray(log_likelihood, float)[first]
+        after = before + likeliest
         held = np.logaddexp.reduce(before)
         after += held - np.logaddexp.reduce(after)
         with np.errstate(divide="ignore"):

@@ -63,7 +63,9 @@ class GaussianPrior:
     def __call__(self, T: Array) -> Array:
         """Log density (n,), not normalised, at poses (n, 4, 4)."""
         xi = log(inverse(self.T) @ T)
-        return np.asarray(-0.5 * np.einsum("ni,ni->n", xi, np.linalg.solve(self.covariance, xi.T).T))
+        # the exponential takes less volume, the larger the angle (Barfoot, State Estimation for Robotics, ch. 7)
+        volume = 4 * np.log(np.sinc(np.linalg.norm(xi[:, :3], axis=1) / (2 * np.pi)))
+        return np.asarray(-0.5 * np.einsum("ni,ni->n", xi, np.linalg.solve(self.covariance, xi.T).T) - volume)
 
     def over_cells(self, index: Index, T_frame_sensor: Array) -> GaussianPrior:
         """As it is told by the cells of ``index`` and by the images under a symmetry that stand for all."""

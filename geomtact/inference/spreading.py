@@ -93,19 +93,27 @@ class Spreading:
         points, least, most = _CARRIED
         draws = min(max(points // len(cells), least), most)
         level, place = np.divmod(cells, index.places)
-        local = np.column_stack([index.shift[place], index.height[level, place]])
+        step, height = index.resolution.step, index.height[level, place]
+        local = np.column_stack([step * np.rint(index.shift[place] / step), height])
         centre = local @ T_after_before[:3, :3].T + T_after_before[:3, 3]
         live, row = np.unique(index.rotation[place], return_inverse=True)
         drawn = self._drawn[rng.integers(len(self._drawn), size=(draws, len(live))), live]
         _, rotation = self._rotation_of(T_after_before[:3, :3] @ drawn.reshape(-1, 3, 3))
         rotation = rotation.reshape(draws, -1)[:, row].ravel()
+        sunk = np.tile((height - centre[:, 2]) / (index.sensor.max_penetration / len(left)), draws)
         centre = np.tile(centre[:, :2], (draws, 1))
-        x, y = index.lattice(centre + index.resolution.step * rng.uniform(-0.5, 0.5, centre.shape))
+        x, y = index.lattice(centre + step * rng.uniform(-0.5, 0.5, centre.shape))
         there = index.table[rotation, np.clip(y, 0, ny - 1), np.clip(x, 0, nx - 1)]
         # the table names a neighbour where a cell does not touch
         mass = before.mass / draws * left[:, place]
-        own = np.flatnonzero((self._slot[there] == self._counted(rotation, x, y)) & (x >= 0) & (x < nx))
-        out = np.array([np.bincount(there[own], each[own % len(cells)], index.places) for each in mass])
+        held = np.tile(mass.sum(0), draws)
+        own = (self._slot[there] == self._counted(rotation, x, y)) & (x >= 0) & (x < nx)
+        stays = own & (there == np.tile(place, draws))
+        leaves = np.flatnonzero(own & ~stays)
+        out = np.array([np.bincount(there[leaves], each[leaves % len(cells)], index.places) for each in mass])
+        # within its own place the object keeps its penetration, but for how far it has sunk
+        deeper = np.rint(np.tile(level, draws)[stays] + sunk[stays] + rng.uniform(-0.5, 0.5, int(stays.sum())))
+        np.add.at(out, (np.clip(deeper, 0, len(left) - 1).astype(int), there[stays]), held[stays])
         out[np.asarray(index.weight) == 0] = 0
         found = np.flatnonzero(out)
         return Mixture(found, out.reshape(-1)[found], before.uniform)

@@ -245,6 +245,7 @@ def likelihoods(felt: NDArray[np.bool_], shown: Array, noise: Array) -> Array:
     noise : (k,) standard deviation of what is shown, at one pose
     """
     told, felt, seen, shown = felt[0], felt[1:], shown[0], shown[1:]
+    seen = seen + noise * np.random.default_rng(0).normal(size=seen.shape)
     count = felt.sum(0)
     mean = (shown * felt[..., None]).sum(0) / np.maximum(count, 1)[:, None]
     off = (shown - mean)[felt]
