@@ -1,4 +1,4 @@
-"""Touch until sure: localize, ask for the touch that would tell most, make it, and so on, until one mode holds 95 %.
+"""Touch until sure: localize, ask for the touch that would tell most, make it, and so on, until one mode holds 90 %.
 
 A plug lies on a table; where, and how it is turned, is unknown. A sensor comes down on it. The robot is simulated: `make`
 is what it feels, and nothing else looks at the truth. About half a minute on two cores, most of it to simulate the grid.
@@ -11,7 +11,7 @@ from geomtact.geometry.distance import PoseDistance
 from geomtact.planning.next_touch import Touch, ambiguity, grid_of_touches, next_touch
 from geomtact.se3 import exp, inverse, transform
 
-SURE, MOST_TOUCHES = 0.95, 10
+SURE, MOST_TOUCHES = 0.9, 10
 PRESSED = 1e-3  # m: how deep the robot lets the part press into the gel
 
 localizer = Localizer.prepare("connector_plug", sensor="gelslim", approach=[((0, 1, 0), 0.0)], max_poses=50_000)
