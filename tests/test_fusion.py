@@ -62,6 +62,13 @@ def test_a_rig_known_less_well_spreads_the_shares(plug, rng):
     assert wide.sum() ** 2 / (wide**2).sum() > 1.03 * sharp.sum() ** 2 / (sharp**2).sum()
 
 
+def test_what_the_approach_rules_out_does_not_touch(flat_nut):
+    """A nut known to lie on its face never touches a sensor that looks at it from the side."""
+    side = se3.transform(se3.exp([np.pi / 2, 0, 0, 0, 0, 0])[:3, :3], np.zeros(3))
+    carry = Carry(flat_nut.index, flat_nut.index, side)
+    assert carry.mean(np.ones(len(flat_nut.index)))[1].max() == 0
+
+
 def test_doubtful_places_are_carried_roughly_but_without_bias(plug, rng):
     T, _ = plug.space.sample(32, rng)
     density, places = np.ones(len(plug.index)), plug.index.places

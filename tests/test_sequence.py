@@ -79,6 +79,15 @@ def test_what_does_not_move_stays(index, rng):
     np.testing.assert_allclose(dense(index, Spreading(index, STILL)(before)), dense(index, before), atol=1e-5)
 
 
+def test_a_sensor_that_hardly_moves_changes_nothing(index, rng):
+    """Neither the place nor the penetration that was known."""
+    spreading, moved = Spreading(index, STILL), se3.transform(np.eye(3), [1e-6, 0, 0])
+    cells = np.sort(rng.choice(index.possible, 20, replace=False))
+    before = Mixture(cells, rng.dirichlet(np.ones(20)), 0.0)
+    after = spreading.carried(before, moved, spreading.left(moved), rng).normalised()
+    assert np.minimum(dense(index, after), dense(index, before)).sum() > 0.97
+
+
 def middle_cell(localizer):
     """A cell from which all neighbours touch: the middle of the window, at a middle penetration."""
     index = localizer.index

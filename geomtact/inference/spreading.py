@@ -110,7 +110,9 @@ class Spreading:
         own = (self._slot[there] == self._counted(rotation, x, y)) & (x >= 0) & (x < nx)
         stays = own & (there == np.tile(place, draws))
         leaves = np.flatnonzero(own & ~stays)
-        out = np.array([np.bincount(there[leaves], each[leaves % len(cells)], index.places) for each in mass])
+        out = np.zeros((len(mass), index.places))
+        for at_depth, each in zip(out, mass, strict=True):
+            np.add.at(at_depth, there[leaves], each[leaves % len(cells)])
         # within its own place the object keeps its penetration, but for how far it has sunk
         deeper = np.rint(np.tile(level, draws)[stays] + sunk[stays] + rng.uniform(-0.5, 0.5, int(stays.sum())))
         np.add.at(out, (np.clip(deeper, 0, len(left) - 1).astype(int), there[stays]), held[stays])
