@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.resolution import Resolution
 from geomtact.geometry.approach import Approach
+from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Directions
 from geomtact.se3 import Array, hat, transform
@@ -98,6 +99,13 @@ class Index:
         R = self.rotations[self.rotation[place]]
         centre = np.concatenate([self.shift[place], self.height[level, place, None]], 1)
         return transform(R, centre - R @ self.mesh.centre)
+
+    def perhaps_within(self, T: Array, distance: PoseDistance, radius: float) -> NDArray[np.int64]:
+        """Pose ids (n,) of all cells whose own pose may lie within ``radius`` [m] of ``T`` (4, 4), in mean point distance."""
+        # the mean over a surface is seldom less than a third of the root mean square: farther rotations are left out
+        turned = distance.turned(T[:3, :3], self.rotations) <= 3 * radius
+        here = T[:3, :3] @ distance.anchor + T[:3, 3]
+        return self.around(np.flatnonzero(turned), distance.anchor, here, radius + distance.slack)
 
     def around(
         self, rotations: NDArray[np.int64], point: ArrayLike, where: ArrayLike, reach: float

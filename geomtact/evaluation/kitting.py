@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
+from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.errors import InputError
 from geomtact.evaluation.fixture import Fixture
-from geomtact.evaluation.touches import PENETRATION
+from geomtact.evaluation.touches import PENETRATION, counts
 from geomtact.geometry.approach import facing
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
@@ -243,4 +243,4 @@ def draw_part(space: ContactSpace, rng: np.random.Generator) -> Array:
 def _felt(space: ContactSpace, T_world_sensor: Array, T_world_part: Array, elastic: bool) -> NDArray[np.bool_] | None:
     """The mask (H, W) without noise; None where it is smaller than a contact that counts."""
     mask = felt_mask(space, inverse(T_world_sensor) @ T_world_part, elastic)
-    return mask if mask.sum() * np.prod(space.sensor.pixel_pitch) >= LEAST_CONTACT else None
+    return mask if counts(space, mask) else None

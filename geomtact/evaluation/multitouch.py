@@ -11,7 +11,7 @@ import numpy as np
 
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.pose_error import add_s, mssd
-from geomtact.evaluation.study import MODES, coverage_figures
+from geomtact.evaluation.study import MODES, coverage_figures, mean_with_interval
 from geomtact.evaluation.touches import Touch, random_touches
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference.localizer import Localizer
@@ -19,7 +19,6 @@ from geomtact.se3 import Array, inverse, random_rotations, transform
 from geomtact.sensing.noise import Noise
 
 SENSORS = 5
-_RESAMPLES = 2000
 _POINTS = 20_000  # for ADD-S, which says no less than the distance between points (0.3 mm on the pin)
 
 
@@ -126,8 +125,7 @@ def summarise(outcomes: Sequence[Fused]) -> list[dict[str, Any]]:
         figures |= {"gain_mean": float(kept.mean()), "claimed_mean": float(_column(outcomes, n, "claimed").mean())}
         if n - 1 in gains:
             more = (gain - gains[n - 1])[np.isfinite(gain) & np.isfinite(gains[n - 1])]
-            means = rng.choice(more, (_RESAMPLES, len(more))).mean(1)
-            figures["more"] = [float(more.mean()), *(float(q) for q in np.quantile(means, [0.025, 0.975]))]
+            figures["more"] = mean_with_interval(more, rng)
         for name in ("mssd_mm", "add_mm", "add_s_mm", "add10_mm", "probability", "ms"):
             figures[f"{name}_median"] = float(np.median(_column(outcomes, n, name)))
         figures["warned"] = float(_column(outcomes, n, "warned").mean())

@@ -23,6 +23,7 @@ from geomtact.sensing.noise import Noise
 NOMINAL = (0.5, 0.8, 0.9, 0.95)
 MODES = 10  # the thesis's best10, of modes instead of poses
 WRONG_MM = 10.0  # MSSD beyond which a first mode is wrong
+_RESAMPLES = 2000
 CERTAIN = 0.5  # a first mode below this probability is one of high entropy
 Felt = Callable[[ContactSpace, Array, bool], NDArray[np.bool_]]
 
@@ -137,6 +138,12 @@ def by_class(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
             gain = float(np.mean([o.gain for o in some]))
             out[name] = {"n": len(some), "gain_mean": gain, **coverage_figures([o.level for o in some], 0.99)}
     return out
+
+
+def mean_with_interval(values: Array, rng: np.random.Generator) -> list[float]:
+    """The mean of ``values`` (n,) and the bounds of its 95 % bootstrap interval."""
+    means = rng.choice(values, (_RESAMPLES, len(values))).mean(1)
+    return [float(values.mean()), *(float(bound) for bound in np.quantile(means, [0.025, 0.975]))]
 
 
 def coverage_figures(levels: ArrayLike, confidence: float = 0.95) -> dict[str, Any]:

@@ -26,6 +26,17 @@ class Touch:
     elastic: bool
 
 
+def penetrations(space: ContactSpace) -> tuple[float, float]:
+    """Least and largest penetration [m] of touches on a sensor, whose gel may be thinner."""
+    high = min(PENETRATION[1], space.sensor.max_penetration)
+    return min(PENETRATION[0], high / 2), high
+
+
+def counts(space: ContactSpace, mask: NDArray[np.bool_]) -> bool:
+    """Whether a mask (H, W) of the sensor's own resolution is a touch: 1 mm^2 of contact at least."""
+    return bool(mask.sum() * np.prod(space.sensor.pixel_pitch) >= LEAST_CONTACT)
+
+
 def random_touches(
     localizer: Any, n: int, seed: int, elastic: bool | None = None, noise: Noise = MODERATE
 ) -> list[Touch]:
@@ -40,14 +51,12 @@ def random_touches(
     """
     rng = np.random.default_rng(seed)
     space: ContactSpace = localizer.space
-    high = min(PENETRATION[1], space.sensor.max_penetration)
-    pixel = float(np.prod(space.sensor.pixel_pitch))
     out: list[Touch] = []
     while len(out) < n:
-        T, depth = space.sample(min(64, 2 * (n - len(out)) + 8), rng, (min(PENETRATION[0], high / 2), high))
+        T, depth = space.sample(min(64, 2 * (n - len(out)) + 8), rng, penetrations(space))
         for pose, d in zip(T, depth, strict=True):
             soft = len(out) % 2 == 1 if elastic is None else elastic
             mask = felt_mask(space, pose, soft)
-            if mask.sum() * pixel >= LEAST_CONTACT and len(out) < n:
+            if counts(space, mask) and len(out) < n:
                 out.append(Touch(pose, float(d), spoilt(mask, space, noise, rng), soft))
     return out

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import Index
 from geomtact.errors import MeshError
 from geomtact.evaluation.contact_class import contact_class
-from geomtact.evaluation.study import coverage_figures
+from geomtact.evaluation.study import coverage_figures, mean_with_interval
 from geomtact.evaluation.trajectories import FEATURELESS, Trajectory, random_trajectory
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import filter as filtering
@@ -34,7 +34,6 @@ LIVE = 50_000  # cells at which a step of the filter is timed
 SPEED = 4e-3  # m from frame to frame, half of what the thesis's motion allows
 _FLOOR = np.log(1e-4)  # log density that a truth without any counts as
 _POINTS = 128  # of the surface, for distances
-_RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
@@ -109,10 +108,7 @@ def cell_width(index: Index, distance: PoseDistance) -> float:
 
 def cells_near(index: Index, distance: PoseDistance, T: Array, radius: float) -> NDArray[np.int64]:
     """Pose ids (n,) of all cells whose own pose lies within ``radius`` [m] of ``T`` (4, 4) in mean point distance."""
-    # the mean over a surface is seldom less than a third of the root mean square: farther rotations are left out
-    turned = distance.turned(T[:3, :3], index.rotations) <= 3 * radius
-    here = T[:3, :3] @ distance.anchor + T[:3, 3]
-    near = index.around(np.flatnonzero(turned), distance.anchor, here, radius + distance.slack)
+    near = index.perhaps_within(T, distance, radius)
     return near[distance.within(T, index.poses(near), radius)]
 
 
@@ -173,11 +169,10 @@ def summarise(outcomes: Sequence[Followed]) -> dict[str, Any]:
             any(a < LOST * b for a, b in zip(o.mass[m][:n], o.mass["frames"][:n], strict=True)) for o, n in stretches
         ]
         more = means[m] - means["frames"]
-        bounds = np.quantile(rng.choice(more, (_RESAMPLES, len(more))).mean(1), [0.025, 0.975])
         out[m] = {
             "gain_mean": float(means[m].mean()),
             "claimed_mean": float(np.mean([np.mean(o.claimed[m]) for o in outcomes])),
-            "more": [float(more.mean()), *(float(b) for b in bounds)],
+            "more": mean_with_interval(more, rng),
             "better": float((more > 0).mean()),
             "worst": float(more.min()),
             "lost": sum(lost),

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
+from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.errors import MeshError
 from geomtact.evaluation.contact_class import contact_class
-from geomtact.evaluation.touches import PENETRATION
+from geomtact.evaluation.touches import counts, penetrations
 from geomtact.geometry.symmetry import about
 from geomtact.se3 import Array, exp, inverse
 from geomtact.sensing.noise import MODERATE, Noise
@@ -75,7 +75,7 @@ def random_trajectory(
 def _stretch(space: ContactSpace, n: int, speed: float, featureless: int, rng: np.random.Generator) -> list[Array]:
     """Poses of one unbroken motion of ``n`` frames, the first ``featureless`` of them without features."""
     for _ in range(_STARTS):
-        T, _ = space.sample(1, rng, _depths(space))
+        T, _ = space.sample(1, rng, penetrations(space))
         if not _fits(space, T[0], featureless > 0):
             continue
         out, xi = [T[0]], _motion(space, speed, rng)
@@ -95,14 +95,9 @@ def _stretch(space: ContactSpace, n: int, speed: float, featureless: int, rng: n
     raise MeshError(f"{space.mesh.name}: hardly any motion of {n} frames keeps such a contact; ask for fewer frames")
 
 
-def _depths(space: ContactSpace) -> tuple[float, float]:
-    high = min(PENETRATION[1], space.sensor.max_penetration)
-    return min(PENETRATION[0], high / 2), high
-
-
 def _fits(space: ContactSpace, T: Array, featureless: bool) -> bool:
-    area = space.caster.contact(space.sensor, T).mask.sum() * float(np.prod(space.sensor.pixel_pitch))
-    return area >= LEAST_CONTACT and (not featureless or contact_class(space, T) in FEATURELESS)
+    mask = space.caster.contact(space.sensor, T).mask
+    return counts(space, mask) and (not featureless or contact_class(space, T) in FEATURELESS)
 
 
 def _moved(space: ContactSpace, T: Array, xi: Array, speed: float, featureless: bool) -> Array | None:

@@ -364,11 +364,7 @@ class Posterior:
 
     def _within(self, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]) -> NDArray[np.int64]:
         """Cells whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""
-        # the mean over a surface is seldom less than a third of the root mean square: farther rotations are left out
-        turned = distance.turned(T[:3, :3], self.index.rotations) <= 3 * radius
-        here = T[:3, :3] @ distance.anchor + T[:3, 3]
-        near = self.index.around(np.flatnonzero(turned), distance.anchor, here, radius + distance.slack)
-        cells = np.union1d(near, moved)
+        cells = np.union1d(self.index.perhaps_within(T, distance, radius), moved)
         return cells[distance.within(T, self._poses_of_cells(cells), radius)]
 
     def _mass_of(self, cells: NDArray[np.int64]) -> Array:
