@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 from geomtact import load_mesh, se3
 from geomtact.cli import app
 from geomtact.contact_space.space import ContactSpace
-from geomtact.evaluation.fixture import Fixture
+from geomtact.evaluation.fixture import Fixture, upwards
 from geomtact.evaluation.kitting import (
     SURE,
     Belief,
@@ -44,9 +44,27 @@ def test_a_perfect_placing_fits_at_any_clearance(mesh):
     assert abs(Fixture(mesh, 300).clearance_needed(np.eye(4))[0]) < TOLERANCE
 
 
-def test_an_error_along_a_flat_needs_as_much_clearance_as_it_is_long(nut):
-    lifted = se3.transform(np.eye(3), [0.0, 0.0, 0.7e-3])
-    assert Fixture(nut).clearance_needed(lifted)[0] == pytest.approx(0.7e-3, abs=TOLERANCE)
+def test_an_error_sideways_or_down_needs_as_much_clearance_as_it_is_long_and_one_upwards_none(nut):
+    """What is held too high is lowered until it rests."""
+    fixture = Fixture(nut)
+    up = upwards(nut)
+    assert abs(up[2]) == pytest.approx(1)  # on one of its faces
+    moved = se3.transform(np.eye(3), 0.7e-3 * np.stack([-up, [0, 1, 0], up]))  # the nut's flats look along y
+    assert fixture.clearance_needed(moved) == pytest.approx([0.7e-3, 0.7e-3, 0], abs=1e-4)
+
+
+def test_the_recess_is_what_the_part_sweeps_on_its_way_up(mesh, rng):
+    """Held against the least distance from the part of points all the way down, a tenth of a millimetre apart."""
+    fixture, up = Fixture(mesh, 300), upwards(mesh)
+    about = se3.transform(np.eye(3), mesh.centre)
+    xi = rng.normal(size=(3, 6)) * np.repeat([0.02, 5e-4], 3)
+    off = about @ np.array([se3.exp(each) for each in xi]) @ se3.inverse(about)
+    way = np.arange(0, mesh.diameter, 1e-4)[:, None, None] * -up
+    for T, needed in zip(off, fixture.clearance_needed(off), strict=True):
+        points = se3.apply(T, fixture.points)
+        distance = fixture._distance((points + way).reshape(-1, 3)).reshape(len(way), len(points))
+        swept = np.maximum(distance.min(0), 0).max()
+        assert swept - 1e-5 <= needed <= swept + 1e-4
 
 
 def test_a_turn_needs_more_clearance_the_farther_out_the_part_reaches(mesh):
@@ -58,11 +76,12 @@ def test_a_turn_needs_more_clearance_the_farther_out_the_part_reaches(mesh):
     assert (needed <= 1.2 * angles * mesh.reach).all()
 
 
-def test_a_hole_across_a_pin_has_to_be_met():
-    """The recess is the part's own shape, so something stands where the hole is; it is 3.6 mm wide."""
+def test_a_hole_across_a_pin_matters_only_to_a_fixture_that_has_a_peg_in_it():
+    """Lying so that the hole leads from side to side, the pin goes in however it is turned; not where the hole points up."""
     pin = load_mesh("pin")
     turned = np.array([se3.exp([0, 0, np.radians(a), 0, 0, 0]) for a in (15.0, 90.0)])
-    assert (Fixture(pin).clearance_needed(turned) > 1.4e-3).all()
+    assert (Fixture(pin).clearance_needed(turned) < 0.5e-3).all()
+    assert (Fixture(pin, up=np.array([1.0, 0, 0])).clearance_needed(turned) > 1.4e-3).all()
 
 
 def test_images_under_the_symmetry_fit_alike(nut):

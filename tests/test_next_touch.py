@@ -14,6 +14,7 @@ from geomtact.cli.shell import one_line_errors
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError, InputError, PoseError, UsageError
 from geomtact.evaluation import next_touch_study
+from geomtact.evaluation.fixture import upwards
 from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.planning.next_touch import (
     LEAST,
@@ -491,7 +492,7 @@ def test_figures_of_runs_made_by_hand():
 @pytest.mark.parametrize("part", ["connector_plug", "bracket"])
 def test_a_part_lies_on_its_lowest_side(part):
     mesh = load_mesh(part)
-    up = next_touch_study.upwards(mesh)
+    up = upwards(mesh)
     assert np.linalg.norm(up) == pytest.approx(1)
     # lying on a facet: three of its corners, at least, are down
     height = mesh.vertices @ up

@@ -40,9 +40,10 @@ def judge_next_touch(
     Prints their numbers and pose errors, and writes them and every run to --out.
     """
     from geomtact.evaluation import next_touch_study, study
+    from geomtact.evaluation.fixture import upwards
 
     def lying(mesh: Mesh) -> Approach:
-        return [(next_touch_study.upwards(mesh), 0.0)]
+        return [(upwards(mesh), 0.0)]
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir, _POSES, lying):

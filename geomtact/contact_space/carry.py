@@ -19,7 +19,8 @@ from geomtact.contact_space.index import Index
 from geomtact.geometry.approach import allowed, approach_of
 from geomtact.se3 import Array, transform
 
-# which places of the one sensor, the place of the other that each falls into, and the object's centre (3, n) there [m]
+# which places of the one sensor, the place of the other that each falls into, or the nearest, and the object's centre (3, n)
+# there [m]
 Placed = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
 # the rotation of the other sensor that each of the one falls into, and a shift (3,) in the other sensor's frame [m]
 Draw = tuple[NDArray[np.int32], NDArray[np.float32]]
@@ -27,6 +28,7 @@ _CHUNK = 1 << 15  # places worked on at a time
 _FAR = 3.0  # standard deviations beyond which nothing of a cell touches
 # share of poses whose height is far from their cell's: where a limb of the object leaves the window, the rest sinks
 _JUMPS = 0.02
+_BESIDE = 0.3  # steps of the grid by which a cell's neighbours share in it: few poses stand for a cell
 _SPREAD = 1.2  # of heights over the other sensor, in units of what the steps of both grids come to
 
 
@@ -65,22 +67,28 @@ class Carry:
         """Standard deviation [m] of the object's height over the other sensor within a cell, at that sensor's own grid."""
         grids = (self.here, self.there)
         steps = sum((g.angle_step * g.mesh.radius_rms) ** 2 + g.resolution.step**2 for g in grids) / 12
-        lever = float(np.linalg.norm(self.T_there_here[:3, 3]))
-        rig = self.rig.translation**2 + (self.rig.rotation * lever) ** 2
-        return float(np.sqrt(_SPREAD**2 * steps + rig))
+        return float(np.sqrt(_SPREAD**2 * steps + self._rig_std**2))
 
-    def shares(self, cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """The place (n,) of ``there`` that the pose of each of ``cells`` (n,) falls into, and which share (P, n) of the cell
-        touches there at each of the P penetrations."""
-        rotation = self._rotations_there(self.here.rotations)
-        everywhere = np.arange(len(self._within_reach[0]))
-        near, found, centre = self._near(*self._placed(everywhere, rotation, np.zeros(3, np.float32)))
-        place = np.zeros(self.here.places, np.int64)
+    @property
+    def _rig_std(self) -> float:
+        """Standard deviation [m] of the object along each axis of the other sensor, for the rig's sake."""
+        lever = float(np.linalg.norm(self.T_there_here[:3, 3]))
+        return float(np.hypot(self.rig.translation, self.rig.rotation * lever))
+
+    def shares(self) -> NDArray[np.float32]:
+        """Which share (P, n) of each place of ``here`` touches the other sensor at each of its P penetrations."""
         share = np.zeros((len(self.there.height), self.here.places), np.float32)
-        place[near], share[:, near] = found, self._shares(self.there.height[:, found].T, found, centre).T
-        share[:, near] *= self.there.weight[:, found] > 0
-        at = cells % self.here.places
-        return place[at], share[:, at]
+        heights = np.ascontiguousarray(self.there.height.T)
+        possible = self.there.weight > 0
+
+        def work(part: NDArray[np.int64]) -> None:
+            for draw in self._draws:
+                places, found, centre = self._near(*self._placed(part, *draw))
+                each = self._shares(heights.take(found, 0), found, centre).T
+                share[:, places] += each * possible[:, found] / len(self._draws)
+
+        self._in_parts(np.arange(len(self._within_reach[0])), work)
+        return share
 
     def mean(
         self, density: NDArray[np.floating], doubtful: NDArray[np.bool_] | None = None
@@ -95,7 +103,8 @@ class Carry:
         # what belongs to one place stands together
         weight = (self.there.weight.T > 0).astype(np.float32)
         weighed = density.reshape(bins, -1).T.astype(np.float32) * weight
-        rows, anywhere = np.concatenate([self.there.height.T, weighed, weight], 1), (weighed.sum(1), weight.sum(1))
+        rows = np.ascontiguousarray(np.concatenate([self.there.height.T, weighed, weight], 1))
+        anywhere = weighed.sum(1), weight.sum(1)
         total, touching = np.zeros(n, np.float32), np.zeros(n, np.float32)
         jump = np.float32(_JUMPS * self.there.sensor.max_penetration / bins / self.there.mesh.diameter)
 
@@ -122,10 +131,10 @@ class Carry:
         top = self.there.height[0] + np.float32(self.there.sensor.max_penetration / len(self.there.height) / 2)
 
         def work(part: NDArray[np.int64]) -> None:
-            for rotation, shift in self._draws:
-                inside, found, centre = self._placed(part, rotation, shift)
-                share = ndtr((top[found] - centre[2]) / self.std) * self._overlap(found, centre)
-                out[inside] += share / len(self._draws)
+            for draw in self._draws:
+                places, found, centre = self._placed(part, *draw)
+                own = self.there.touching[found] * (self._beside(found, centre) == 0).all(1)
+                out[places] += own * ndtr((top[found] - centre[2]) / self.std) / len(self._draws)
 
         self._in_parts(np.arange(len(self._within_reach[0])), work)
         return out
@@ -137,8 +146,7 @@ class Carry:
             list(pool.map(work, parts))
 
     def _placed(self, part: NDArray[np.int64], rotation_there: NDArray[np.int32], shift: NDArray[np.float32]) -> Placed:
-        """Those of the rows ``part`` of :attr:`_within_reach` that lie over the other sensor (m,), the places (m,) of ``there``
-        they fall into, and the object's centre (3, m) in the other sensor's frame.
+        """Those of the rows ``part`` of :attr:`_within_reach` that lie over the other sensor.
 
         Poses are turned so that they fall into ``rotation_there`` (M,), and moved by ``shift`` (3,).
         """
@@ -167,13 +175,24 @@ class Carry:
         variance = self.std**2 + width**2 / 12
         out: NDArray[np.float32] = np.exp((height - centre[2][:, None]) ** 2 * np.float32(-0.5 / variance))
         # a place may stand for a neighbour that does not touch
-        return out * (self._overlap(found, centre) * np.float32(width / np.sqrt(2 * np.pi * variance)))[:, None]
+        beside = self._beside(found, centre)
+        overlap = np.exp(
+            np.float32(-0.5 / (_BESIDE * self.there.resolution.step) ** 2) * np.einsum("ni,ni->n", beside, beside)
+        )
+        return out * (overlap * np.float32(width / np.sqrt(2 * np.pi * variance)))[:, None]
 
-    def _overlap(self, found: NDArray[np.int32], centre: NDArray[np.float32]) -> NDArray[np.float32]:
-        """How much (n,) the cells of places ``found`` count when the object's centre (3, n) lies beside them: 1 within."""
-        off = np.abs(centre[:2].T - self.there.shift.take(found, 0)) - np.float32(0.5 * self.there.resolution.step)
-        beside = np.maximum(off, 0)
-        return np.exp(np.float32(-0.5 / self.std**2) * (beside[:, 0] ** 2 + beside[:, 1] ** 2))
+    def _beside(self, found: NDArray[np.int32], centre: NDArray[np.float32]) -> NDArray[np.float32]:
+        """How far (n, 2) [m] the object's centre (3, n) lies beside the cells of places ``found`` (n,); 0 within."""
+        off = np.abs(centre[:2].T - self._middles.take(found, 0)) - np.float32(
+            (0.5 + 1e-5) * self.there.resolution.step
+        )
+        return np.maximum(off, 0)
+
+    @cached_property
+    def _middles(self) -> NDArray[np.float32]:
+        """Middle (n, 2) [m] of the lattice cell of each place of ``there``."""
+        step = np.float32(self.there.resolution.step)
+        return np.asarray(step * np.rint(self.there.shift / step))
 
     @cached_property
     def _within_reach(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
@@ -197,6 +216,7 @@ class Carry:
         # evenly over the lattice cell (Roberts, R2 sequence)
         even = (0.5 + np.outer(np.arange(len(turned)), [0.7548776662466927, 0.5698402909980532])) % 1 - 0.5
         shifts = self.here.resolution.step * even @ self.T_there_here[:3, :2].T
+        shifts[:, :2] += self._rig_std * np.random.default_rng(0).normal(size=(len(turned), 2))
         return list(zip(turned, shifts.astype(np.float32), strict=True))
 
     def _rotations_there(self, rotations: Array) -> NDArray[np.int32]:

@@ -193,6 +193,14 @@ class Index:
         return transform(R, centre - R @ self.mesh.centre), depth
 
     @cached_property
+    def touching(self) -> NDArray[np.float32]:
+        """Share (n,) of the lattice cell of each place in which the object can touch."""
+        directions = self.directions
+        of_rotation = np.repeat(directions.weights / directions.turns, directions.turns)
+        share = self.weight.max(0) / of_rotation[self.rotation]
+        return (share / share.max()).astype(np.float32)
+
+    @cached_property
     def _mass_before(self) -> Array:
         """Uniform measure of all poses before each (N + 1,)."""
         return np.concatenate([[0.0], np.cumsum(self.weight, dtype=np.float64)])

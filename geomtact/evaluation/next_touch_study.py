@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.pose_error import mssd
 from geomtact.evaluation.touches import PENETRATION, Touch, random_touches
-from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
 from geomtact.planning.next_touch import Touch as Planned
@@ -49,14 +47,6 @@ class Run:
     probability: float
     mssd_mm: float
     gains: list[float]
-
-
-def upwards(mesh: Mesh) -> Array:
-    """The direction (3,) that points up, in the object's frame, where the part rests with its centre of mass lowest."""
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
-    poses, _ = trimesh.poses.compute_stable_poses(solid)
-    heights = poses[:, 2, :3] @ solid.center_mass + poses[:, 2, 3]
-    return np.asarray(poses[heights.argmin(), 2, :3], float)
 
 
 def touch_until_sure(localizer: Localizer, n: int, seed: int, noise: Noise, first: int = 0) -> Iterator[list[Run]]:

@@ -161,23 +161,29 @@ class Posterior:
         return self._heart(rows[np.argsort(-self.log_prob[rows], kind="stable")[:n]])
 
     def shared_anew(
-        self, cells: NDArray[np.int64], log_likelihood: ArrayLike, doubt: float = 0.0, elsewhere: float = 1.0
+        self,
+        cells: NDArray[np.int64],
+        log_likelihood: ArrayLike,
+        doubt: float = 0.0,
+        elsewhere: float = 1.0,
+        before: float = 1.0,
     ) -> Posterior:
-        """The posterior in which what the runs that hold ``cells`` (n,) have together is shared out among them again, each
-        getting what it had times exp(``log_likelihood``) (n,), up to a constant; all but a share ``doubt``, which stays. Of what
-        all other runs have, a share ``elsewhere`` counts."""
+        """The posterior in which what the runs that hold ``cells`` (n,) have together is shared out among them again, each by
+        its density to the power ``before`` times exp(``log_likelihood``) (n,), up to a constant; all but a share ``doubt``, which
+        stays. Of what all other runs have, a share ``elsewhere`` counts."""
         row, which = np.unique(self._rows_of(cells)[0], return_inverse=True)
         likeliest = np.full(len(row), -np.inf)
         np.maximum.at(likeliest, which, np.asarray(log_likelihood, float))
         if not np.isfinite(likeliest).any():
             return self
-        before = self.log_prob[row].astype(float)
-        after = before + likeliest
-        held = np.logaddexp.reduce(before)
-        after += held - np.logaddexp.reduce(after)
+        had = self.log_prob[row].astype(float)
+        with np.errstate(invalid="ignore"):
+            gets = had + likeliest - (1 - before) * np.where(had > -np.inf, self._log_density_of(row), 0.0)
+        held = np.logaddexp.reduce(had)
+        gets += held - np.logaddexp.reduce(gets)
         with np.errstate(divide="ignore"):
             log_prob = self.log_prob + self.log_prob.dtype.type(np.log(elsewhere))
-            log_prob[row] = np.logaddexp(after + np.log1p(-doubt), before + np.log(doubt))
+            log_prob[row] = np.logaddexp(gets + np.log1p(-doubt), had + np.log(doubt))
         log_prob -= np.log(elsewhere + (1 - elsewhere) * np.exp(held))
         return replace(self, log_prob=log_prob)
 

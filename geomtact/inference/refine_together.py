@@ -30,12 +30,14 @@ from geomtact.sensing.moments import without_specks
 _SHAPE = (24, 32)  # of the casts that choose among many
 _CELLS, _DRAWS = 128, 16  # that are looked into, and poses drawn within each
 _PER_MODE = 5  # of these cells are searched for each mode that is asked for
+_HOPEFUL = 4  # of the poses tried for a cell, that are asked for by more than two sensors
 _KEPT = 3  # poses of a cell that are registered
 _ROUNDS, _AROUND = 3, 12  # of the last search, each in half the width of the one before
-_CHECKED = 8  # of the poses tried for each cell, whether they touch
+_CHECKED = 4  # of the poses tried for each cell, whether they touch
 # Shares of their mass that cells keep where a pose was found that explains all: those looked into, whatever is likely within
 # them, and all others, in which as good a one may lie. Chosen on scenes that the study does not judge (docs/several-sensors.md)
 _DOUBT, _ELSEWHERE = 0.03, 0.5
+_BEFORE = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
 # nats, for each sensor, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 _ALIKE, _UNLIKE = 3.0, 8.0
 _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
@@ -69,9 +71,16 @@ class View:
 
         A pose that does not touch, or is too deep, is the less likely the farther it is from doing so: a search finds its way.
         """
+        return self.likely(self.depths(T))
+
+    def depths(self, T: Array) -> NDArray[np.float32]:
+        """How far below the membrane the object lies (n, h, w) [m], coarsely."""
         space = self.refinery.space
-        sensor, shape = space.sensor, space.sensor.along(_SHAPE)
-        depths = space.caster.depths(sensor, self.T_sensor_first @ T, shape)
+        return space.caster.depths(space.sensor, self.T_sensor_first @ T, space.sensor.along(_SHAPE))
+
+    def likely(self, depths: NDArray[np.float32]) -> Array:
+        """As :meth:`log_likelihood`, from :meth:`depths`."""
+        sensor, shape = self.refinery.space.sensor, depths.shape[1:]
         deepest = depths.max((1, 2))
         if self.contact is None:
             return np.where(deepest > 0, _UNFELT, 0.0)
@@ -83,7 +92,7 @@ class View:
 def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: int) -> Posterior:
     """``posterior``, on the first sensor's cells, with its leading modes refined against all ``views`` and weighed anew.
 
-    As ``Refinery.refine`` does, each cell keeps the pose at which what is seen is likeliest, and what the cells hold together
+    As in ``Refinery.refine``, each cell keeps the pose at which what is seen is likeliest, and what the cells hold together
     is shared out anew by these likelihoods: but only as far as the likeliest pose explains what all sensors show, nearly as well
     as other poses do what each of them shows. If none does, the right one was not looked into.
     """
@@ -91,8 +100,7 @@ def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: i
     if not len(looked_into):
         return posterior
     index, search = posterior.index, _Search(posterior.index, views, np.random.default_rng(seed))
-    drawn = search.drawn(looked_into)
-    merit = search.log_likelihood(drawn)
+    drawn, merit = search.drawn(looked_into)
     within = merit.max(1)  # so likely is what is seen somewhere in each cell
     prior = posterior.cell_log_density(looked_into) + index.log_weight[looked_into]
     chosen = np.argsort(-(prior + TRUST * within), kind="stable")[: _PER_MODE * k]
@@ -109,7 +117,7 @@ def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: i
     unexplained = (search.most.sum() - merit.max(initial=-np.inf)) / len(views)
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
     doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, _ELSEWHERE))
-    posterior = posterior.shared_anew(judged, TRUST * likely, doubt, elsewhere)
+    posterior = posterior.shared_anew(judged, TRUST * likely, doubt, elsewhere, _BEFORE)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: len(chosen)]
     return replace(posterior, refined=search.told(home[leading], poses[leading]))
@@ -126,7 +134,8 @@ class _Search:
     def __init__(self, index: Index, views: Sequence[View], rng: np.random.Generator):
         self.index, self.views, self.rng = index, views, rng
         touching = [(view, view.contact) for view in views if view.contact is not None]
-        self.first = touching[0][0].refinery
+        self.base = touching[0][0]
+        self.first = self.base.refinery
         self.problem = Problem.joined(
             [make_problem(view.mask, view.refinery.space.sensor, contact.height) for view, contact in touching],
             np.stack([inverse(view.T_sensor_first) for view, _ in touching]),
@@ -135,19 +144,33 @@ class _Search:
         self.filterreg = FilterReg(self.first.surface, self.spread)
         self.most = np.full(len(views), -np.inf)
 
-    def log_likelihood(self, T: Array) -> Array:
-        """Log likelihood (...) of what all sensors show, with the object at ``T`` (..., 4, 4)."""
-        each = np.stack([view.log_likelihood(T.reshape(-1, 4, 4)) for view in self.views])
-        self.most = np.maximum(self.most, each.max(1))
-        return np.asarray(each.sum(0).reshape(T.shape[:-2]))
+    def log_likelihood(self, T: Array, first: Array | None = None) -> Array:
+        """Log likelihood (n, d) of what all sensors show, with the object at ``T`` (n, d, 4, 4); -inf where others of the d are
+        likelier for two sensors already. ``first`` (n, d) is the first sensor's, where it is known."""
+        n, d = T.shape[:2]
+        out, hopeful = np.zeros((n, d)), np.ones((n, d), bool)
+        for i, view in enumerate(self.views):
+            if i == 2 and d > _HOPEFUL:
+                hopeful = out.argsort(1).argsort(1) >= d - _HOPEFUL
+            each = view.log_likelihood(T[hopeful]) if i or first is None else first.ravel()
+            self.most[i] = max(self.most[i], each.max())
+            out[hopeful] += each
+        return np.where(hopeful, out, -np.inf)
 
-    def drawn(self, cells: NDArray[np.int64]) -> Array:
-        """The poses of ``cells`` (n,) and others within them (n, d, 4, 4), about as deep in the first sensor as the cells say."""
-        space = self.first.space
+    def drawn(self, cells: NDArray[np.int64]) -> tuple[Array, Array]:
+        """The poses of ``cells`` (n,) and others within them (n, d, 4, 4), about as deep in the first sensor that has contact as
+        the cells say; and how likely each is (n, d)."""
+        own, level = self.index.poses(cells), cells // self.index.places
+        wanted = np.asarray(self.index.resolution.penetrations)[level]
         T, depth = self.index.draw(np.repeat(cells, _DRAWS), self.rng)
-        deepest = space.caster.depths(space.sensor, T, space.sensor.along(_SHAPE)).max((1, 2))
-        T[:, 2, 3] += np.where(np.isfinite(deepest), deepest - depth, 0.0)
-        return np.concatenate([self.index.poses(cells)[:, None], T.reshape(len(cells), _DRAWS, 4, 4)], 1)
+        T = np.concatenate([own[:, None], T.reshape(len(cells), _DRAWS, 4, 4)], 1)
+        depth = np.concatenate([wanted[:, None], depth.reshape(len(cells), _DRAWS)], 1)
+        depths = self.base.depths(T.reshape(-1, 4, 4))
+        rise = depths.max((1, 2)) - depth.ravel()
+        rise[~np.isfinite(rise)] = 0
+        T[..., 2, 3] += rise.reshape(depth.shape)
+        known = self.base.likely(depths - rise[:, None, None].astype(np.float32)).reshape(depth.shape)
+        return T, self.log_likelihood(T, known if self.base is self.views[0] else None)
 
     def registered(self, T: Array, merit: Array) -> tuple[Array, Array]:
         """``T`` (n, d, 4, 4) and ``merit`` (n, d), and what registration makes of the best of each row."""

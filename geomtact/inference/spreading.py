@@ -121,7 +121,7 @@ class Spreading:
         return Mixture(found, out.reshape(-1)[found], before.uniform)
 
     def _touching(self, T_after_before: Array) -> NDArray[np.float32]:
-        return Carry(self.index, self.index, T_after_before).shares(np.arange(self.index.places))[1]
+        return Carry(self.index, self.index, T_after_before).shares()
 
     @cached_property
     def _standing(self) -> NDArray[np.float32]:
