@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from geomtact import Localizer, Mesh, load_mesh
 from geomtact.cli import app
-from geomtact.evaluation import study
+from geomtact.evaluation import known_approach, study
 from geomtact.evaluation.pose_error import add, add_s, coverage, mssd, normalised_add, random_add
 from geomtact.geometry.distance import PoseDistance
 from geomtact.se3 import exp, random_rotations, transform
@@ -216,3 +216,32 @@ def test_the_judging_solver_agrees_with_hertz_and_with_our_own():
     assert (mask ^ elastic_mask(ball, pitch)).sum() < 0.03 * mask.sum()
     punch = np.where(r2 < (4 * MM) ** 2, depth, -np.inf)
     assert (judge.tamaas_mask(punch, pitch) ^ (punch > 0)).sum() < 0.03 * (punch > 0).sum()
+
+
+def test_the_thesis_table_counts_what_refinement_brings_nearer():
+    rows = [[8.0, 4.0, 9.0, 3.0, 2.0, 1.0], [2.0, 3.0, 1.0, 2.0, 2.0, 2.0], [6.0, 6.0, 5.0, 6.0, 4.0, 5.0]]
+    figures = known_approach.summarise([known_approach.Outcome(0, True, row, 20.0) for row in rows])
+    assert figures["best"]["error_mm_quartiles"][1] == 6 and figures["best"]["normalised_median"] == 0.3
+    assert (figures["refined best"]["nearer"], figures["refined best"]["farther"]) == pytest.approx((1 / 3, 1 / 3))
+    assert figures["thesis's refinement of best"]["nearer"] == pytest.approx(2 / 3)
+    assert figures["refined best10"]["farther"] == pytest.approx(1 / 3)
+    assert "nearer" not in figures["answer"]
+
+
+def test_touches_of_a_known_side_are_judged_before_and_after_refinement(flat_nut, monkeypatch, tmp_path):
+    monkeypatch.setattr(Localizer, "prepare", classmethod(lambda cls, *args, **options: flat_nut))
+    out = tmp_path / "table.json"
+    args = ["evaluate", "thesis", "hex_nut", "--sides", "2", "--touches", "3", "--out", str(out)]
+    done = CliRunner().invoke(app, args)
+    assert done.exit_code == 0, done.output
+    part = json.loads(out.read_text("utf-8"))["parts"]["hex_nut"]
+    assert [o["side"] for o in part["outcomes"]] == [0, 0, 0, 1, 1, 1]
+    for outcome in part["outcomes"]:
+        best, _, _, answer, best10, refined10 = outcome["error_mm"]
+        # ten modes hold the first
+        assert best10 <= best + 1e-6 and refined10 <= answer + 1e-6
+        assert 0 < outcome["random_mm"] < 100
+    # a study that is whole is not made again
+    monkeypatch.setattr(Localizer, "prepare", None)
+    assert CliRunner().invoke(app, args).exit_code == 0
+    assert json.loads(out.read_text("utf-8"))["parts"]["hex_nut"] == part

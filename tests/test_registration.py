@@ -299,7 +299,7 @@ def test_open3d_repeats_itself_to_the_last_digit(pin, a_touch):
     mask = pin.localize(a_touch(pin)[1], effort="fast").observation.contact.mask
     problem = make_problem(mask, pin.sensor)
     starts = pin.index.poses(pin.localize(a_touch(pin)[1], effort="fast").leading_cells(3))
-    icp = next(r for r in pin._refinery._refiners(pin.index, True) if r.name == "icp")
+    icp = next(r for r in pin.refinery._refiners(pin.index, True) if r.name == "icp")
     first = icp.refine(problem, starts).T
     assert all((first == icp.refine(problem, starts).T).all() for _ in range(15))
 

@@ -7,7 +7,6 @@ python tools/make_meshes.py --check   # compare with what is there, byte for byt
 from __future__ import annotations
 
 import argparse
-import hashlib
 import itertools
 import sys
 import tempfile
@@ -16,10 +15,11 @@ from pathlib import Path
 
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
-from scipy.spatial.transform import Rotation
 
 from geomtact.geometry.mesh import load_mesh
-from geomtact.geometry.symmetry import Symmetry, group_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from meshprep.adding import catalogue_entry
 
 FOLDER = Path(__file__).resolve().parents[1] / "meshes"
 FINE = 128  # sides of a large circle: 6 micrometres from round at 20 mm radius
@@ -336,44 +336,6 @@ def stl_bytes(solid: Manifold) -> bytes:
     return b"geomtact part, millimetres".ljust(80) + np.uint32(len(faces)).tobytes() + record.tobytes()
 
 
-def generators(symmetry: Symmetry) -> list[tuple[np.ndarray, int]]:
-    """Few (axis, order) that generate the symmetry's elements, highest orders first."""
-    rotvecs = Rotation.from_matrix(symmetry.elements[1:, :3, :3]).as_rotvec()
-    chosen: list[tuple[np.ndarray, int]] = []
-    size = 1
-    for vector in sorted(
-        rotvecs, key=lambda v: (round(float(np.linalg.norm(v)), 6), *np.round(-np.abs(v), 6), *np.round(-v, 6))
-    ):
-        angle = float(np.linalg.norm(vector))
-        trial = [*chosen, (np.round(vector / angle, 9) + 0.0, round(2 * np.pi / angle))]
-        larger = len(group_of([2 * np.pi / n * a for a, n in trial], symmetry.centre))
-        if larger > size:
-            chosen, size = trial, larger
-    return chosen
-
-
-def catalogue_entry(name: str, description: str, content: bytes, symmetry: Symmetry) -> str:
-    def numbers(values: np.ndarray) -> str:
-        return "[" + ", ".join(f"{v + 0.0:.9g}" for v in values) + "]"
-
-    lines = [
-        f"[{name}]",
-        f'file = "{name}.stl"',
-        'unit = "mm"',
-        f'sha256 = "{hashlib.sha256(content).hexdigest()}"',
-        'licence = "MIT"',
-        f'description = "{description}"',
-        f"[{name}.symmetry]",
-        f'kind = "{symmetry.kind}"',
-        f"centre_mm = {numbers(np.round(1e3 * symmetry.centre, 4))}",
-    ]
-    if symmetry.axis is not None:
-        lines.append(f"axis = {numbers(np.round(symmetry.axis, 5))}")
-    turns = ", ".join(f"{{axis = {numbers(np.round(a, 5))}, order = {n}}}" for a, n in generators(symmetry))
-    lines.append(f"turns = [{turns}]")
-    return "\n".join(lines) + "\n"
-
-
 def make(names: list[str]) -> dict[str, bytes]:
     """Contents by file name."""
     files: dict[str, bytes] = {}
@@ -389,7 +351,7 @@ def make(names: list[str]) -> dict[str, bytes]:
             mesh = load_mesh(path, "mm").with_symmetry()
             assert mesh.symmetry is not None
             files[path.name] = content
-            catalogue += "\n" + catalogue_entry(name, description, content, mesh.symmetry)
+            catalogue += "\n" + catalogue_entry(path, "mm", "MIT", description, mesh.symmetry)
             size = 1e3 * np.ptp(mesh.vertices, axis=0)
             print(
                 f"{name:15s} {len(mesh.faces):6d} faces  {size[0]:5.1f} x {size[1]:5.1f} x {size[2]:5.1f} mm  "

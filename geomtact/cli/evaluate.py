@@ -17,6 +17,7 @@ from geomtact.cli.evaluate_kitting import judge_kitting
 from geomtact.cli.evaluate_next_touch import judge_next_touch
 from geomtact.cli.evaluate_registration import judge_registration
 from geomtact.cli.evaluate_scores import judge_scores
+from geomtact.cli.evaluate_thesis import judge_thesis_table
 from geomtact.cli.evaluate_touches import judge_touches
 from geomtact.cli.evaluate_track import judge_track
 from geomtact.cli.evaluate_triplets import judge_triplets
@@ -165,6 +166,7 @@ evaluate.command("samples")(one_line_errors(judge_samples))
 evaluate.command("localize")(one_line_errors(judge_localize))
 evaluate.command("scores")(one_line_errors(judge_scores))
 evaluate.command("registration")(one_line_errors(judge_registration))
+evaluate.command("thesis")(one_line_errors(judge_thesis_table))
 evaluate.command("touches")(one_line_errors(judge_touches))
 evaluate.command("triplets")(one_line_errors(judge_triplets))
 evaluate.command("track")(one_line_errors(judge_track))

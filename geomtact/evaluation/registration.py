@@ -231,7 +231,7 @@ def own_methods(space: ContactSpace, surface: Surface, spread: Spread) -> dict[s
         "icp": icp,
         "filterreg": filterreg,
         "both": both,
-        "thesis": _thesis(space, spread),
+        "thesis": thesis_refinement(space, spread),
     }
 
 
@@ -243,7 +243,7 @@ def _method(refiner: Refiner) -> Method:
     return refine
 
 
-def _thesis(space: ContactSpace, spread: Spread) -> Method:
+def thesis_refinement(space: ContactSpace, spread: Spread) -> Method:
     """The thesis's refinement (6.3): FilterReg from the points of the simulated local shape to those of the sensed one."""
 
     def refine(seen: Seen, start: Array) -> End:

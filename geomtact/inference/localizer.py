@@ -161,26 +161,26 @@ class Localizer:
         if len(backgrounds) != len(images):
             raise UsageError(f"localize: expected one background, or {len(images)}, got {len(backgrounds)}")
         if len(images) == 1:
-            touch = self._touch(images[0], kind, backgrounds[0], T_frame_sensor[0], frame, prior, effort, seed)
+            touch = self.touch(images[0], kind, backgrounds[0], T_frame_sensor[0], frame, prior, effort, seed)
             if not touch.contact:
                 return touch
             with _timed(touch.timing_ms, "refine"):
                 contact = touch.observation.contact
-                return self._refinery.refine(touch, contact, EFFORTS[effort].modes, EFFORTS[effort].thorough)
+                return self.refinery.refine(touch, contact, EFFORTS[effort].modes, EFFORTS[effort].thorough)
         localizers = (self, *self.others) if self.others else (self,) * len(images)
         if len(localizers) != len(images):
             raise UsageError(
                 f"localize: prepared for {len(localizers)} sensors, got {len(images)} images; give one for each"
             )
         touches = [
-            each._touch(shown, kind, empty, T, frame, None, effort, seed)
+            each.touch(shown, kind, empty, T, frame, None, effort, seed)
             for each, shown, empty, T in zip(localizers, images, backgrounds, T_frame_sensor, strict=True)
         ]
         return fused_posterior(
-            touches, [each._refinery for each in localizers], prior, EFFORTS[effort].modes, rig, self.cache_dir
+            touches, [each.refinery for each in localizers], prior, EFFORTS[effort].modes, rig, self.cache_dir
         )
 
-    def _touch(
+    def touch(
         self,
         image: Any,
         kind: str,
@@ -191,7 +191,7 @@ class Localizer:
         effort: str,
         seed: int,
     ) -> Posterior:
-        """What one sensor tells, not refined."""
+        """What one sensor at ``T_frame_sensor`` (4, 4) tells, not refined; the rest as in :meth:`localize`."""
         timing: dict[str, float] = {}
         settings = self._settings(effort, seed)
         with _timed(timing, "read"):
@@ -262,7 +262,7 @@ class Localizer:
         return ContactSpace(self.mesh, self.sensor, self.index.approach)
 
     @cached_property
-    def _refinery(self) -> Refinery:
+    def refinery(self) -> Refinery:
         return Refinery(self.space)
 
     def _settings(self, effort: str, seed: int) -> dict[str, Any]:

@@ -1,0 +1,102 @@
+"""The thesis's Table 1: one touch from a side that is known, anywhere on the part, turned in any way about the normal (7.1).
+
+A robot that lowers a part onto the sensor knows which way it came. The errors of the most probable pose and of the best of
+ten are given before and after refinement: by this project, and by the thesis's own way of refining.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from geomtact.contact_space.space import ContactSpace
+from geomtact.evaluation.registration import Seen, thesis_refinement
+from geomtact.evaluation.study import MODES, expected_random_add
+from geomtact.evaluation.touches import Touch, random_touches
+from geomtact.geometry.approach import Approach, approach_of
+from geomtact.geometry.distance import PoseDistance
+from geomtact.geometry.mesh import Mesh
+from geomtact.inference.localizer import Localizer
+from geomtact.registration.observability import Spread
+from geomtact.registration.rim import make_problem
+from geomtact.se3 import Array
+from geomtact.sensing.moments import without_specks
+from geomtact.sensing.noise import Noise
+from geomtact.sensing.sensor import Sensor
+
+ROWS = ("best", "refined best", "thesis's refinement of best", "answer", "best10", "refined best10")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Errors after one touch: ADD modulo symmetry [mm], and over what two random poses of the contact pose space differ by.
+
+    Attributes
+    ----------
+    side : number of the side that is touched
+    error_mm : of each of ``ROWS``: the most probable mode of the grid, the same pose refined, refined as in the thesis, the
+        first mode after all were refined and weighed anew, and the best of ten modes before and after refinement
+    random_mm : expected ADD of a random guess, touching from that side
+    """
+
+    side: int
+    elastic: bool
+    error_mm: list[float]
+    random_mm: float
+
+
+def draw_sides(mesh: Mesh, sensor: Sensor, n: int, seed: int) -> list[Approach]:
+    """Approaches of ``n`` touches drawn by the uniform measure of the contact pose space."""
+    T, _ = ContactSpace(mesh, sensor).sample(n, np.random.default_rng([seed, 41]))
+    return [[(direction, 0.0)] for direction in approach_of(T[:, :3, :3])]
+
+
+def judge_side(
+    localizer: Localizer, side: int, n: int, seed: int, noise: Noise, effort: str, elastic: bool | None
+) -> Iterator[Outcome]:
+    """``n`` touches of a part whose approach ``localizer`` knows; ``elastic`` as in ``touches.random_touches``."""
+    distance, random_mm = PoseDistance(localizer.mesh), expected_random_add(localizer)
+    for touch in random_touches(localizer, n, seed * 1000 + side, elastic, noise):
+        errors = [
+            1e3 * float(distance.mean(touch.T_sensor_object, T).min()) for T in _answers(localizer, touch, effort)
+        ]
+        yield Outcome(side, touch.elastic, errors, random_mm)
+
+
+def _answers(localizer: Localizer, touch: Touch, effort: str) -> list[Array]:
+    """The poses (k, 4, 4) that each of ``ROWS`` names."""
+    index, sensor = localizer.index, localizer.sensor
+    grid = localizer.touch(touch.mask, "mask", None, np.eye(4), "sensor", None, effort, 0)
+    refined = localizer.refinery.refine(grid, grid.observation.contact, MODES)
+    before, after = (np.stack([mode.T for mode in posterior.modes(MODES)]) for posterior in (grid, refined))
+    first = grid.leading_cells(1)
+    best = index.poses(first)
+    ours = refined.refined[int(first[0])].T[None]
+    mask = without_specks(touch.mask, sensor.pixel_area(touch.mask.shape))
+    spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
+    theirs = thesis_refinement(localizer.space, spread)(Seen(mask, make_problem(mask, sensor, None)), best[0]).T[None]
+    return [best, ours, theirs, after[:1], before, after]
+
+
+def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """For each of ``ROWS`` the median error [mm] with its quartiles, the median normalised error, and how many touches it brings
+    nearer than the pose it started from."""
+    error = np.array([o.error_mm for o in outcomes])
+    normalised = error / np.array([[o.random_mm] for o in outcomes])
+    start = {"refined best": "best", "thesis's refinement of best": "best", "refined best10": "best10"}
+    out = {}
+    for i, row in enumerate(ROWS):
+        figures: dict[str, Any] = {
+            "n": len(error),
+            "error_mm_quartiles": [float(q) for q in np.quantile(error[:, i], [0.25, 0.5, 0.75])],
+            "normalised_median": float(np.median(normalised[:, i])),
+        }
+        if row in start:
+            before = error[:, ROWS.index(start[row])]
+            figures["nearer"] = float((error[:, i] < before - 1e-9).mean())
+            figures["farther"] = float((error[:, i] > before + 1e-9).mean())
+        out[row] = figures
+    return out

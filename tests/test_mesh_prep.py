@@ -1,0 +1,377 @@
+"""Mesh preparation: what is sound stays to the last bit, what is spoilt comes back, and what moves is measured and refused."""
+
+import json
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from typer import Typer
+from typer.testing import CliRunner
+
+from geomtact import Sensor, load_mesh, se3
+from geomtact.geometry import catalogue as catalogues
+from geomtact.geometry import mesh as meshes
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tools"))
+
+import prep_mesh  # noqa: E402
+from meshprep import Refused  # noqa: E402
+from meshprep.adding import add  # noqa: E402
+from meshprep.proof import distances, prove  # noqa: E402
+from meshprep.reading import read  # noqa: E402
+from meshprep.repair import STEPS, Options, repair  # noqa: E402
+from meshprep.surface import Surface  # noqa: E402
+from meshprep.writing import write_ply  # noqa: E402
+
+BOX = trimesh.creation.box((10.0, 8.0, 6.0))
+
+
+def options(surface, **other):
+    given = {
+        "skip": frozenset(),
+        "merge": 1e-6 * surface.size,
+        "max_hole": 3.0,
+        "max_faces": 200_000,
+        "max_error": 0.025,
+    }
+    return Options(**(given | other))
+
+
+def as_surface(mesh):
+    return Surface(np.array(mesh.vertices, float), np.array(mesh.faces, np.int64))
+
+
+def sound(surface, folder):
+    """The file of a surface, which trimesh and geomtact find closed."""
+    path = folder / "mesh.ply"
+    write_ply(path, surface)
+    mesh = trimesh.load_mesh(path)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.is_volume and mesh.volume > 0
+    return load_mesh(path, "mm")
+
+
+@pytest.fixture(scope="module")
+def command():
+    app = Typer()
+    app.command()(prep_mesh.main)
+    return lambda *args: CliRunner().invoke(app, [str(arg) for arg in args])
+
+
+@pytest.mark.parametrize("name", ["bracket", "gear", "pin"])
+def test_a_sound_part_is_kept_to_the_last_bit(name, tmp_path):
+    before, unit = read(ROOT / "meshes" / f"{name}.stl", "mm", Sensor.load("gelslim"))
+    work = repair(before, options(before))
+    assert unit == "mm" and not work.changes and not work.holes
+    proof = prove(before, work)
+    assert (proof.new, proof.largest, proof.buried) == (0, pytest.approx(0, abs=1e-6 * before.size), 0)
+    assert sound(work.surface, tmp_path).sha256 == load_mesh(name).sha256
+
+
+@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    turned=st.floats(0.01, 0.5),
+    repeated=st.floats(0.0, 0.3),
+    name=st.sampled_from(["hex_nut", "bracket"]),
+    scale=st.floats(0.2, 5.0),
+)
+def test_shuffled_repeated_turned_and_torn_apart_it_comes_back(seed, turned, repeated, name, scale, tmp_path):
+    """Whatever its pose and size, with its faces in any order, some stored twice or inside out, each with corners of its own."""
+    rng = np.random.default_rng(seed)
+    part = load_mesh(name)
+    T = se3.transform(se3.random_rotations(1, rng)[0], rng.uniform(-50, 50, 3))
+    vertices = se3.apply(T, 1e3 * scale * part.vertices).astype(np.float32).astype(float)
+    path = tmp_path / "sound.ply"
+    write_ply(path, Surface(vertices, part.faces.astype(np.int64)))
+    faces = rng.permutation(part.faces.astype(np.int64))
+    faces = np.concatenate([faces, faces[rng.random(len(faces)) < repeated]])
+    flip = rng.random(len(faces)) < turned
+    faces[flip] = faces[flip][:, ::-1]
+    soup = Surface(vertices[faces.ravel()], np.arange(3 * len(faces)).reshape(-1, 3))
+    work = repair(soup, options(soup))
+    assert sound(work.surface, tmp_path).sha256 == load_mesh(path, "mm").sha256
+
+
+def test_a_hole_is_filled_and_told_or_refused_where_it_is():
+    ball = trimesh.creation.icosphere(4, 10.0)
+    gone = np.linalg.norm(ball.triangles_center - [0, 0, 10.0], axis=1) < 0.9
+    holed = as_surface(ball).with_faces(as_surface(ball).faces[~gone]).tidied()
+    work = repair(holed, options(holed))
+    (hole,) = work.holes
+    assert 2 < hole.span < 3 and 0.4 < hole.area / (np.pi / 4 * hole.span**2) < 1
+    np.testing.assert_allclose(hole.middle, [0, 0, 9.9], atol=0.2)
+    assert not work.surface.open_edges and work.surface.volume == pytest.approx(ball.volume, rel=1e-3)
+    # what fills the hole is not held against the surface
+    assert prove(holed, work).largest < 1e-6
+    with pytest.raises(Refused, match=r"a hole 2\..* across at \(.*, 9\..*\), of 1, is wider than 1; close it in CAD"):
+        repair(holed, options(holed, max_hole=1.0))
+    skipped = repair(holed, options(holed, skip=frozenset(["holes"])))
+    assert skipped.surface.open_edges and not skipped.holes
+
+
+def test_sides_of_a_seam_that_are_cut_up_differently_meet(tmp_path):
+    """A box whose lid has its edges divided, and whose walls do not."""
+    lid = BOX.triangles_center[:, 2] > 2.9
+    finer = BOX.submesh([np.flatnonzero(lid)], append=True).subdivide().subdivide()
+    rest = BOX.submesh([np.flatnonzero(~lid)], append=True)
+    torn = as_surface(trimesh.util.concatenate([finer, rest]))
+    work = repair(torn, options(torn))
+    assert "seams" in work.changes and not work.holes
+    assert prove(torn, work).largest < 1e-6 * torn.size
+    sound(work.surface, tmp_path)
+    assert work.surface.volume == pytest.approx(480)
+
+
+def test_boxes_that_share_an_edge_stay_apart_in_any_file(tmp_path):
+    other = BOX.copy()
+    other.apply_translation([10.0, 8.0, 0.0])
+    both = as_surface(trimesh.util.concatenate([BOX, other]))
+    work = repair(both, options(both))
+    assert {"cut", "apart"} <= set(work.changes)
+    assert 0 < prove(both, work).largest < 1e-4
+    assert sound(work.surface, tmp_path)
+    assert work.surface.volume == pytest.approx(960, rel=1e-4)
+
+
+def test_bodies_that_overlap_become_their_union(tmp_path):
+    other = BOX.copy()
+    other.apply_translation([5.0, 4.0, 3.0])
+    both = as_surface(trimesh.util.concatenate([BOX, other]))
+    work = repair(both, options(both))
+    assert "intersections" in work.changes
+    assert work.surface.volume == pytest.approx(2 * 480 - 5 * 4 * 3, rel=1e-6)
+    proof = prove(both, work)
+    # what lay inside is no deviation, for nobody can touch it
+    assert proof.largest < 1e-5 * both.size and 0.1 < proof.buried < 0.3
+    sound(work.surface, tmp_path)
+
+
+def test_a_sheet_of_no_thickness_goes_and_a_cavity_stays(tmp_path):
+    cavity = trimesh.creation.box((2.0, 2.0, 2.0))
+    cavity.invert()
+    hollow = trimesh.util.concatenate([BOX, cavity])
+    vertices = np.concatenate([hollow.vertices, [[5.0, 4.0, 12.0]]])
+    corner = [int(np.flatnonzero((hollow.vertices == c).all(1))[0]) for c in ([5, 4, 3], [5, -4, 3])]
+    flap = [[*corner, len(vertices) - 1], [*corner[::-1], len(vertices) - 1]]
+    spoilt = Surface(np.array(vertices), np.concatenate([hollow.faces, flap]).astype(np.int64))
+    work = repair(spoilt, options(spoilt))
+    assert work.surface.volume == pytest.approx(480 - 8) and len(work.surface.volumes) == 2
+    sound(work.surface, tmp_path)
+
+
+def test_the_largest_body_alone_and_specks():
+    speck = trimesh.creation.box((1e-3, 1e-3, 1e-3))
+    speck.apply_translation([20, 0, 0])
+    small = trimesh.creation.box((2.0, 2.0, 2.0))
+    small.apply_translation([-20, 0, 0])
+    three = as_surface(trimesh.util.concatenate([BOX, speck, small]))
+    work = repair(three, options(three))
+    assert work.surface.volume == pytest.approx(488) and work.changes["bodies"] == "1 of 3 bodies dropped"
+    assert repair(three, options(three, largest=True)).surface.volume == pytest.approx(480)
+    assert prove(three, work).largest < 1e-6 * three.size
+
+
+def test_a_mesh_of_too_many_faces_is_made_coarser_within_the_bound():
+    ball = as_surface(trimesh.creation.icosphere(5, 10.0))
+    work = repair(ball, options(ball, max_faces=6000, max_error=0.02))
+    assert len(work.surface.faces) < len(ball.faces) and not work.surface.open_edges
+    assert max(distances(ball, work.surface).max(), distances(work.surface, ball).max()) <= 0.02
+    # what would move it farther is not done
+    assert len(repair(ball, options(ball, max_faces=100, max_error=1e-6)).surface.faces) == len(ball.faces)
+
+
+def test_a_surface_that_moved_is_measured_both_ways():
+    from meshprep.repair import Work
+
+    box = as_surface(BOX)
+    moved = Surface(box.vertices + [0.0, 0.0, 0.3], box.faces)
+    proof = prove(box, Work(moved))
+    assert proof.to_input[0] == pytest.approx(0.3, abs=1e-6)
+    # the lid of the original now lies inside, its floor and walls do not
+    assert proof.to_output[0] == pytest.approx(0.3, abs=1e-6) and abs(proof.worst[2]) >= 3 - 1e-6
+    assert proof.new == len(box.vertices)
+
+
+def test_steps_can_be_left_out(command, tmp_path):
+    path = tmp_path / "box.stl"
+    BOX.export(path)
+    done = command(path, "--unit", "mm", "--out", tmp_path / "out", *(x for s in STEPS for x in ("--skip", s)))
+    assert done.exit_code == 0, done.output
+    told = json.loads((tmp_path / "out" / "box.json").read_text("utf-8"))
+    assert told["outcome"] == "clean" and told["options"]["skip"] == sorted(STEPS)
+    wrong = command(path, "--unit", "mm", "--skip", "mend")
+    assert wrong.exit_code == 2 and "no step named mend" in wrong.output
+
+
+def test_the_same_part_in_any_format_and_unit_is_the_same(tmp_path):
+    sensor, solid = Sensor.load("gelslim"), trimesh.creation.icosahedron()
+    found = {}
+    for file, scale in {"mm.stl": 10.0, "metre.glb": 0.01, "inch.obj": 10 / 25.4}.items():
+        trimesh.Trimesh(scale * solid.vertices, solid.faces, process=False).export(tmp_path / file)
+    (tmp_path / "part.step").write_text(step_of(10 * solid.vertices, solid.faces))
+    for file in ("mm.stl", "metre.glb", "inch.obj", "part.step"):
+        unit = {"mm": "mm", "inch": "inch"}.get(file.split(".")[0])
+        surface, own = read(tmp_path / file, unit, sensor)
+        work = repair(surface, options(surface))
+        found[file] = Surface(1e3 * meshes.UNITS[own] * work.surface.vertices, work.surface.faces)
+    for other in found.values():
+        assert not other.open_edges
+        assert max(distances(found["mm.stl"], other).max(), distances(other, found["mm.stl"]).max()) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "unit", "words"),
+    [
+        ("a.stl", b"", "mm", "the file is empty"),
+        ("a.txt", b"x", "mm", "not a mesh format known here"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "mm", "only points or lines|found nothing"),
+        ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "NaN"),
+        ("a.obj", b"v 0 0 3e38\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "beyond 1e9"),
+        ("a.ply", b"ply\nformat", "mm", "cannot be read as .ply"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", None, "do not say their unit; give --unit"),
+        ("a.obj", b"v 0 0 0\nv 10 0 0\nv 0 10 0\nf 1 2 3\n", "auto", "likely: 14.1 mm across in mm.*Give --unit"),
+    ],
+)
+def test_what_cannot_be_read_is_said(name, content, unit, words, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(Refused, match=words):
+        read(tmp_path / name, unit, Sensor.load("gelslim"))
+
+
+def test_a_unit_that_contradicts_the_file_is_refused(tmp_path):
+    BOX.export(tmp_path / "box.glb")
+    with pytest.raises(Refused, match="the file says m, but --unit mm was given"):
+        read(tmp_path / "box.glb", "mm", Sensor.load("gelslim"))
+    with pytest.raises(Refused, match="no such file"):
+        read(tmp_path / "none.stl", "mm", Sensor.load("gelslim"))
+
+
+def test_a_folder_gets_a_table_and_what_is_refused_leaves_nothing(command, tmp_path):
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    BOX.export(folder / "box.stl")
+    open_box = BOX.submesh([np.arange(10)], append=True)
+    open_box.export(folder / "open.stl")
+    done = command(folder, "--unit", "mm", "--out", out, "--json")
+    assert done.exit_code == 0, done.output
+    results = {r["name"]: r for r in json.loads(done.stdout)["meshes"]}
+    assert (results["box"]["outcome"], results["open"]["outcome"]) == ("clean", "refused")
+    assert "is wider than 5" in results["open"]["reason"] or "wider than" in results["open"]["reason"]
+    assert results["box"]["volume_mm3"]["after"] == pytest.approx(480)
+    assert (results["box"]["symmetry"]["kind"], results["box"]["symmetry"]["order"]) == ("discrete", 4)
+    assert sorted(p.name for p in out.iterdir()) == ["box.json", "box.ply", "box.png"]
+
+
+def test_a_mesh_that_takes_too_long_is_given_up(command, tmp_path, monkeypatch):
+    BOX.export(tmp_path / "box.stl")
+    monkeypatch.setattr(prep_mesh, "SECONDS", 0.05)
+    done = command(tmp_path / "box.stl", "--unit", "mm", "--out", tmp_path / "out")
+    assert done.exit_code == 3 and "takes more than" in done.output
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_part_of_a_catalogue_goes_by_its_name(command, tmp_path, monkeypatch):
+    BOX.export(tmp_path / "crate.stl")
+    folder = tmp_path / "parts"
+    done = command(tmp_path / "crate.stl", "--unit", "mm", "--out", tmp_path / "out", "--add-to", folder)
+    assert done.exit_code == 0, done.output
+    monkeypatch.setattr(catalogues, "meshes_folder", lambda: folder)
+    catalogues.catalogue.cache_clear()
+    try:
+        assert list(catalogues.catalogue()) == ["crate"]
+        entry = (folder / "catalogue.toml").read_text("utf-8")
+        # added again it takes its own place; beside others it takes none of theirs
+        symmetry = load_mesh("crate").symmetry
+        for _ in range(2):
+            add(tmp_path / "out" / "crate.ply", "mm", "unknown", "made of crate", symmetry, folder)
+        assert (folder / "catalogue.toml").read_text("utf-8") == entry
+        (folder / "catalogue.toml").write_text(entry + "\n" + entry.replace("crate", "other"), "utf-8")
+        add(tmp_path / "out" / "crate.ply", "mm", "MIT", "a crate", symmetry, folder)
+        both = tomllib.loads((folder / "catalogue.toml").read_text("utf-8"))
+        assert (both["crate"]["licence"], both["other"]["licence"]) == ("MIT", "unknown")
+        part = load_mesh("crate")
+        assert part.unit == "mm" and len(part.symmetry.elements) == 4
+        np.testing.assert_allclose(part.vertices.max(0), [5e-3, 4e-3, 3e-3], atol=1e-9)
+    finally:
+        monkeypatch.undo()
+        catalogues.catalogue.cache_clear()
+
+
+def test_real_nuts_and_gear_become_solids_where_they_were(data_folder, tmp_path):
+    for file in ("factory_nut_m16_tight_subdiv_3x", "factory_gear_small_space_5e-4"):
+        before, _ = read(data_folder / "meshes_factory_nist" / f"{file}.obj", "m", Sensor.load("gelslim"))
+        work = repair(before, options(before, max_hole=5e-3, max_error=2.5e-5))
+        assert prove(before, work).largest < 5e-5 and not work.holes
+        write_ply(tmp_path / "part.ply", work.surface)
+        assert trimesh.load_mesh(tmp_path / "part.ply").is_volume
+        mesh = load_mesh(tmp_path / "part.ply", "m")
+        if "nut" in file:  # the thread is a helix: six-fold only to within its pitch
+            # 60 degrees move it by 0.30 mm, 180 by 0.87; it can be turned over to within a micrometre
+            symmetry = mesh.with_symmetry(5e-5).symmetry
+            assert symmetry.kind == "discrete" and len(symmetry.elements) == 2
+
+
+def step_of(vertices, faces):
+    """A STEP file (AP214) of a faceted solid in millimetres."""
+    lines = [
+        "#1=APPLICATION_CONTEXT('automotive design');",
+        "#2=PRODUCT_CONTEXT('',#1,'mechanical');",
+        "#3=PRODUCT('part','part','',(#2));",
+        "#4=PRODUCT_DEFINITION_FORMATION('','',#3);",
+        "#5=PRODUCT_DEFINITION_CONTEXT('part definition',#1,'design');",
+        "#6=PRODUCT_DEFINITION('design','',#4,#5);",
+        "#7=PRODUCT_DEFINITION_SHAPE('','',#6);",
+        "#8=(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.MILLI.,.METRE.));",
+        "#9=(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.));",
+        "#10=(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT());",
+        "#11=UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-6),#8,'distance_accuracy_value','');",
+        "#12=(GEOMETRIC_REPRESENTATION_CONTEXT(3)GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT((#11))"
+        "GLOBAL_UNIT_ASSIGNED_CONTEXT((#8,#9,#10))REPRESENTATION_CONTEXT('',''));",
+    ]
+    number = iter(range(100, 10**6))
+
+    def line(text):
+        n = next(number)
+        lines.append(f"#{n}={text};")
+        return f"#{n}"
+
+    def point(v):
+        return line(f"CARTESIAN_POINT('',({v[0]:.12E},{v[1]:.12E},{v[2]:.12E}))")
+
+    def direction(v):
+        v = v / np.linalg.norm(v)
+        return line(f"DIRECTION('',({v[0]:.12E},{v[1]:.12E},{v[2]:.12E}))")
+
+    points = [point(v) for v in vertices]
+    corners = [line(f"VERTEX_POINT('',{p})") for p in points]
+    edges, shell = {}, []
+    for face in faces.tolist():
+        walked = []
+        for a, b in zip(face, [*face[1:], face[0]], strict=True):
+            low, high = min(a, b), max(a, b)
+            if (low, high) not in edges:
+                along = line(f"VECTOR('',{direction(vertices[high] - vertices[low])},1.)")
+                straight = line(f"LINE('',{points[low]},{along})")
+                edges[low, high] = line(f"EDGE_CURVE('',{corners[low]},{corners[high]},{straight},.T.)")
+            walked.append(line(f"ORIENTED_EDGE('',*,*,{edges[low, high]},.{'T' if a == low else 'F'}.)"))
+        loop = line(f"EDGE_LOOP('',({','.join(walked)}))")
+        bound = line(f"FACE_OUTER_BOUND('',{loop},.T.)")
+        a, b, c = vertices[face]
+        placed = line(
+            f"AXIS2_PLACEMENT_3D('',{points[face[0]]},{direction(np.cross(b - a, c - a))},{direction(b - a)})"
+        )
+        plane = line(f"PLANE('',{placed})")
+        shell.append(line(f"ADVANCED_FACE('',({bound}),{plane},.T.)"))
+    closed = line(f"CLOSED_SHELL('',({','.join(shell)}))")
+    solid = line(f"MANIFOLD_SOLID_BREP('part',{closed})")
+    shape = line(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',({solid}),#12)")
+    line(f"SHAPE_DEFINITION_REPRESENTATION(#7,{shape})")
+    head = "ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION((''),'2;1');\nFILE_NAME('part','',(''),(''),'','','');\n"
+    schema = "FILE_SCHEMA(('AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }'));\nENDSEC;\nDATA;\n"
+    return head + schema + "\n".join(lines) + "\nENDSEC;\nEND-ISO-10303-21;\n"

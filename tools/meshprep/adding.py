@@ -1,0 +1,79 @@
+"""A part's entry in a catalogue, by which its name serves wherever a mesh path does."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geomtact.files import write_whole
+from geomtact.geometry.symmetry import Symmetry, group_of
+from meshprep import Refused
+
+
+def add(path: Path, unit: str, licence: str, description: str, symmetry: Symmetry, folder: Path) -> None:
+    """Copy the mesh into ``folder`` and write its entry into the catalogue there, in the place of one of the same name.
+
+    Raises
+    ------
+    Refused
+        The name cannot be one of a part, or another part has it.
+    """
+    name, catalogue = path.stem, folder / "catalogue.toml"
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        raise Refused(f"{name!r} cannot be a part's name: letters, digits, - and _ alone; rename the file")
+    text = catalogue.read_text("utf-8") if catalogue.is_file() else ""
+    entries = tomllib.loads(text)
+    if name in entries and entries[name]["file"] != path.name:
+        raise Refused(f"{catalogue}: another part is named {name} ({entries[name]['file']}); rename the file")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / path.name, lambda target: shutil.copyfile(path, target))
+    kept = re.sub(rf"(?ms)^\[{re.escape(name)}\]\n.*?(?=^\[(?!{re.escape(name)}\.)|\Z)", "", text).rstrip("\n")
+    entry = catalogue_entry(path, unit, licence, description, symmetry)
+    write_whole(catalogue, lambda target: target.write_text(f"{kept}\n\n{entry}".lstrip("\n"), "utf-8"))
+
+
+def catalogue_entry(path: Path, unit: str, licence: str, description: str, symmetry: Symmetry) -> str:
+    """The TOML table of the part in a file."""
+
+    def numbers(values: np.ndarray) -> str:
+        return "[" + ", ".join(f"{v + 0.0:.9g}" for v in values) + "]"
+
+    lines = [
+        f"[{path.stem}]",
+        f'file = "{path.name}"',
+        f'unit = "{unit}"',
+        f'sha256 = "{hashlib.sha256(path.read_bytes()).hexdigest()}"',
+        f"licence = {json.dumps(licence, ensure_ascii=False)}",
+        f"description = {json.dumps(description, ensure_ascii=False)}",
+        f"[{path.stem}.symmetry]",
+        f'kind = "{symmetry.kind}"',
+        f"centre_mm = {numbers(np.round(1e3 * symmetry.centre, 4))}",
+    ]
+    if symmetry.axis is not None:
+        lines.append(f"axis = {numbers(np.round(symmetry.axis, 5))}")
+    turns = ", ".join(f"{{axis = {numbers(np.round(a, 5))}, order = {n}}}" for a, n in generators(symmetry))
+    lines.append(f"turns = [{turns}]")
+    return "\n".join(lines) + "\n"
+
+
+def generators(symmetry: Symmetry) -> list[tuple[np.ndarray, int]]:
+    """Few (axis, order) that generate the symmetry's elements, highest orders first."""
+    rotvecs = Rotation.from_matrix(symmetry.elements[1:, :3, :3]).as_rotvec()
+    chosen: list[tuple[np.ndarray, int]] = []
+    size = 1
+    for vector in sorted(
+        rotvecs, key=lambda v: (round(float(np.linalg.norm(v)), 6), *np.round(-np.abs(v), 6), *np.round(-v, 6))
+    ):
+        angle = float(np.linalg.norm(vector))
+        trial = [*chosen, (np.round(vector / angle, 9) + 0.0, round(2 * np.pi / angle))]
+        larger = len(group_of([2 * np.pi / n * a for a, n in trial], symmetry.centre))
+        if larger > size:
+            chosen, size = trial, larger
+    return chosen

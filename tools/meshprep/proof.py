@@ -1,0 +1,138 @@
+"""What a repair did to the surface, measured: how far each lies from the other, what was filled, and whether it is a solid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pymeshlab
+import trimesh
+from numpy.typing import NDArray
+
+from meshprep.repair import Work
+from meshprep.surface import Array, Surface
+
+SAMPLES = 60_000  # points on each surface, besides its corners and the middles of its faces
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """How two surfaces differ. Lengths in their unit.
+
+    Attributes
+    ----------
+    to_input, to_output : largest and mean distance of the output from the input, away from filled holes; and the other
+        way, but for what lies inside the output, where no sensor gets
+    worst : (3,) where the larger of both is
+    buried : share of the input's area that lies inside the output
+    kept, new : vertices of the output that are the input's to the last bit, and all others
+    deviation : (F,) of the output's faces from the input, for the picture
+    """
+
+    to_input: tuple[float, float]
+    to_output: tuple[float, float]
+    worst: list[float]
+    buried: float
+    kept: int
+    new: int
+    deviation: Array
+
+    @property
+    def largest(self) -> float:
+        return max(self.to_input[0], self.to_output[0])
+
+
+def prove(before: Surface, work: Work) -> Proof:
+    """How ``work.surface`` differs from ``before``."""
+    after = work.surface
+    ours, theirs = _points(after), _points(_without(before, work.dropped))
+    off = _distance(before, ours)
+    patches = Surface(work.patches.reshape(-1, 3), np.arange(3 * len(work.patches)).reshape(-1, 3))
+    filled = _distance(patches, ours) < 1e-6 * after.size if len(work.patches) else np.zeros(len(ours), bool)
+    back = _distance(after, theirs)
+    inside = (back > 1e-5 * after.size) & _inside(after, theirs)
+    off, back = np.where(filled, 0.0, off), np.where(inside, 0.0, back)
+    worst = ours[off.argmax()] if off.max() >= back.max() else theirs[back.argmax()]
+    exact = {tuple(v) for v in before.vertices.tolist()}
+    kept = sum(tuple(v) in exact for v in after.vertices.tolist())
+    deviation = _distance(before, after.corners.mean(1))
+    return Proof(
+        (float(off.max()), float(off.mean())),
+        (float(back.max()), float(back.mean())),
+        worst.tolist(),
+        float(inside.mean()),
+        kept,
+        len(after.vertices) - kept,
+        deviation,
+    )
+
+
+def distances(a: Surface, b: Surface) -> Array:
+    """Distance (n,) of points all over ``a`` from the surface of ``b``."""
+    return _distance(b, _points(a))
+
+
+def is_solid(path: str) -> str | None:
+    """What trimesh's own checks, of the file as any program reads it, find wrong; None where they pass."""
+    mesh = trimesh.load_mesh(path)
+    for passed, what in (
+        (mesh.is_watertight, "not watertight"),
+        (mesh.is_winding_consistent, "its faces do not agree about the outside"),
+        (mesh.volume > 0 and mesh.is_volume, "it encloses no volume"),
+    ):
+        if not passed:
+            return what
+    return None
+
+
+def _points(surface: Surface) -> Array:
+    """Corners, the middles of faces, and points spread evenly (n, 3)."""
+    rng = np.random.default_rng(0)
+    share = surface.areas / surface.areas.sum()
+    face = rng.choice(len(share), SAMPLES, p=share)
+    u, v = rng.random((2, SAMPLES, 1))
+    fold = u + v > 1
+    u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
+    a, b, c = np.moveaxis(surface.corners[face], 1, 0)
+    solid = surface.areas > 0
+    return np.concatenate(
+        [surface.corners.reshape(-1, 3), surface.corners[solid].mean(1), a + u * (b - a) + v * (c - a)]
+    )
+
+
+def _without(before: Surface, dropped: list[Surface]) -> Surface:
+    """``before`` without the faces that were dropped on purpose."""
+    if not dropped:
+        return before
+    corners = np.concatenate([surface.corners.reshape(-1, 3) for surface in dropped])
+    gone = Surface(corners, np.arange(len(corners)).reshape(-1, 3))
+    near = _distance(gone, before.corners.mean(1))
+    kept = before.faces[near > 1e-6 * before.size]
+    return before.with_faces(kept) if len(kept) else before
+
+
+def _distance(surface: Surface, points: Array) -> Array:
+    """Distance (n,) of ``points`` (n, 3) from ``surface``, by pymeshlab, in double precision: exact on long thin faces too."""
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(points - surface.middle))
+    meshes.add_mesh(pymeshlab.Mesh(surface.vertices - surface.middle, surface.faces))
+    far = pymeshlab.PureValue(2 * surface.size + float(np.ptp(points, axis=0).max()))
+    meshes.compute_scalar_by_distance_from_another_mesh_per_vertex(
+        measuremesh=0, refmesh=1, signeddist=False, maxdist=far
+    )
+    return np.array(meshes.mesh(0).vertex_scalar_array(), float)
+
+
+def _inside(surface: Surface, points: Array) -> NDArray[np.bool_]:
+    scene, (middle, scale) = _scene(surface)
+    return scene.compute_occupancy(((points - middle) / scale).astype(np.float32), nsamples=3).numpy() > 0.5
+
+
+def _scene(surface: Surface):
+    import open3d as o3d
+
+    middle, scale = surface.middle, surface.size
+    scene = o3d.t.geometry.RaycastingScene()
+    vertices = ((surface.vertices - middle) / scale).astype(np.float32)
+    scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(surface.faces.astype(np.uint32)))
+    return scene, (middle, scale)

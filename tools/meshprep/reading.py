@@ -1,0 +1,123 @@
+"""Files as they are: the triangles of a mesh or CAD file in its own unit, and which unit that is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from geomtact.geometry.mesh import UNITS
+from geomtact.sensing.sensor import Sensor
+from meshprep import Refused
+from meshprep.surface import Surface
+
+UNITLESS = (".stl", ".obj", ".ply", ".off")
+METRES = (".glb", ".gltf")
+STEP = (".step", ".stp")
+FORMATS = (*UNITLESS, *METRES, *STEP, ".3mf")
+_LARGEST_FILE = 500_000_000  # bytes
+_THREE_MF = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
+_STEP_TOLERANCE = 0.01  # of tessellation [mm]
+
+
+def read(path: Path, unit: str | None, sensor: Sensor) -> tuple[Surface, str]:
+    """The surface in a file, and its unit.
+
+    Parameters
+    ----------
+    unit : "mm", "cm", "m", "inch" for files that state none; "auto" only proposes
+    sensor : by whose window "auto" judges
+
+    Raises
+    ------
+    Refused
+        Unreadable, empty, without unit, or with another one than was given.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise Refused(f"not a mesh format known here; give one of {' '.join(FORMATS)}")
+    if not path.is_file():
+        raise Refused("no such file")
+    if path.stat().st_size == 0:
+        raise Refused("the file is empty (0 bytes); export the mesh again")
+    if path.stat().st_size > _LARGEST_FILE:
+        raise Refused(
+            f"the file has {path.stat().st_size / 1e6:.0f} MB, more than {_LARGEST_FILE / 1e6:.0f}; export it coarser"
+        )
+    scene = _scene(path)
+    own = _own_unit(suffix, scene)
+    if own is None and unit is None:
+        raise Refused(
+            f"{suffix} files do not say their unit; give --unit, one of {', '.join(UNITS)}, or auto for a proposal"
+        )
+    if own is not None and unit not in (None, "auto", own):
+        raise Refused(f"the file says {own}, but --unit {unit} was given; leave the unit out")
+    surface = _triangles(scene)
+    if own is None and unit == "auto":
+        raise Refused(_proposal(surface, sensor))
+    return surface, own or str(unit)
+
+
+def _scene(path: Path):
+    import trimesh
+
+    options = {}
+    if path.suffix.lower() in STEP:
+        try:
+            import cascadio  # noqa: F401
+        except ImportError:
+            raise Refused("STEP files need cascadio; install the extra with pip install 'geomtact[step]'") from None
+        options = {"tol_linear": _STEP_TOLERANCE, "tol_angular": 0.1}
+    try:
+        # process=False: trimesh would merge, drop and reorder by rules of its own
+        return trimesh.load_scene(str(path), process=False, **options)
+    except ImportError as error:
+        raise Refused(
+            f"reading {path.suffix} needs another package ({error}); install the extra 'geomtact[meshprep]'"
+        ) from None
+    except Exception as error:  # noqa: BLE001 -- a parser fails on bad bytes in more ways than can be listed
+        reason = " ".join(str(error).split())[:100] or type(error).__name__
+        raise Refused(f"cannot be read as {path.suffix.lower()} ({reason}); export it again") from None
+
+
+def _own_unit(suffix: str, scene) -> str | None:
+    """The unit that a file states; trimesh gives what it reads of glTF and STEP in metres."""
+    if suffix in METRES or suffix in STEP:
+        return "m"
+    if suffix == ".3mf":
+        stated = _THREE_MF.get(str(scene.units or "millimeter").rstrip("s").replace("metre", "meter"), 1e-3)
+        return next((name for name, scale in UNITS.items() if np.isclose(scale, stated)), "mm")
+    return None
+
+
+def _triangles(scene) -> Surface:
+    try:
+        mesh = scene.to_mesh()
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+    except Exception:  # noqa: BLE001 -- a scene without triangles fails in more ways than can be listed
+        vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    if not len(faces):
+        what = "only points or lines" if scene.geometry else "nothing"
+        raise Refused(f"expected a surface of triangles, found {what}; export the mesh with its faces")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise Refused(f"a face names a vertex that is not there (of {len(vertices)}); export the mesh again")
+    used = vertices[np.unique(faces)]
+    if not np.isfinite(used).all() or np.abs(used).max() > 1e9:
+        raise Refused("vertices hold NaN, infinity or numbers beyond 1e9; export the mesh again")
+    # exporters repeat a vertex for every face, or for its texture: to the last bit the same is one
+    vertices, index = np.unique(vertices, axis=0, return_inverse=True)
+    surface = Surface(vertices, index.ravel()[faces]).tidied()
+    if not surface.size > 0 or np.abs(used).max() > 1e6 * surface.size:
+        raise Refused("its extent is nothing against its distance from the origin; export it near the origin")
+    return surface
+
+
+def _proposal(surface: Surface, sensor: Sensor) -> str:
+    """Which units would make sense of a size, in words."""
+    window = 2 * float(np.hypot(*sensor.half_window))
+    sizes = {unit: surface.size * scale for unit, scale in UNITS.items()}
+    # a part that a gripper holds: from a tenth of the window to twenty windows
+    likely = [unit for unit, size in sizes.items() if 0.1 * window <= size <= 20 * window]
+    words = ", ".join(f"{1e3 * sizes[u]:.3g} mm across in {u}" for u in likely or sizes)
+    lead = "likely" if likely else "no unit makes it a part to be touched"
+    return f"the unit is for you to say; {lead}: {words} (the window of {sensor.name} is {1e3 * window:.0f} mm). Give --unit"

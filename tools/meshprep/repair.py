@@ -1,0 +1,439 @@
+"""The repairs, one after the other: each takes a surface and gives a better one, and says in words what it changed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pymeshlab
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from meshprep import Refused
+from meshprep.surface import Array, Faces, Surface, label_faces
+
+_SEAM = 1e-5  # of the size, by which a corner may lie beside an edge that it divides
+# of the size, and at least in the file's unit, by which surfaces that touch are moved apart
+_APART, _LEAST_APART = (
+    2e-6,
+    5e-8,
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What may be done to a mesh. Lengths are in the mesh's own unit.
+
+    Attributes
+    ----------
+    skip : names of steps that are left out
+    merge : distance below which vertices are one
+    max_hole : span of the largest hole that is filled
+    max_faces : beyond which a mesh is made coarser
+    max_error : by which coarsening may move the surface
+    largest : whether all bodies but the largest are dropped
+    """
+
+    skip: frozenset[str]
+    merge: float
+    max_hole: float
+    max_faces: int
+    max_error: float
+    largest: bool = False
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A hole that was filled: area, span (largest distance of two corners of its rim) and middle (3,), in the mesh's unit."""
+
+    area: float
+    span: float
+    middle: list[float]
+
+
+@dataclass
+class Work:
+    """A mesh under repair.
+
+    Attributes
+    ----------
+    surface : as it is now
+    changes : what each step did, in words, by its name; steps that changed nothing are not named
+    holes, patches : holes filled, and the corners (n, 3, 3) of the faces that fill them
+    dropped : what was given up of the original on purpose: whole bodies
+    """
+
+    surface: Surface
+    changes: dict[str, str] = field(default_factory=dict)
+    holes: list[Hole] = field(default_factory=list)
+    patches: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    dropped: list[Surface] = field(default_factory=list)
+
+
+def repair(surface: Surface, options: Options) -> Work:
+    """``surface`` after all steps that are not to be skipped.
+
+    Raises
+    ------
+    Refused
+        It cannot be made a closed solid within what the options allow.
+    """
+    work = Work(surface)
+    for name, step in STEPS.items():
+        if name not in options.skip:
+            step(work, options)
+    return work
+
+
+def merge(work: Work, options: Options) -> None:
+    """Vertices closer than a millionth of the size are one: exporters round the same corner in different ways."""
+    before = work.surface
+    meshes = _meshset(before)
+    meshes.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(options.merge))
+    work.surface = _kept_exactly(_surface(meshes), before)
+    gone = len(before.vertices) - len(work.surface.vertices)
+    if gone:
+        work.changes["merge"] = f"{gone} vertices merged with others less than {options.merge:.3g} away"
+
+
+def degenerate(work: Work, options: Options) -> None:
+    """Faces without area and faces that repeat others are dropped; two that cover each other from both sides, both."""
+    faces = work.surface.faces
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    lines = len(work.surface.faces) - len(faces)
+    if not len(faces):
+        raise Refused("every face has shrunk to a line; export the mesh again")
+    once, cancelled = _without_repeats(faces, False), _without_repeats(faces, True)
+    # a sheet of no thickness has two sides: without both nothing opens; a face stored twice, turned, is one face
+    best = min((once, cancelled), key=lambda some: work.surface.with_faces(some).open_edges)
+    repeats = len(faces) - len(best)
+    surface, flat = _without_slivers(work.surface.with_faces(best))
+    said = [(lines, "shrunk to a line"), (repeats, "repeated"), (flat, "of no area")]
+    if any(count for count, _ in said):
+        work.changes["degenerate"] = "faces dropped: " + ", ".join(f"{n} {why}" for n, why in said if n)
+    work.surface = surface.tidied()
+
+
+def seams(work: Work, options: Options) -> None:
+    """Open edges on which corners of others lie are divided there: the sides of a seam that are cut up differently then meet."""
+    surface, divided = work.surface, 0
+    while True:
+        faces, count = _divided(surface, _SEAM * surface.size)
+        if not count:
+            break
+        surface, divided = surface.with_faces(faces), divided + count
+    if divided and surface.open_edges < work.surface.open_edges:
+        work.changes["seams"] = f"{divided} edges divided where corners of others lie on them"
+        work.surface = surface
+
+
+def cut(work: Work, options: Options) -> None:
+    """Where more than two faces share an edge, they are sorted about it, and those that bound the same solid stay together."""
+    surface = work.surface
+    crowded = surface.crowded_edges
+    cut_up = _cut_up(surface)
+    if len(cut_up.vertices) > len(surface.vertices):
+        more = len(cut_up.vertices) - len(surface.vertices)
+        work.changes["cut"] = f"{crowded} edges of more than two faces cut, {more} vertices doubled"
+        work.surface = cut_up
+
+
+def winding(work: Work, options: Options) -> None:
+    """Neighbouring faces agree about the outside, and every body is turned so that its outside is outside."""
+    surface = work.surface
+    before = _canonical(surface.faces)
+    if surface.torn_edges and not surface.crowded_edges:
+        meshes = _meshset(surface)
+        meshes.meshing_re_orient_faces_coherently()
+        surface = _kept_exactly(_surface(meshes), surface)
+        if len(surface.faces) != len(before):
+            raise Refused("the surface has only one side (as a Moebius strip has); export the part as a solid")
+    surface = _outwards(surface)
+    turned = int((_canonical(surface.faces) != before).any(1).sum())
+    if turned:
+        work.changes["winding"] = f"{turned} of {len(before)} faces turned round"
+        work.surface = surface
+
+
+def holes(work: Work, options: Options) -> None:
+    """Holes are filled with flat triangles, if none is wider than is allowed."""
+    surface = work.surface
+    if not surface.open_edges or surface.crowded_edges:
+        return
+    meshes = _meshset(surface)
+    meshes.meshing_close_holes(maxholesize=len(surface.faces) + 3, selfintersection=False, refinehole=False)
+    filled = _kept_exactly(_surface(meshes), surface)
+    new = filled.faces[len(surface.faces) :]
+    if (filled.faces[: len(surface.faces)] != surface.faces).any():
+        raise Refused("its holes could not be filled; close the surface in a mesh editor")
+    piece = label_faces(new)
+    for k in range(int(piece.max(initial=-1)) + 1):
+        rim = filled.vertices[np.unique(new[piece == k])]
+        span = _span(rim)
+        area = float(filled.areas[len(surface.faces) :][piece == k].sum())
+        work.holes.append(Hole(area, span, rim.mean(0).tolist()))
+    widest = max(work.holes, key=lambda hole: hole.span, default=None)
+    if widest is not None and widest.span > options.max_hole:
+        where = ", ".join(f"{x:.4g}" for x in widest.middle)
+        raise Refused(
+            f"a hole {widest.span:.4g} across at ({where}), of {len(work.holes)}, is wider than {options.max_hole:.4g}; close it "
+            "in CAD, or allow it with --max-hole"
+        )
+    if len(new):
+        work.patches = filled.vertices[new]
+        work.changes["holes"] = f"{len(work.holes)} filled with {len(new)} faces, the widest {widest.span:.3g} across"
+        work.surface = _outwards(filled)
+
+
+def bodies(work: Work, options: Options) -> None:
+    """Specks are dropped, and all but the largest body where that is asked for; all others are kept as they lie."""
+    surface, body = work.surface, work.surface.bodies
+    count = int(body.max()) + 1
+    volume = np.abs(surface.volumes)
+    keep = volume > 1e-9 * surface.size**3
+    if options.largest and keep.any():
+        keep &= volume == volume.max()
+    if keep.all() or surface.open_edges:
+        return
+    if not keep.any():
+        raise Refused("the surface encloses no volume; give a solid part")
+    work.dropped.append(surface.with_faces(surface.faces[~keep[body]]).tidied())
+    work.surface = surface.with_faces(surface.faces[keep[body]]).tidied()
+    work.changes["bodies"] = f"{int((~keep).sum())} of {count} bodies dropped"
+
+
+def intersections(work: Work, options: Options) -> None:
+    """Where the surface passes through itself, the union of all that it encloses takes its place."""
+    surface = work.surface
+    if surface.open_edges or surface.torn_edges:
+        return
+    meshes = _meshset(surface)
+    meshes.compute_selection_by_self_intersections_per_face()
+    crossing = meshes.current_mesh().selected_face_number()
+    if not crossing:
+        return
+    meshes = _meshset(surface)
+    try:
+        meshes.generate_boolean_union(first_mesh=0, second_mesh=0)
+    except pymeshlab.PyMeshLabException:
+        raise Refused(
+            f"{crossing} faces pass through others, and what they enclose cannot be told; unite the bodies in CAD"
+        ) from None
+    work.surface = _cut_up(_kept_exactly(_surface(meshes), surface)).tidied()
+    work.changes["intersections"] = f"{crossing} faces passed through others: united"
+
+
+def coarser(work: Work, options: Options) -> None:
+    """A mesh of too many faces is made coarser, as far as the surface moves no more than is allowed."""
+    surface = work.surface
+    if len(surface.faces) <= options.max_faces:
+        return
+    from meshprep.proof import distances
+
+    for share in (0.0, 0.5, 0.75, 0.9):  # of the way from what is wanted back to what there is
+        wanted = int(options.max_faces + share * (len(surface.faces) - options.max_faces))
+        meshes = _meshset(surface)
+        meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=wanted, preservetopology=True, qualitythr=0.5)
+        fewer = _surface(meshes).tidied()
+        if (
+            not fewer.open_edges
+            and max(distances(surface, fewer).max(), distances(fewer, surface).max()) <= options.max_error
+        ):
+            work.changes["coarser"] = f"{len(surface.faces)} faces made {len(fewer.faces)}"
+            work.surface = fewer
+            return
+
+
+def apart(work: Work, options: Options) -> None:
+    """Surfaces that touch along an edge or at a point are moved apart a little, as files join what coincides."""
+    surface = work.surface
+    _, twin, count = np.unique(surface.vertices, axis=0, return_inverse=True, return_counts=True)
+    touching = count[twin.ravel()] > 1
+    if not touching.any():
+        return
+    middle = surface.corners.mean(1)
+    inwards = np.zeros_like(surface.vertices)
+    for k in range(3):
+        np.add.at(inwards, surface.faces[:, k], middle - surface.corners[:, k])
+    length = np.linalg.norm(inwards, axis=1, keepdims=True)
+    vertices = surface.vertices.copy()
+    by = max(_APART * surface.size, _LEAST_APART)
+    step = by * inwards / np.maximum(length, 1e-300)
+    vertices[touching] += step[touching]
+    work.surface = Surface(vertices, surface.faces)
+    work.changes["apart"] = f"{int(touching.sum())} vertices moved by {by:.2g}, off surfaces that they touch"
+
+
+STEPS: dict[str, Callable[[Work, Options], None]] = {
+    step.__name__: step
+    for step in (merge, degenerate, seams, cut, winding, holes, bodies, intersections, coarser, apart)
+}
+
+
+def _without_repeats(faces: Faces, cancel: bool) -> Faces:
+    """One of each set of faces with the same corners; with ``cancel``, none of those that occur as often each way round."""
+    order = np.argsort(faces, axis=1)
+    # an even permutation of the sorted corners is walked one way, an odd one the other
+    even = np.isin(order @ [9, 3, 1], [5, 15, 19])
+    _, which = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
+    net = np.bincount(which.ravel(), np.where(even, 1, -1))[which.ravel()]
+    wanted = np.ones(len(faces), bool) if not cancel else (net != 0) & ((net > 0) == even)
+    some = np.flatnonzero(wanted)
+    _, first = np.unique(which.ravel()[some], return_index=True)
+    return faces[np.sort(some[first])]
+
+
+def _without_slivers(surface: Surface) -> tuple[Surface, int]:
+    """Faces whose three corners lie on a line are flipped away into their neighbours, so that nothing opens."""
+    flat = int((surface.areas <= 1e-12 * surface.size**2).sum())
+    if not flat:
+        return surface, 0
+    meshes = _meshset(surface)
+    try:
+        meshes.meshing_remove_t_vertices(method="Edge Flip", threshold=1e4, repeat=True)
+    except pymeshlab.PyMeshLabException:  # it asks for two faces an edge; what has no area does no harm
+        return surface, 0
+    flipped = _kept_exactly(_surface(meshes), surface)
+    faces = flipped.faces[flipped.areas > 1e-12 * surface.size**2]
+    better = flipped.with_faces(faces)
+    return (better, flat) if better.open_edges <= surface.open_edges else (surface, 0)
+
+
+def _divided(surface: Surface, near: float) -> tuple[Faces, int]:
+    """The faces with one open edge of each, at most, divided at the corners of open edges that lie on it; and how many were."""
+    from scipy.spatial import cKDTree
+
+    edges, number, uses = surface.half_edges
+    bare = np.flatnonzero(uses[number] % 2 == 1)
+    if not len(bare):
+        return surface.faces, 0
+    corners = np.unique(edges[bare])
+    tree, (a, b) = cKDTree(surface.vertices[corners]), np.moveaxis(surface.vertices[edges[bare]], 1, 0)
+    length = np.linalg.norm(b - a, axis=1)
+    around = tree.query_ball_point(0.5 * (a + b), 0.5 * length + near)
+    fans: dict[int, Faces] = {}
+    for i, half in enumerate(bare.tolist()):
+        column, face = divmod(half, len(surface.faces))
+        some = corners[around[i]]
+        along = (surface.vertices[some] - a[i]) @ (b[i] - a[i]) / max(length[i], 1e-300)
+        off = np.linalg.norm(
+            surface.vertices[some] - a[i] - along[:, None] * (b[i] - a[i]) / max(length[i], 1e-300), axis=1
+        )
+        on = (off < near) & (along > near) & (along < length[i] - near)
+        if on.any() and face not in fans:
+            start, end, opposite = surface.faces[face, [column, (column + 1) % 3, (column + 2) % 3]]
+            way = [start, *some[on][np.argsort(along[on])], end]
+            fans[face] = np.array([[p, q, opposite] for p, q in itertools.pairwise(way)])
+    if not fans:
+        return surface.faces, 0
+    return np.concatenate([np.delete(surface.faces, list(fans), axis=0), *fans.values()]), len(fans)
+
+
+def _cut_up(surface: Surface) -> Surface:
+    """``surface`` with vertices doubled so that each edge has two faces at most, and each vertex one fan of faces."""
+    edges, number, uses = surface.half_edges
+    n = len(surface.faces)
+    face = np.tile(np.arange(n), 3)
+    order = np.argsort(number, kind="stable")
+    first = np.concatenate([[0], np.cumsum(uses)])
+    pairs = [order[first[:-1][uses == 2][:, None] + np.arange(2)]]
+    for k in np.flatnonzero(uses > 2):
+        pairs.append(_about_an_edge(surface, edges, face, order[first[k] : first[k + 1]]))
+    joined = np.concatenate([p.reshape(-1, 2) for p in pairs])
+    # corner c of face f is number 3 f + c; a half-edge of column c runs from corner c to the next
+    column = np.arange(3 * n) // n
+    start, end = 3 * face + column, 3 * face + (column + 1) % 3
+    a, b = joined.T
+    same_way = edges[a, 0] == edges[b, 0]
+    links = np.concatenate(
+        [
+            np.column_stack([start[a], np.where(same_way, start[b], end[b])]),
+            np.column_stack([end[a], np.where(same_way, end[b], start[b])]),
+        ]
+    )
+    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), (3 * n, 3 * n))
+    count, label = connected_components(graph, directed=False)
+    vertices = np.zeros((count, 3))
+    vertices[label] = surface.vertices[surface.faces.ravel()]
+    return Surface(vertices, label.reshape(-1, 3).astype(np.int64))
+
+
+def _about_an_edge(surface: Surface, edges: Faces, face: Faces, half: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pairs (m, 2) of the half-edges ``half`` (k,) of one edge whose faces bound the same solid there."""
+    low, high = sorted(edges[half[0]])
+    axis = surface.vertices[high] - surface.vertices[low]
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-300)
+    opposite = surface.corners[face[half]].sum(1) - surface.vertices[low] - surface.vertices[high]
+    out = opposite - surface.vertices[low]
+    out = out - (out @ axis)[:, None] * axis
+    x = out[0] / max(float(np.linalg.norm(out[0])), 1e-300)
+    angle = np.arctan2(out @ np.cross(axis, x), out @ x)
+    forwards = edges[half, 0] == low
+    turn = np.argsort(angle, kind="stable")
+    todo, pairs = turn.tolist(), []
+    if forwards.sum() * 2 != len(half):  # who bounds what cannot be told: neighbours are paired
+        pairs = [turn[i : i + 2] for i in range(0, len(turn) - 1, 2)]
+        return half[np.array(pairs)].reshape(-1, 2)
+    # seen along the axis, a face walked forwards has its solid on the side of greater angles' opposite: the solid lies between
+    # a face walked backwards and the next one walked forwards
+    while todo:
+        for i in range(len(todo)):
+            a, b = todo[i], todo[(i + 1) % len(todo)]
+            if not forwards[a] and forwards[b]:
+                pairs.append([a, b])
+                todo = [t for t in todo if t not in (a, b)]
+                break
+    return half[np.array(pairs)]
+
+
+def _outwards(surface: Surface) -> Surface:
+    """Bodies turned so that each encloses a positive volume, but those that lie as cavities in others."""
+    body, volume = surface.bodies, surface.volumes
+    count = len(volume)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, body, surface.corners.min(1))
+    np.maximum.at(high, body, surface.corners.max(1))
+    faces = surface.faces.copy()
+    for k in np.flatnonzero(volume < 0):
+        inside = ((low < low[k]) & (high > high[k])).all(1) & (volume > 0)
+        if not inside.any():
+            faces[body == k] = faces[body == k][:, ::-1]
+    return surface.with_faces(faces)
+
+
+def _canonical(faces: Faces) -> Faces:
+    """Faces with the smallest corner first, walked as they are."""
+    start = faces.argmin(1)[:, None]
+    return np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
+
+
+def _span(points: Array) -> float:
+    """Largest distance of two of ``points`` (n, 3)."""
+    from scipy.spatial.distance import pdist
+
+    return float(pdist(points[:: max(1, len(points) // 500)]).max(initial=0.0))
+
+
+def _meshset(surface: Surface) -> pymeshlab.MeshSet:
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(surface.vertices, surface.faces))
+    return meshes
+
+
+def _surface(meshes: pymeshlab.MeshSet) -> Surface:
+    mesh = meshes.current_mesh()
+    return Surface(np.array(mesh.vertex_matrix(), float), np.array(mesh.face_matrix(), np.int64))
+
+
+def _kept_exactly(after: Surface, before: Surface) -> Surface:
+    """``after`` with every vertex that lies on one of ``before``, but for rounding, given that one's very coordinates."""
+    from scipy.spatial import cKDTree
+
+    distance, nearest = cKDTree(before.vertices).query(after.vertices)
+    vertices = after.vertices.copy()
+    same = distance <= 1e-12 * before.size
+    vertices[same] = before.vertices[nearest[same]]
+    return Surface(vertices, after.faces)

@@ -1,0 +1,118 @@
+"""A triangle surface as a file holds it, in the file's own unit, and what can be counted on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+Array = NDArray[np.float64]
+Faces = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles, closed or not. Lengths are in the file's unit, coordinates the file's own.
+
+    Attributes
+    ----------
+    vertices : (V, 3)
+    faces : (F, 3) indices into vertices
+    """
+
+    vertices: Array
+    faces: Faces
+
+    @cached_property
+    def corners(self) -> Array:
+        """(F, 3, 3)"""
+        return self.vertices[self.faces]
+
+    @cached_property
+    def crosses(self) -> Array:
+        """(F, 3) normals of twice the area's length."""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return np.asarray(np.cross(b - a, c - a))
+
+    @cached_property
+    def areas(self) -> Array:
+        return 0.5 * np.linalg.norm(self.crosses, axis=1)
+
+    @cached_property
+    def size(self) -> float:
+        """Diagonal of the bounding box."""
+        used = self.vertices[np.unique(self.faces)]
+        return float(np.linalg.norm(used.max(0) - used.min(0)))
+
+    @cached_property
+    def middle(self) -> Array:
+        used = self.vertices[np.unique(self.faces)]
+        return np.asarray(0.5 * (used.max(0) + used.min(0)))
+
+    @cached_property
+    def half_edges(self) -> tuple[Faces, NDArray[np.int64], NDArray[np.int64]]:
+        """Every face's three edges (3 F, 2) as walked, the number (3 F,) of the undirected edge of each, and how many half-edges
+        each of those has."""
+        edges = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]])
+        _, number, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+        return edges, number.ravel(), uses
+
+    @cached_property
+    def open_edges(self) -> int:
+        """Edges of one face, or of another odd number."""
+        return int((self.half_edges[2] % 2 == 1).sum())
+
+    @cached_property
+    def crowded_edges(self) -> int:
+        """Edges of more than two faces."""
+        return int((self.half_edges[2] > 2).sum())
+
+    @cached_property
+    def torn_edges(self) -> int:
+        """Edges that are not walked as often one way as the other."""
+        edges, number, _ = self.half_edges
+        return int((np.bincount(number, np.where(edges[:, 0] < edges[:, 1], 1, -1)) != 0).sum())
+
+    @cached_property
+    def bodies(self) -> NDArray[np.int64]:
+        """Which body (F,) each face belongs to, connected by edges."""
+        return label_faces(self.faces)
+
+    @cached_property
+    def volumes(self) -> Array:
+        """Signed volume of each body."""
+        a, b, c = np.moveaxis(self.corners - self.middle, 1, 0)
+        return np.bincount(self.bodies, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
+
+    @property
+    def volume(self) -> float:
+        return float(self.volumes.sum())
+
+    @property
+    def area(self) -> float:
+        return float(self.areas.sum())
+
+    def with_faces(self, faces: Faces) -> Surface:
+        """The same vertices with other faces."""
+        return Surface(self.vertices, faces)
+
+    def tidied(self) -> Surface:
+        """Without vertices that no face uses."""
+        kept, faces = np.unique(self.faces, return_inverse=True)
+        return Surface(self.vertices[kept], faces.reshape(-1, 3))
+
+
+def label_faces(faces: Faces) -> NDArray[np.int64]:
+    """Number (F,) of the connected piece of each face, connected by vertices."""
+    if not len(faces):
+        return np.zeros(0, np.int64)
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    n = int(faces.max()) + 1
+    _, label = connected_components(
+        coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (n, n)), directed=False
+    )
+    return np.unique(label[faces[:, 0]], return_inverse=True)[1]

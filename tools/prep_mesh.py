@@ -1,0 +1,221 @@
+"""Make parts of mesh files: repaired, proved to be where they were, in a known unit, ready to be localized.
+
+    python tools/prep_mesh.py IN... --unit mm --out DIR        # repair; a folder stands for the meshes in it
+    python tools/prep_mesh.py part.step --add-to meshes/       # and use it from then on as --object part
+
+For each file DIR gets NAME.ply (the mesh, in the file's own unit and frame), NAME.png (before and after) and NAME.json (what was
+done and measured). A mesh that cannot be repaired within the bounds is refused, with the reason, and nothing of it is written.
+Needs the extra meshprep (pymeshlab, GPL-3), for STEP files also the extra step.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+SECONDS, BYTES = 60.0, 4_000_000_000  # that a file may take
+SCHEMA = "geomtact/mesh-prep/1"
+
+
+def main(
+    inputs: Annotated[list[Path], typer.Argument(metavar="IN...", help="Mesh or CAD files, or folders of them.")],
+    unit: Annotated[
+        str | None, typer.Option(help="mm, cm, m or inch, for files that do not say; auto: proposals.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("out/meshes"),
+    max_deviation: Annotated[float, typer.Option(min=0, help="By how much the surface may move [mm].")] = 0.05,
+    max_hole: Annotated[float, typer.Option(min=0, help="Span of the largest hole that is filled [mm].")] = 5.0,
+    max_faces: Annotated[int, typer.Option(min=12, help="Faces beyond which a mesh is made coarser.")] = 200_000,
+    skip: Annotated[list[str] | None, typer.Option(help="A step to leave out; may be given again.")] = None,
+    largest: Annotated[bool, typer.Option("--largest", help="Keep the largest body alone.")] = False,
+    split: Annotated[bool, typer.Option("--split", help="Make a part of each body.")] = False,
+    symmetry: Annotated[float, typer.Option(min=0, help="Tolerance of the symmetry [mm].")] = 0.05,
+    sensor: Annotated[
+        str, typer.Option(help="By whose window units are proposed and ambiguity is judged.")
+    ] = "gelslim",
+    ambiguity: Annotated[
+        bool, typer.Option("--ambiguity", help="Draw how ambiguous a touch is, all over the part.")
+    ] = False,
+    add_to: Annotated[Path | None, typer.Option(help="Folder of a catalogue to which the parts are added.")] = None,
+    description: Annotated[str, typer.Option(help="Of the part, for the catalogue.")] = "",
+    licence: Annotated[str, typer.Option(help="Of the part, for the catalogue.")] = "unknown",
+    as_json: Annotated[bool, typer.Option("--json", help="Print all results as JSON, and nothing else there.")] = False,
+) -> None:
+    """Repair meshes, prove what that changed, and say in which unit and with which symmetry they are parts."""
+    from meshprep.repair import STEPS
+
+    unknown = sorted(set(skip or ()) - set(STEPS))
+    if unknown:
+        raise typer.BadParameter(
+            f"no step named {', '.join(unknown)}; steps are {', '.join(STEPS)}", param_hint="--skip"
+        )
+    files = _files(inputs)
+    if not files:
+        raise typer.BadParameter("no mesh files there", param_hint="IN")
+    names = _names(files)
+    out.mkdir(parents=True, exist_ok=True)
+    options = {
+        "unit": unit,
+        "max_deviation_mm": max_deviation,
+        "max_hole_mm": max_hole,
+        "max_faces": max_faces,
+        "skip": sorted(skip or ()),
+        "largest": largest,
+        "split": split,
+        "symmetry_mm": symmetry,
+        "sensor": sensor,
+        "add_to": None if add_to is None else str(add_to),
+        "description": description,
+        "licence": licence,
+    }
+    results = []
+    for file, name in zip(files, names, strict=True):
+        result = _bounded(file, name, out, options)
+        results.append(result)
+        if ambiguity and result["outcome"] != "refused":
+            _draw_ambiguity(result, out, sensor)
+        typer.echo(f"{file}: {_said(result)}", err=True)
+    if as_json:
+        typer.echo(json.dumps({"schema": SCHEMA, "meshes": results}, indent=1))
+    else:
+        _table(results)
+    raise typer.Exit(3 if all(result["outcome"] == "refused" for result in results) else 0)
+
+
+def prepare(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[str, Any]:
+    """Read, repair, prove and write one file; what came of it."""
+    from meshprep import Refused
+    from meshprep.reading import read
+    from meshprep.repair import Options, repair
+    from meshprep.writing import write
+
+    from geomtact.errors import GeomtactError
+    from geomtact.geometry.mesh import UNITS
+    from geomtact.sensing.sensor import Sensor
+
+    result: dict[str, Any] = {"file": str(file), "name": name, "outcome": "refused", "reason": None}
+    try:
+        surface, unit = read(file, options["unit"], Sensor.load(options["sensor"]))
+        mm = 1e3 * UNITS[unit]  # millimetres in the file's unit
+        result |= {"unit": unit, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), "size_mm": mm * surface.size}
+        allowed = Options(
+            frozenset(options["skip"]),
+            1e-6 * surface.size,
+            options["max_hole_mm"] / mm,
+            options["max_faces"],
+            0.5 * options["max_deviation_mm"] / mm,
+            options["largest"],
+        )
+        result |= write(surface, repair(surface, allowed), name, unit, out, options)
+    except (Refused, GeomtactError) as error:
+        result |= {"outcome": "refused", "reason": str(error)}
+    return result
+
+
+def _draw_ambiguity(result: dict[str, Any], out: Path, sensor: str) -> None:
+    """Beside each part's mesh a picture of how much a touch tells there; an index is built for it, about a minute."""
+    from meshprep.ambiguity import draw_ambiguity
+
+    from geomtact.files import write_whole
+    from geomtact.geometry.mesh import load_mesh
+
+    for part in result["parts"]:
+        drawn = draw_ambiguity(load_mesh(out / f"{part}.ply", result["unit"]), sensor)
+        write_whole(out / f"{part}_ambiguity.png", lambda path, drawn=drawn: path.write_bytes(drawn))
+
+
+def _bounded(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[str, Any]:
+    """:func:`prepare` in a process of its own, which may crash, hang or grow without harm."""
+    began = time.monotonic()
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe(duplex=False)
+    worker = context.Process(target=_work, args=(there, file, name, out, options))
+    worker.start()
+    there.close()
+    reason, result = None, None
+    while True:
+        if here.poll(0.05):
+            try:
+                result = here.recv()
+            except EOFError:
+                reason = "reading or repairing it crashed; repair it in a mesh editor first"
+            break
+        if time.monotonic() - began > SECONDS:
+            reason = f"it takes more than {SECONDS:.0f} s; make it coarser first"
+        elif _resident(worker.pid) > BYTES:
+            reason = f"it takes more than {BYTES / 1e9:.0f} GB of memory; make it coarser first"
+        if reason:
+            break
+    worker.terminate() if reason else None
+    worker.join()
+    if result is None:
+        result = {"file": str(file), "name": name, "outcome": "refused", "reason": reason}
+    return result | {"seconds": round(time.monotonic() - began, 2)}
+
+
+def _work(pipe: Any, file: Path, name: str, out: Path, options: dict[str, Any]) -> None:
+    pipe.send(prepare(file, name, out, options))
+
+
+def _resident(pid: int | None) -> int:
+    """Bytes of memory that a process holds; 0 where that cannot be told."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
+    except (OSError, StopIteration):
+        return 0
+
+
+def _files(inputs: Sequence[Path]) -> list[Path]:
+    from meshprep.reading import FORMATS
+
+    out: list[Path] = []
+    for each in inputs:
+        inside = sorted(p for p in each.rglob("*") if p.suffix.lower() in FORMATS) if each.is_dir() else [each]
+        out += inside
+    return out
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """The stem of each file, numbered where several have the same."""
+    stems = [file.stem for file in files]
+    return [stem if stems.count(stem) == 1 else f"{stem}_{stems[: i + 1].count(stem)}" for i, stem in enumerate(stems)]
+
+
+def _said(result: dict[str, Any]) -> str:
+    if result["outcome"] == "refused":
+        return f"refused: {result['reason']}"
+    changes = "; ".join(f"{step}: {words}" for step, words in result["changes"].items())
+    return f"{result['outcome']}{': ' if changes else ''}{changes}"
+
+
+def _table(results: Sequence[dict[str, Any]]) -> None:
+    from geomtact.cli.shell import print_table
+
+    rows = []
+    for r in results:
+        row = [r["name"], r["outcome"], f"{r['seconds']:.1f}"]
+        if r["outcome"] != "refused":
+            holes = str(len(r["holes"]))
+            row += [f"{r['deviation_mm']:.4f}", holes, str(r["faces"]), r["symmetry"]["kind"], ""]
+        else:
+            row += ["", "", "", "", str(r["reason"])[:70]]
+        rows.append(row)
+    headings = ("mesh", "outcome", "s", "deviation [mm]", "holes", "faces", "symmetry", "why")
+    print_table(headings, rows, headings[2:6])
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(main)
+    app()
