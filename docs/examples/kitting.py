@@ -1,9 +1,9 @@
 """Kitting: a robot takes a part whose pose it does not know, touches it until it is sure, and places it in its fixture.
 
 A jaw with a sensor in each finger grasps the part; a second one touches it where that tells most. The fixture is a recess of
-the part's own shape, open to above, wider by a clearance on all sides. The part is placed only if, of the poses that the posterior leaves,
-95 % would go in. The robot is simulated. About ten seconds on two cores, after the part's touches were simulated once (a
-minute); the picture and the animation go to out/kitting.
+the part's own shape, open to above, wider by a clearance on all sides. The part is placed only if, of the poses that the
+posterior leaves, 95 % would go in. The robot is simulated. About ten seconds on two cores, after the part's touches were
+simulated once (a minute); the picture and the animation go to out/kitting.
 """
 
 import argparse
