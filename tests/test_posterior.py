@@ -408,3 +408,7 @@ def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_
         halved = np.exp(before.shared_anew(before.cells[row], likelihood, elsewhere=0.5).log_prob.astype(float))
         assert halved.sum() == pytest.approx(q.sum(), rel=1e-5)
         assert halved[others].sum() / halved[row].sum() == pytest.approx(0.5 * q[others].sum() / q[row].sum(), rel=1e-4)
+        # where what was known before counts for nothing, the likelihood alone is the density
+        anew = before.shared_anew(before.cells[row], likelihood, before=0.0)
+        density = anew._log_density_of(row)
+        np.testing.assert_allclose(density - density[0], likelihood - likelihood[0], atol=1e-4)

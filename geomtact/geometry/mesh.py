@@ -295,7 +295,7 @@ def _check_closed(vertices: Array, faces: NDArray[np.int32], path: Path) -> None
     if bare:
         raise MeshError(
             f"{path}: not watertight, {bare} of {len(uses)} edges are open; "
-            "close the surface in a mesh editor and export it again"
+            "close the surface with tools/prep_mesh.py or a mesh editor"
         )
     turned = int((excess != 0).sum())
     if turned:
