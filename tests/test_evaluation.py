@@ -225,6 +225,7 @@ def test_the_thesis_table_counts_what_refinement_brings_nearer():
     assert (figures["refined best"]["nearer"], figures["refined best"]["farther"]) == pytest.approx((1 / 3, 1 / 3))
     assert figures["thesis's refinement of best"]["nearer"] == pytest.approx(2 / 3)
     assert figures["refined best10"]["farther"] == pytest.approx(1 / 3)
+    assert figures["refined best"]["near"] == [3, 6.0, 4.0]
     assert "nearer" not in figures["answer"]
 
 

@@ -91,8 +91,12 @@ def _print(parts: Mapping[str, Any]) -> None:
         for row, f in part["figures"].items():
             low, middle, high = f["error_mm_quartiles"]
             moved = [f"{100 * f[key]:.0f} %" if key in f else "" for key in ("nearer", "farther")]
+            n, before, after = f.get("near", (0, None, None))
+            moved.append(f"{before:.1f} to {after:.1f} ({n})" if n else "")
             error = [f"{middle:.1f} ({low:.1f} to {high:.1f})", f"{f['normalised_median']:.2f}"]
             rows.append([name, row, str(f["n"]), *error, *moved])
-    headings = ("part", "pose", "touches", "ADD [mm]", "normalised", "nearer", "farther")
-    typer.echo("Median error with quartiles; nearer, farther: than the pose before refinement")
+    headings = ("part", "pose", "touches", "ADD [mm]", "normalised", "nearer", "farther", "of those near")
+    typer.echo(
+        "Median error with quartiles; nearer, farther: than before refinement; of those near: from 10 mm off at most"
+    )
     print_table(headings, rows, headings[2:])

@@ -28,6 +28,7 @@ from geomtact.sensing.noise import Noise
 from geomtact.sensing.sensor import Sensor
 
 ROWS = ("best", "refined best", "thesis's refinement of best", "answer", "best10", "refined best10")
+NEAR_MM = 10.0  # a start that is farther off lies at another place, to which no registration leads back
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,11 @@ def _answers(localizer: Localizer, touch: Touch, effort: str) -> list[Array]:
 
 
 def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """For each of ``ROWS`` the median error [mm] with its quartiles, the median normalised error, and how many touches it brings
-    nearer than the pose it started from."""
+    """For each of ``ROWS`` the median error [mm] with its quartiles, and the median normalised error.
+
+    Of a refinement also which share of touches it brings nearer than the pose that it started from, and which farther; and of
+    touches whose start was ``NEAR_MM`` off at most, their number and the median errors before and after: ``near``.
+    """
     error = np.array([o.error_mm for o in outcomes])
     normalised = error / np.array([[o.random_mm] for o in outcomes])
     start = {"refined best": "best", "thesis's refinement of best": "best", "refined best10": "best10"}
@@ -98,5 +102,8 @@ def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
             before = error[:, ROWS.index(start[row])]
             figures["nearer"] = float((error[:, i] < before - 1e-9).mean())
             figures["farther"] = float((error[:, i] > before + 1e-9).mean())
+            near = before <= NEAR_MM
+            medians = [float(np.median(some[near])) if near.any() else None for some in (before, error[:, i])]
+            figures["near"] = [int(near.sum()), *medians]
         out[row] = figures
     return out
