@@ -4,9 +4,10 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 from typer.testing import CliRunner
 
-from geomtact import Localizer, se3
+from geomtact import Localizer, Mesh, se3
 from geomtact.cli import app
 from geomtact.contact_space.carry import Carry, RigStd
 from geomtact.errors import InputError, UsageError
@@ -294,3 +295,24 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
         assert done.exit_code == 3 and words in done.output and "\n" not in done.output.strip()
     done = CliRunner().invoke(app, args)
     assert done.exit_code == 2 and "2 images need --sensor-poses" in done.output
+
+
+def test_a_jaw_on_a_plain_rod_says_that_it_may_be_shifted(make_localizer):
+    """Both fingers feel the same all along: no mode claims to know where along the rod they hold it."""
+    bar = trimesh.creation.cylinder(6e-3, 0.1, sections=64)
+    rod = make_localizer(Mesh(bar.vertices, bar.faces, "rod", "m").with_symmetry(), "gelslim", max_poses=8_000)
+    lying = se3.transform(se3.exp([0, np.pi / 2, 0, 0, 0, 0])[:3, :3], [0.0, 0.0, 5e-3])  # its axis along x, 1 mm deep
+    opposite = se3.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 10e-3])
+    sensors = np.stack([np.eye(4), opposite])
+    masks = [rod.simulate(se3.inverse(T) @ lying).mask for T in sensors]
+    assert all(mask.any() for mask in masks)
+    posterior = rod.localize(masks, "mask", None, sensors)
+    mode = posterior.modes(1)[0]
+    along = np.zeros(6)
+    along[3:] = mode.T[:3, :3].T @ [1.0, 0.0, 0.0]  # a shift along the rod, as xi
+    assert mode.T[0, :3] @ [0, 0, 1] == pytest.approx(np.sign(mode.T[0, 2]), abs=0.1)  # it lies along x
+    assert np.abs(mode.observable @ along).max(initial=0) < 0.1
+    assert np.sqrt(along @ mode.covariance @ along) > 1e-3 and mode.probability < 0.7
+    across = np.zeros(6)
+    across[3:] = mode.T[:3, :3].T @ [0.0, 1.0, 0.0]
+    assert np.linalg.norm(mode.observable @ across) > 0.9
