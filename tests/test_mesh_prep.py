@@ -177,6 +177,81 @@ def test_the_largest_body_alone_and_specks():
     assert prove(three, work).largest < 1e-6 * three.size
 
 
+def box(size, where=(0.0, 0.0, 0.0), inwards=False):
+    mesh = trimesh.creation.box(size)
+    mesh.apply_translation(where)
+    if inwards:
+        mesh.invert()
+    return mesh
+
+
+HOLLOW = trimesh.util.concatenate([box((20, 20, 20)), box((10, 10, 9), inwards=True)])
+
+
+def test_a_cavity_stays_one_however_the_file_is_wound(rng, tmp_path):
+    inside_out = HOLLOW.copy()
+    inside_out.invert()
+    torn = as_surface(HOLLOW)
+    faces = torn.faces.copy()
+    flip = rng.random(len(faces)) < 0.4
+    faces[flip] = faces[flip][:, ::-1]
+    for surface in (as_surface(HOLLOW), as_surface(inside_out), torn.with_faces(faces)):
+        work = repair(surface, options(surface))
+        assert work.surface.volume == pytest.approx(7100) and len(work.surface.volumes) == 2
+        assert repair(surface, options(surface, largest=True)).surface.volume == pytest.approx(7100)
+        sound(work.surface, tmp_path)
+
+
+def test_what_only_lies_within_anothers_bounds_is_no_cavity(tmp_path):
+    slug = box((4, 4, 3), (1, 0, 0), inwards=True)
+    ring = trimesh.creation.annulus(10, 15, 6)
+    surface = as_surface(trimesh.util.concatenate([ring, slug]))
+    work = repair(surface, options(surface))
+    assert work.changes["winding"].startswith("12 of") and work.surface.volume == pytest.approx(ring.volume + 48)
+    drill = trimesh.creation.cylinder(3, 12)
+    drill.apply_translation([0.3, 0.2, 8])
+    drill.invert()
+    drilled = as_surface(trimesh.util.concatenate([box((20, 20, 20)), drill]))
+    with pytest.raises(Refused, match="wound inwards, about .* passes through another; subtract it in CAD"):
+        repair(drilled, options(drilled))
+
+
+def test_two_rims_that_lie_on_each_other_are_a_seam_and_no_hole(tmp_path):
+    ring = trimesh.creation.annulus(2, 8, 6, sections=32)
+    wall = (np.abs(ring.face_normals[:, 2]) < 0.1) & (np.hypot(*ring.triangles_center.T[:2]) < 2.5)
+    corners = ring.triangles.copy()
+    corners[wall] *= [0.999, 0.999, 1]
+    gaping = Surface(corners.reshape(-1, 3), np.arange(corners.size // 3).reshape(-1, 3))
+    with pytest.raises(Refused, match="two rims lie 0.002 apart .* a seam, not a hole; join them with --merge 0.003"):
+        repair(gaping, options(gaping, max_hole=5.0))
+    work = repair(gaping, options(gaping, merge=0.003))
+    assert not work.holes and work.surface.volume == pytest.approx(ring.volume, rel=1e-2)
+    assert prove(gaping, work).largest < 2.1e-3
+    sound(work.surface, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("size", "where", "volume"), [((10, 10, 10), (10, 0, 0), 2000), ((20, 10, 10), (15, 0, 0), 3000)]
+)
+def test_boxes_that_share_a_face_are_one_solid_or_two(size, where, volume, tmp_path):
+    both = as_surface(trimesh.util.concatenate([box((10, 10, 10)), box(size, where)]))
+    work = repair(both, options(both))
+    assert not work.surface.crowded_edges and work.surface.volume == pytest.approx(volume, rel=1e-3)
+    assert prove(both, work).largest < 1e-3
+    sound(work.surface, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("faces", "words"),
+    [([[0, 1, 2], [0, 2, 1]], "enclose nothing"), ([[0, 1, 3], [1, 0, 3]], "enclose nothing|no face has any area")],
+)
+def test_what_encloses_nothing_is_refused(faces, words):
+    vertices = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [5, 0, 0]])
+    nothing = Surface(vertices, np.array(faces))
+    with pytest.raises(Refused, match=words):
+        repair(nothing, options(nothing))
+
+
 def test_a_mesh_of_too_many_faces_is_made_coarser_within_the_bound():
     ball = as_surface(trimesh.creation.icosphere(5, 10.0))
     work = repair(ball, options(ball, max_faces=6000, max_error=0.02))
@@ -252,6 +327,17 @@ def test_a_unit_that_contradicts_the_file_is_refused(tmp_path):
         read(tmp_path / "none.stl", "mm", Sensor.load("gelslim"))
 
 
+def test_nothing_is_written_over_the_input(command, tmp_path):
+    BOX.export(tmp_path / "box.ply")
+    before = (tmp_path / "box.ply").read_bytes()
+    done = command(tmp_path / "box.ply", "--unit", "mm", "--out", tmp_path)
+    assert done.exit_code == 2 and "written" in done.output and (tmp_path / "box.ply").read_bytes() == before
+    done = command(tmp_path / "box.ply", "--unit", "mm", "--out", tmp_path / "box.ply")
+    assert done.exit_code == 2 and "cannot be made" in done.output
+    files = [Path("a/part.stl"), Path("b/part.stl"), Path("part_2.stl"), Path("c/part.stl")]
+    assert prep_mesh._names(files) == ["part", "part_3", "part_2", "part_4"]
+
+
 def test_a_folder_gets_a_table_and_what_is_refused_leaves_nothing(command, tmp_path):
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
@@ -289,10 +375,10 @@ def test_a_part_of_a_catalogue_goes_by_its_name(command, tmp_path, monkeypatch):
         # added again it takes its own place; beside others it takes none of theirs
         symmetry = load_mesh("crate").symmetry
         for _ in range(2):
-            add(tmp_path / "out" / "crate.ply", "mm", "unknown", "made of crate", symmetry, folder)
+            add([tmp_path / "out" / "crate.ply"], "mm", "unknown", "made of crate", [symmetry], folder)
         assert (folder / "catalogue.toml").read_text("utf-8") == entry
         (folder / "catalogue.toml").write_text(entry + "\n" + entry.replace("crate", "other"), "utf-8")
-        add(tmp_path / "out" / "crate.ply", "mm", "MIT", "a crate", symmetry, folder)
+        add([tmp_path / "out" / "crate.ply"], "mm", "MIT", "a crate", [symmetry], folder)
         both = tomllib.loads((folder / "catalogue.toml").read_text("utf-8"))
         assert (both["crate"]["licence"], both["other"]["licence"]) == ("MIT", "unknown")
         part = load_mesh("crate")

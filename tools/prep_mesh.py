@@ -36,6 +36,9 @@ def main(
     max_deviation: Annotated[float, typer.Option(min=0, help="By how much the surface may move [mm].")] = 0.05,
     max_hole: Annotated[float, typer.Option(min=0, help="Span of the largest hole that is filled [mm].")] = 5.0,
     max_faces: Annotated[int, typer.Option(min=12, help="Faces beyond which a mesh is made coarser.")] = 200_000,
+    merge: Annotated[
+        float | None, typer.Option(min=0, help="Distance below which corners are one, in the file's unit.")
+    ] = None,
     skip: Annotated[list[str] | None, typer.Option(help="A step to leave out; may be given again.")] = None,
     largest: Annotated[bool, typer.Option("--largest", help="Keep the largest body alone.")] = False,
     split: Annotated[bool, typer.Option("--split", help="Make a part of each body.")] = False,
@@ -59,16 +62,23 @@ def main(
         raise typer.BadParameter(
             f"no step named {', '.join(unknown)}; steps are {', '.join(STEPS)}", param_hint="--skip"
         )
-    files = _files(inputs)
+    files = _files(inputs, out)
     if not files:
         raise typer.BadParameter("no mesh files there", param_hint="IN")
     names = _names(files)
-    out.mkdir(parents=True, exist_ok=True)
+    over = {(out / f"{name}.ply").resolve() for name in names} & {file.resolve() for file in files}
+    if over:
+        raise typer.BadParameter(f"{over.pop()} would be written over; give another folder", param_hint="--out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(f"{out} cannot be made a folder ({error.strerror})", param_hint="--out") from None
     options = {
         "unit": unit,
         "max_deviation_mm": max_deviation,
         "max_hole_mm": max_hole,
         "max_faces": max_faces,
+        "merge": merge,
         "skip": sorted(skip or ()),
         "largest": largest,
         "split": split,
@@ -77,6 +87,7 @@ def main(
         "add_to": None if add_to is None else str(add_to),
         "description": description,
         "licence": licence,
+        "taken": names,
     }
     results = []
     for file, name in zip(files, names, strict=True):
@@ -110,7 +121,7 @@ def prepare(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[s
         result |= {"unit": unit, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), "size_mm": mm * surface.size}
         allowed = Options(
             frozenset(options["skip"]),
-            1e-6 * surface.size,
+            options["merge"] if options["merge"] is not None else 1e-6 * surface.size,
             options["max_hole_mm"] / mm,
             options["max_faces"],
             0.5 * options["max_deviation_mm"] / mm,
@@ -119,6 +130,11 @@ def prepare(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[s
         result |= write(surface, repair(surface, allowed), name, unit, out, options)
     except (Refused, GeomtactError) as error:
         result |= {"outcome": "refused", "reason": str(error)}
+    except OSError as error:
+        result |= {"outcome": "refused", "reason": f"cannot be read, or its results not written ({error})"}
+    except Exception as error:  # noqa: BLE001 -- pymeshlab and readers fail in more ways than can be listed
+        words = f"{type(error).__name__}: {' '.join(str(error).split())[:150]}"
+        result |= {"outcome": "refused", "reason": f"its repair failed ({words}); repair it in a mesh editor first"}
     return result
 
 
@@ -160,6 +176,10 @@ def _bounded(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[
     worker.join()
     if result is None:
         result = {"file": str(file), "name": name, "outcome": "refused", "reason": reason}
+    if result["outcome"] == "refused":  # nothing of an earlier run may be taken for its result
+        for suffix in (".ply", ".png") if (out / f"{name}.json").is_file() else ():
+            (out / f"{name}{suffix}").unlink(missing_ok=True)
+        (out / f"{name}.json").unlink(missing_ok=True)
     return result | {"seconds": round(time.monotonic() - began, 2)}
 
 
@@ -176,20 +196,28 @@ def _resident(pid: int | None) -> int:
         return 0
 
 
-def _files(inputs: Sequence[Path]) -> list[Path]:
+def _files(inputs: Sequence[Path], out: Path) -> list[Path]:
+    """The files to be prepared; of folders all meshes in them, but for the results of an earlier run."""
     from meshprep.reading import FORMATS
 
-    out: list[Path] = []
+    files: list[Path] = []
     for each in inputs:
         inside = sorted(p for p in each.rglob("*") if p.suffix.lower() in FORMATS) if each.is_dir() else [each]
-        out += inside
-    return out
+        files += [p for p in inside if p == each or out.resolve() not in p.resolve().parents]
+    return files
 
 
 def _names(files: Sequence[Path]) -> list[str]:
-    """The stem of each file, numbered where several have the same."""
-    stems = [file.stem for file in files]
-    return [stem if stems.count(stem) == 1 else f"{stem}_{stems[: i + 1].count(stem)}" for i, stem in enumerate(stems)]
+    """The stem of each file, numbered where it is taken."""
+    names: list[str] = []
+    stems = {file.stem for file in files}
+    for file in files:
+        name, k = file.stem, 1
+        while name in names or (k > 1 and name in stems):
+            k += 1
+            name = f"{file.stem}_{k}"
+        names.append(name)
+    return names
 
 
 def _said(result: dict[str, Any]) -> str:

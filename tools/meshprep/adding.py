@@ -7,7 +7,9 @@ import json
 import re
 import shutil
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,26 +19,41 @@ from geomtact.geometry.symmetry import Symmetry, group_of
 from meshprep import Refused
 
 
-def add(path: Path, unit: str, licence: str, description: str, symmetry: Symmetry, folder: Path) -> None:
-    """Copy the mesh into ``folder`` and write its entry into the catalogue there, in the place of one of the same name.
+def add(
+    files: Sequence[Path], unit: str, licence: str, description: str, symmetries: Sequence[Symmetry], folder: Path
+) -> None:
+    """Copy meshes into ``folder`` and write their entries into the catalogue there, in the place of those of the same names.
 
     Raises
     ------
     Refused
-        The name cannot be one of a part, or another part has it.
+        A name cannot be one of a part, or another part has it, or the catalogue cannot be read; then nothing was written.
     """
-    name, catalogue = path.stem, folder / "catalogue.toml"
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
-        raise Refused(f"{name!r} cannot be a part's name: letters, digits, - and _ alone; rename the file")
+    catalogue = folder / "catalogue.toml"
     text = catalogue.read_text("utf-8") if catalogue.is_file() else ""
-    entries = tomllib.loads(text)
-    if name in entries and entries[name]["file"] != path.name:
-        raise Refused(f"{catalogue}: another part is named {name} ({entries[name]['file']}); rename the file")
+    entries = _parsed(text, catalogue)
+    for path, symmetry in zip(files, symmetries, strict=True):
+        name = path.stem
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+            raise Refused(f"{name!r} cannot be a part's name: letters, digits, - and _ alone; rename the file")
+        if name in entries and entries[name]["file"] != path.name:
+            raise Refused(f"{catalogue}: another part is named {name} ({entries[name]['file']}); rename the file")
+        kept = re.sub(rf"(?ms)^\[{re.escape(name)}\][^\n]*\n.*?(?=^\[(?!{re.escape(name)}\.)|\Z)", "", text).rstrip(
+            "\n"
+        )
+        text = f"{kept}\n\n{catalogue_entry(path, unit, licence, description, symmetry)}".lstrip("\n")
+    _parsed(text, catalogue)
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / path.name, lambda target: shutil.copyfile(path, target))
-    kept = re.sub(rf"(?ms)^\[{re.escape(name)}\]\n.*?(?=^\[(?!{re.escape(name)}\.)|\Z)", "", text).rstrip("\n")
-    entry = catalogue_entry(path, unit, licence, description, symmetry)
-    write_whole(catalogue, lambda target: target.write_text(f"{kept}\n\n{entry}".lstrip("\n"), "utf-8"))
+    for path in files:
+        write_whole(folder / path.name, lambda target, path=path: shutil.copyfile(path, target))
+    write_whole(catalogue, lambda target: target.write_text(text, "utf-8"))
+
+
+def _parsed(text: str, catalogue: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise Refused(f"{catalogue}: would not be a catalogue any more ({error}); mend its entry by hand") from None
 
 
 def catalogue_entry(path: Path, unit: str, licence: str, description: str, symmetry: Symmetry) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from meshprep.proof import Proof, _scene
+from meshprep.proof import Proof
 from meshprep.repair import Work
 from meshprep.surface import Array, Surface
 
@@ -30,7 +30,7 @@ def draw(name: str, unit: str, before: Surface, work: Work, proof: Proof, bound:
         colours[[tuple(np.round(c, 12)) in patch for c in after.corners.mean(1).tolist()]] = _FILLED
     figure = Figure(figsize=(9, 8.6), dpi=90, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    figure.suptitle(name)
+    figure.suptitle(name, parse_math=False)
     axes = figure.subplots(2, 2)
     for row, towards in zip(axes, _VIEWS, strict=True):
         image, extent, plane = _shaded(before, lambda _, face: np.tile(_PART, (len(face), 1)), towards, after)
@@ -63,7 +63,7 @@ def draw_values(
     scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(low, high), "viridis")
     figure = Figure(figsize=(9, 4.4), dpi=100, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    figure.suptitle(name)
+    figure.suptitle(name, parse_math=False)
     axes = figure.subplots(1, 2)
     for each, towards in zip(axes, _VIEWS, strict=True):
         image, extent, _ = _shaded(surface, lambda point, _: scale.to_rgba(value(point))[:, :3], towards, surface)
@@ -93,7 +93,7 @@ def _shaded(
     origin = (
         u.ravel()[:, None] * plane[0] + v.ravel()[:, None] * plane[1] + (frame.middle @ back + 2 * frame.size) * back
     )
-    scene, (centre, scale) = _scene(surface)
+    scene, (centre, scale) = surface.scene
     rays = np.concatenate([(origin - centre) / scale, np.tile(-back, (len(origin), 1))], 1).astype(np.float32)
     hit = scene.cast_rays(rays)
     face = hit["primitive_ids"].numpy().astype(np.int64)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import pymeshlab
 import trimesh
-from numpy.typing import NDArray
 
 from meshprep.repair import Work
 from meshprep.surface import Array, Surface
@@ -50,7 +49,7 @@ def prove(before: Surface, work: Work) -> Proof:
     patches = Surface(work.patches.reshape(-1, 3), np.arange(3 * len(work.patches)).reshape(-1, 3))
     filled = _distance(patches, ours) < 1e-6 * after.size if len(work.patches) else np.zeros(len(ours), bool)
     back = _distance(after, theirs)
-    inside = (back > 1e-5 * after.size) & _inside(after, theirs)
+    inside = (back > 1e-5 * after.size) & after.encloses(theirs)
     off, back = np.where(filled, 0.0, off), np.where(inside, 0.0, back)
     worst = ours[off.argmax()] if off.max() >= back.max() else theirs[back.argmax()]
     exact = {tuple(v) for v in before.vertices.tolist()}
@@ -121,18 +120,3 @@ def _distance(surface: Surface, points: Array) -> Array:
         measuremesh=0, refmesh=1, signeddist=False, maxdist=far
     )
     return np.array(meshes.mesh(0).vertex_scalar_array(), float)
-
-
-def _inside(surface: Surface, points: Array) -> NDArray[np.bool_]:
-    scene, (middle, scale) = _scene(surface)
-    return scene.compute_occupancy(((points - middle) / scale).astype(np.float32), nsamples=3).numpy() > 0.5
-
-
-def _scene(surface: Surface):
-    import open3d as o3d
-
-    middle, scale = surface.middle, surface.size
-    scene = o3d.t.geometry.RaycastingScene()
-    vertices = ((surface.vertices - middle) / scale).astype(np.float32)
-    scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(surface.faces.astype(np.uint32)))
-    return scene, (middle, scale)

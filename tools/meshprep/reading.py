@@ -16,7 +16,16 @@ METRES = (".glb", ".gltf")
 STEP = (".step", ".stp")
 FORMATS = (*UNITLESS, *METRES, *STEP, ".3mf")
 _LARGEST_FILE = 500_000_000  # bytes
-_THREE_MF = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
+_THREE_MF = {
+    "millimeter": "mm",
+    "centimeter": "cm",
+    "inch": "inch",
+    "meter": "m",
+    "mm": "mm",
+    "cm": "cm",
+    "m": "m",
+    "in": "inch",
+}
 _STEP_TOLERANCE = 0.01  # of tessellation [mm]
 
 
@@ -53,6 +62,8 @@ def read(path: Path, unit: str | None, sensor: Sensor) -> tuple[Surface, str]:
     if own is not None and unit not in (None, "auto", own):
         raise Refused(f"the file says {own}, but --unit {unit} was given; leave the unit out")
     surface = _triangles(scene)
+    if suffix in STEP:  # trimesh gives metres
+        surface = Surface(1e3 * surface.vertices, surface.faces)
     if own is None and unit == "auto":
         raise Refused(_proposal(surface, sensor))
     return surface, own or str(unit)
@@ -81,12 +92,16 @@ def _scene(path: Path):
 
 
 def _own_unit(suffix: str, scene) -> str | None:
-    """The unit that a file states; trimesh gives what it reads of glTF and STEP in metres."""
-    if suffix in METRES or suffix in STEP:
+    """The unit that a file states. STEP files are read in millimetres, whatever they are drawn in."""
+    if suffix in METRES:
         return "m"
+    if suffix in STEP:
+        return "mm"
     if suffix == ".3mf":
-        stated = _THREE_MF.get(str(scene.units or "millimeter").rstrip("s").replace("metre", "meter"), 1e-3)
-        return next((name for name, scale in UNITS.items() if np.isclose(scale, stated)), "mm")
+        stated = str(scene.units or "millimeter").lower().removesuffix("s")
+        if stated not in _THREE_MF:
+            raise Refused(f"the file is in {stated}; export it in one of {', '.join(UNITS)}")
+        return _THREE_MF[stated]
     return None
 
 

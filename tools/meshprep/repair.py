@@ -64,6 +64,7 @@ class Work:
     changes : what each step did, in words, by its name; steps that changed nothing are not named
     holes, patches : holes filled, and the corners (n, 3, 3) of the faces that fill them
     dropped : what was given up of the original on purpose: whole bodies
+    coherent : whether neighbouring faces agreed about the outside
     """
 
     surface: Surface
@@ -71,6 +72,7 @@ class Work:
     holes: list[Hole] = field(default_factory=list)
     patches: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     dropped: list[Surface] = field(default_factory=list)
+    coherent: bool = True
 
 
 def repair(surface: Surface, options: Options) -> Work:
@@ -109,6 +111,8 @@ def degenerate(work: Work, options: Options) -> None:
     once, cancelled = _without_repeats(faces, False), _without_repeats(faces, True)
     # a sheet of no thickness has two sides: without both nothing opens; a face stored twice, turned, is one face
     best = min((once, cancelled), key=lambda some: work.surface.with_faces(some).open_edges)
+    if not len(best):
+        raise Refused("its faces cover each other from both sides and enclose nothing; give a solid part")
     repeats = len(faces) - len(best)
     surface, flat = _without_slivers(work.surface.with_faces(best))
     said = [(lines, "shrunk to a line"), (repeats, "repeated"), (flat, "of no area")]
@@ -144,14 +148,15 @@ def cut(work: Work, options: Options) -> None:
 def winding(work: Work, options: Options) -> None:
     """Neighbouring faces agree about the outside, and every body is turned so that its outside is outside."""
     surface = work.surface
-    before = _canonical(surface.faces)
-    if surface.torn_edges and not surface.crowded_edges:
+    before, coherent = _canonical(surface.faces), not _disagree(surface)
+    work.coherent = coherent
+    if not coherent and not surface.crowded_edges:
         meshes = _meshset(surface)
         meshes.meshing_re_orient_faces_coherently()
         surface = _kept_exactly(_surface(meshes), surface)
         if len(surface.faces) != len(before):
             raise Refused("the surface has only one side (as a Moebius strip has); export the part as a solid")
-    surface = _outwards(surface)
+    surface = _outwards(surface, coherent)
     turned = int((_canonical(surface.faces) != before).any(1).sum())
     if turned:
         work.changes["winding"] = f"{turned} of {len(before)} faces turned round"
@@ -170,6 +175,9 @@ def holes(work: Work, options: Options) -> None:
     if (filled.faces[: len(surface.faces)] != surface.faces).any():
         raise Refused("its holes could not be filled; close the surface in a mesh editor")
     piece = label_faces(new)
+    _check_rims(
+        filled, [np.unique(new[piece == k]) for k in range(int(piece.max(initial=-1)) + 1)], 2 * options.max_error
+    )
     for k in range(int(piece.max(initial=-1)) + 1):
         rim = filled.vertices[np.unique(new[piece == k])]
         span = _span(rim)
@@ -185,7 +193,7 @@ def holes(work: Work, options: Options) -> None:
     if len(new):
         work.patches = filled.vertices[new]
         work.changes["holes"] = f"{len(work.holes)} filled with {len(new)} faces, the widest {widest.span:.3g} across"
-        work.surface = _outwards(filled)
+        work.surface = _outwards(filled, work.coherent)
 
 
 def bodies(work: Work, options: Options) -> None:
@@ -194,9 +202,11 @@ def bodies(work: Work, options: Options) -> None:
     count = int(body.max()) + 1
     volume = np.abs(surface.volumes)
     keep = volume > 1e-9 * surface.size**3
+    if surface.open_edges:
+        return
     if options.largest and keep.any():
-        keep &= volume == volume.max()
-    if keep.all() or surface.open_edges:
+        keep &= surface.owners == surface.volumes.argmax()  # with the cavities in it
+    if keep.all():
         return
     if not keep.any():
         raise Refused("the surface encloses no volume; give a solid part")
@@ -299,6 +309,8 @@ def _without_slivers(surface: Surface) -> tuple[Surface, int]:
     flipped = _kept_exactly(_surface(meshes), surface)
     faces = flipped.faces[flipped.areas > 1e-12 * surface.size**2]
     better = flipped.with_faces(faces)
+    if not len(faces):
+        raise Refused("no face has any area; export the mesh again")
     return (better, flat) if better.open_edges <= surface.open_edges else (surface, 0)
 
 
@@ -370,9 +382,10 @@ def _about_an_edge(surface: Surface, edges: Faces, face: Faces, half: NDArray[np
     out = opposite - surface.vertices[low]
     out = out - (out @ axis)[:, None] * axis
     x = out[0] / max(float(np.linalg.norm(out[0])), 1e-300)
-    angle = np.arctan2(out @ np.cross(axis, x), out @ x)
+    # faces that lie on each other are told apart by the way they are walked, not by rounding: what they bound does not join
+    angle = np.round((np.arctan2(out @ np.cross(axis, x), out @ x) + 1e-7) % (2 * np.pi), 6)
     forwards = edges[half, 0] == low
-    turn = np.argsort(angle, kind="stable")
+    turn = np.lexsort((~forwards, angle))
     todo, pairs = turn.tolist(), []
     if forwards.sum() * 2 != len(half):  # who bounds what cannot be told: neighbours are paired
         pairs = [turn[i : i + 2] for i in range(0, len(turn) - 1, 2)]
@@ -389,25 +402,60 @@ def _about_an_edge(surface: Surface, edges: Faces, face: Faces, half: NDArray[np
     return half[np.array(pairs)]
 
 
-def _outwards(surface: Surface) -> Surface:
-    """Bodies turned so that each encloses a positive volume, but those that lie as cavities in others."""
-    body, volume = surface.bodies, surface.volumes
-    count = len(volume)
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    np.minimum.at(low, body, surface.corners.min(1))
-    np.maximum.at(high, body, surface.corners.max(1))
+def _outwards(surface: Surface, coherent: bool) -> Surface:
+    """Bodies turned so that the outside is outside, cavities inwards.
+
+    Where the faces were ``coherent``, which body is a cavity is as the file says: only what is wound inwards and lies in no other
+    is turned, with all that lies in it. Else what lies in an odd number of others is a cavity.
+    """
+    volume = surface.volumes
+    if surface.open_edges:  # what lies where is told once all is closed
+        turn = volume < 0 if len(volume) == 1 else np.zeros(len(volume), bool)
+    else:
+        contains, crosses = surface.contained
+        lost = np.flatnonzero((volume < 0) & crosses.any(1) & ~contains.any(1))
+        if coherent and len(lost):
+            where = ", ".join(f"{x:.4g}" for x in surface.corners[surface.bodies == lost[0]].mean((0, 1)))
+            raise Refused(f"a body wound inwards, about ({where}), passes through another; subtract it in CAD")
+        depth = contains.sum(1)
+        if coherent:
+            inverted = (volume < 0) & (depth == 0)
+            turn = inverted | (contains & inverted).any(1)
+        else:
+            turn = (volume < 0) != (depth % 2 == 1)
     faces = surface.faces.copy()
-    for k in np.flatnonzero(volume < 0):
-        inside = ((low < low[k]) & (high > high[k])).all(1) & (volume > 0)
-        if not inside.any():
-            faces[body == k] = faces[body == k][:, ::-1]
+    flip = turn[surface.bodies]
+    faces[flip] = faces[flip][:, ::-1]
     return surface.with_faces(faces)
+
+
+def _disagree(surface: Surface) -> bool:
+    """Whether two faces walk an edge that they share the same way."""
+    edges, number, uses = surface.half_edges
+    net = np.bincount(number, np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    return bool((np.abs(net) > uses % 2).any())
 
 
 def _canonical(faces: Faces) -> Faces:
     """Faces with the smallest corner first, walked as they are."""
     start = faces.argmin(1)[:, None]
     return np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
+
+
+def _check_rims(surface: Surface, rims: list[NDArray[np.int64]], near: float) -> None:
+    """Refuse to fill holes whose rims lie on each other: the two sides of a seam, behind which there is no hole."""
+    from scipy.spatial import cKDTree
+
+    for i, rim in enumerate(rims):
+        tree = cKDTree(surface.vertices[rim])
+        for other in rims[i + 1 :]:
+            apart = tree.query(surface.vertices[other])[0]
+            if apart.max() <= near:
+                where = ", ".join(f"{x:.4g}" for x in surface.vertices[other].mean(0))
+                raise Refused(
+                    f"two rims lie {apart.max():.2g} apart about ({where}): a seam, not a hole; join them with --merge "
+                    f"{1.5 * apart.max():.1g} (in the file's unit)"
+                )
 
 
 def _span(points: Array) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,51 @@ class Surface:
     @property
     def area(self) -> float:
         return float(self.areas.sum())
+
+    @cached_property
+    def contained(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Of a closed surface, which body (n, n) of the column contains that of the row, and which pass through each other."""
+        n = len(self.volumes)
+        contains, crosses = np.zeros((n, n), bool), np.zeros((n, n), bool)
+        own = [np.unique(self.faces[self.bodies == k]) for k in range(n)]
+        low, high = (np.array([f(self.vertices[some], axis=0) for some in own]) for f in (np.min, np.max))
+        for j in range(n):
+            near = (low < high[j]).all(1) & (high > low[j]).all(1)
+            near[j] = False
+            if not near.any():
+                continue
+            alone = self.with_faces(self.faces[self.bodies == j])
+            for k in np.flatnonzero(near):
+                some = self.vertices[own[k][:: max(1, len(own[k]) // 50)]]
+                # a little towards the body's own middle, so that what touches is not taken to lie inside
+                inside = alone.encloses(some + 1e-4 * (some.mean(0) - some))
+                contains[k, j], crosses[k, j] = inside.all(), inside.any() and not inside.all()
+        return contains, crosses | crosses.T
+
+    @cached_property
+    def owners(self) -> NDArray[np.int64]:
+        """Which body each body (n,) is part of: itself, or for a cavity the smallest that contains it."""
+        owner = np.arange(len(self.volumes))
+        for k in np.flatnonzero(self.volumes < 0):
+            around = np.flatnonzero(self.contained[0][k] & (self.volumes > 0))
+            if len(around):
+                owner[k] = around[self.volumes[around].argmin()]
+        return owner
+
+    def encloses(self, points: Array) -> NDArray[np.bool_]:
+        """Whether ``points`` (n, 3) lie inside, whichever way the faces look."""
+        scene, (middle, scale) = self.scene
+        return scene.compute_occupancy(((points - middle) / scale).astype(np.float32), nsamples=3).numpy() > 0.5
+
+    @cached_property
+    def scene(self) -> tuple[Any, tuple[Array, float]]:
+        """For rays, in single precision: the surface about its middle and in its size, and both."""
+        import open3d as o3d
+
+        scene = o3d.t.geometry.RaycastingScene()
+        vertices = ((self.vertices - self.middle) / self.size).astype(np.float32)
+        scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(self.faces.astype(np.uint32)))
+        return scene, (self.middle, self.size)
 
     def with_faces(self, faces: Faces) -> Surface:
         """The same vertices with other faces."""

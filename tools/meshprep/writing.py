@@ -33,35 +33,42 @@ def write(before: Surface, work: Work, name: str, unit: str, out: Path, options:
     mm = 1e3 * UNITS[unit]
     bound = options["max_deviation_mm"] / mm
     after = work.surface
+    if after.open_edges:
+        edges, number, uses = after.half_edges
+        where = ", ".join(f"{mm * x:.4g}" for x in after.vertices[edges[(uses % 2 == 1)[number]][0]].mean(0))
+        raise Refused(
+            f"{after.open_edges} of {len(uses)} edges are left open, one at ({where}) mm; close the surface in CAD"
+        )
     proof = prove(before, work)
-    if proof.largest > bound:
+    if proof.largest > bound + 1e-6 * before.size:  # no distance is known better
         where = ", ".join(f"{mm * x:.4g}" for x in proof.worst)
         raise Refused(
             f"the repaired surface lies {mm * proof.largest:.3g} mm from the original at ({where}) mm, more than "
             f"{options['max_deviation_mm']:g}; repair it in CAD there, or allow it with --max-deviation"
         )
+    parts = _parts(after, options["split"])
+    names = [name if len(parts) == 1 else f"{name}_{i + 1}" for i in range(len(parts))]
+    taken = sorted(set(names) & set(options["taken"]) - {name})
+    if taken:
+        raise Refused(f"--split would write over {taken[0]}; rename the file, or give another --out")
+    told = {"schema": "geomtact/mesh-prep/1", "name": name, "unit": unit, "options": options}
+    told |= _told(before, work, proof, mm) | {"parts": names}
     with tempfile.TemporaryDirectory() as folder:
-        parts = _parts(after, options["split"])
-        names = [name if len(parts) == 1 else f"{name}_{i + 1}" for i in range(len(parts))]
         files = [Path(folder) / f"{each}.ply" for each in names]
-        meshes = []
         for file, part in zip(files, parts, strict=True):
             write_ply(file, part)
-            meshes.append(_checked(file, unit, options["symmetry_mm"]))
-        told = _told(before, work, proof, mm) | {"parts": names, "symmetry": _symmetry(meshes[0])}
-        picture = draw(name, unit, before, work, proof, bound)
-        for file, mesh in zip(files, meshes, strict=True):
-            assert mesh.symmetry is not None
-            if options["add_to"] is not None:
-                words = options["description"] or f"made of {name}"
-                add(file, unit, options["licence"], words, mesh.symmetry, Path(options["add_to"]))
-            content = file.read_bytes()
-            write_whole(out / file.name, lambda path, content=content: path.write_bytes(content))
-    write_whole(out / f"{name}.png", lambda path: path.write_bytes(picture))
-    whole = {"schema": "geomtact/mesh-prep/1", "name": name, "unit": unit, "options": options} | told
-    whole["versions"] = versions()
-    write_whole(out / f"{name}.json", lambda path: path.write_text(json.dumps(whole, indent=1), "utf-8"))
-    return told
+        meshes = [_checked(file, unit, options["symmetry_mm"]) for file in files]
+        told |= {"symmetry": _symmetry(meshes[0]), "versions": versions()}
+        contents = {file.name: file.read_bytes() for file in files}
+        contents[f"{name}.png"] = draw(name, unit, before, work, proof, max(bound, 1e-6 * before.size))
+        contents[f"{name}.json"] = json.dumps(told, indent=1).encode()
+        if options["add_to"] is not None:
+            words = options["description"] or f"made of {name}"
+            symmetries = [mesh.symmetry for mesh in meshes if mesh.symmetry is not None]
+            add(files, unit, options["licence"], words, symmetries, Path(options["add_to"]))
+        for each, content in contents.items():
+            write_whole(out / each, lambda path, content=content: path.write_bytes(content))
+    return {key: value for key, value in told.items() if key not in ("schema", "options", "versions")}
 
 
 def write_ply(path: Path, surface: Surface) -> None:
@@ -93,14 +100,7 @@ def _parts(surface: Surface, split: bool) -> list[Surface]:
     volume = surface.volumes
     if not split or (volume > 0).sum() < 2:
         return [surface]
-    body = surface.bodies
-    low, high = (
-        np.array([f(surface.corners[body == k], axis=(0, 1)) for k in range(len(volume))]) for f in (np.min, np.max)
-    )
-    owner = np.arange(len(volume))
-    for k in np.flatnonzero(volume < 0):
-        around = np.flatnonzero((volume > 0) & (low < low[k]).all(1) & (high > high[k]).all(1))
-        owner[k] = around[volume[around].argmin()]
+    body, owner = surface.bodies, surface.owners
     solid = [k for k in np.argsort(-volume) if volume[k] > 0]
     return [surface.with_faces(surface.faces[owner[body] == k]).tidied() for k in solid]
 
