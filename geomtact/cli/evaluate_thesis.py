@@ -60,6 +60,12 @@ def judge_thesis_table(
         }
         done = study_file.earlier(content["parts"].get(mesh.name), settings, known_approach.Outcome)
         done = done[: len(done) // touches * touches]  # a side that was not finished is touched anew
+
+        def keep(done: list, name: str = mesh.name, settings: Mapping[str, Any] = settings) -> None:
+            figures = known_approach.summarise(done)
+            outcomes = [asdict(o) for o in done]
+            study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=outcomes)
+
         approaches = known_approach.draw_sides(mesh, gel, sides, seed)
         for side in range(len(done) // touches, sides):
             with progress_bar(f"preparing {mesh.name}, side {side + 1} of {sides}") as progress:
@@ -73,14 +79,8 @@ def judge_thesis_table(
                 )
             judged = known_approach.judge_side(localizer, side, touches, seed, strength, effort.value, FELT[felt])
             done = study_file.collect(done, judged, len(done) + touches, f"touching {mesh.name}", lambda _: None)
-            study_file.keep(
-                out,
-                content,
-                mesh.name,
-                settings=settings,
-                figures=known_approach.summarise(done),
-                outcomes=[asdict(o) for o in done],
-            )
+            keep(done)
+        keep(done)
         tell(f"{mesh.name}: done")
     _print(content["parts"])
 
