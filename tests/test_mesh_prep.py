@@ -109,7 +109,9 @@ def test_a_hole_is_filled_and_told_or_refused_where_it_is():
     assert not work.surface.open_edges and work.surface.volume == pytest.approx(ball.volume, rel=1e-3)
     # what fills the hole is not held against the surface
     assert prove(holed, work).largest < 1e-6
-    with pytest.raises(Refused, match=r"a hole 2\..* across at \(.*, 9\..*\), of 1, is wider than 1; close it in CAD"):
+    with pytest.raises(
+        Refused, match=r"a hole 2\..* across at \(.*, 9\..*\), the widest of 1, is wider than 1 .*; close it in CAD"
+    ):
         repair(holed, options(holed, max_hole=1.0))
     skipped = repair(holed, options(holed, skip=frozenset(["holes"])))
     assert skipped.surface.open_edges and not skipped.holes
@@ -309,6 +311,7 @@ def test_the_same_part_in_any_format_and_unit_is_the_same(tmp_path):
         ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "NaN"),
         ("a.obj", b"v 0 0 3e38\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "beyond 1e9"),
         ("a.ply", b"ply\nformat", "mm", "cannot be read as .ply"),
+        ("a.stl", b"x", "mmm", "unknown unit 'mmm'; give --unit, one of mm, cm, m, inch"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", None, "do not say their unit; give --unit"),
         ("a.obj", b"v 0 0 0\nv 10 0 0\nv 0 10 0\nf 1 2 3\n", "auto", "likely: 14.1 mm across in mm.*Give --unit"),
     ],

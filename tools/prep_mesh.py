@@ -49,7 +49,9 @@ def main(
     ambiguity: Annotated[
         bool, typer.Option("--ambiguity", help="Draw how ambiguous a touch is, all over the part.")
     ] = False,
-    add_to: Annotated[Path | None, typer.Option(help="Folder of a catalogue to which the parts are added.")] = None,
+    add_to: Annotated[
+        Path | None, typer.Option(help="Folder to whose catalogue the parts are added: meshes/ of this checkout.")
+    ] = None,
     description: Annotated[str, typer.Option(help="Of the part, for the catalogue.")] = "",
     licence: Annotated[str, typer.Option(help="Of the part, for the catalogue.")] = "unknown",
     as_json: Annotated[bool, typer.Option("--json", help="Print all results as JSON, and nothing else there.")] = False,
@@ -244,6 +246,6 @@ def _table(results: Sequence[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.command()(main)
     app()

@@ -91,7 +91,8 @@ def localize(
     placed = read_sensor_poses(sensor_poses, len(images)) if sensor_poses is not None else None
     if placed is None and len(images) > 1:
         raise UsageError(f"{len(images)} images need --sensor-poses FILE.json; or localize them one at a time")
-    values, sources = resolve(given, read_metadata(images[0]))
+    metadata = read_metadata(images[0])
+    values, sources = resolve(given, metadata)
     _check_name("kind", kind, Kind)
     chosen = values["effort"] or Effort.balanced.value
     _check_name("effort", chosen, Effort, sources.get("effort"))
@@ -103,6 +104,9 @@ def localize(
             # a bad image is told before minutes go into an index
             read_observation(image, gel, kind, values["background"])
     opened = {gel: open_localizer({**values, "sensor": gel}, sources, scorer, cache_dir) for gel in dict.fromkeys(gels)}
+    made_of = metadata.get("geomtact:object")
+    if made_of and values["object"] and Path(made_of).stem != Path(values["object"]).stem:
+        tell(f"{images[0]}: was made of {made_of}, as its metadata says, and is localized on {values['object']}")
     localizer = opened[gels[0]]
     if len(opened) > 1:
         localizer = replace(localizer, others=tuple(opened[gel] for gel in gels[1:]))

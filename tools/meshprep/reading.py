@@ -43,6 +43,8 @@ def read(path: Path, unit: str | None, sensor: Sensor) -> tuple[Surface, str]:
         Unreadable, empty, without unit, or with another one than was given.
     """
     suffix = path.suffix.lower()
+    if unit not in (None, "auto", *UNITS):
+        raise Refused(f"unknown unit {unit!r}; give --unit, one of {', '.join(UNITS)}, or auto for a proposal")
     if suffix not in FORMATS:
         raise Refused(f"not a mesh format known here; give one of {' '.join(FORMATS)}")
     if not path.is_file():

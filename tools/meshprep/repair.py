@@ -182,8 +182,8 @@ def holes(work: Work, options: Options) -> None:
     if widest is not None and widest.span > options.max_hole:
         where = ", ".join(f"{x:.4g}" for x in widest.middle)
         raise Refused(
-            f"a hole {widest.span:.4g} across at ({where}), of {len(work.holes)}, is wider than {options.max_hole:.4g}; close it "
-            "in CAD, or allow it with --max-hole"
+            f"a hole {widest.span:.4g} across at ({where}), the widest of {len(work.holes)}, is wider than "
+            f"{options.max_hole:.4g} (in the file's unit); close it in CAD, or allow it with --max-hole, in mm"
         )
     if len(new):
         work.patches = filled.vertices[new]
