@@ -26,6 +26,17 @@ def single(localizer, touch, T):
     return localizer.localize(touch.mask, "mask", T_world_sensor=T, effort="fast")
 
 
+def carried(localizer, rng):
+    """Twelve pairs of sensors that touch: the places of poses drawn within cells of the first, and the poses at the second."""
+    index, space = localizer.index, localizer.space
+    T, _ = space.sample(24, rng)
+    for here, there in zip(T[::2], T[1::2], strict=True):
+        carry = Carry(index, index, there @ se3.inverse(here))
+        cells = rng.choice(index.possible, 400)
+        settled, ok = space.settle(*index.draw(cells, rng))
+        yield carry, cells[ok] % index.places, carry.T_there_here @ settled[ok]
+
+
 def test_a_sensor_in_the_same_place_sees_each_place_in_itself(plug):
     """Carried nowhere, a place lies in its own: a height is known to the grid's own coarseness, so that a share is left of it,
     never more than all; and what the other sensor knows is asked of that place and of its neighbours at most."""
@@ -42,32 +53,19 @@ def test_a_sensor_in_the_same_place_sees_each_place_in_itself(plug):
 
 def test_shares_are_what_happens(plug, rng):
     """Of poses drawn within cells, as many touch a second sensor as the cells' shares say, within a factor of two."""
-    index, space = plug.index, plug.space
     expected, happened = [], []
-    T, _ = space.sample(24, rng)
-    for here, there in zip(T[::2], T[1::2], strict=True):
-        carry = Carry(index, index, there @ se3.inverse(here))
-        share = carry.mean(np.ones(len(index)))[1]
-        cells = rng.choice(index.possible, 400)
-        drawn, depth = index.draw(cells, rng)
-        settled, ok = space.settle(drawn, depth)
-        expected.append(share[cells % index.places][ok].mean())
-        happened.append(np.isfinite(space.penetration(carry.T_there_here @ settled[ok])).mean())
+    for carry, places, T in carried(plug, rng):
+        expected.append(carry.mean(np.ones(len(plug.index)))[1][places].mean())
+        happened.append(np.isfinite(plug.space.penetration(T)).mean())
     assert 0.5 < np.mean(expected) / np.mean(happened) < 2.0
 
 
 def test_free_sensors_are_reached_as_often_as_said(plug, rng):
     """Of poses drawn within cells, as many reach a second sensor, however deep, as their shares say; and those that do, more."""
-    index, space = plug.index, plug.space
     expected, happened = [], []
-    T, _ = space.sample(24, rng)
-    for here, there in zip(T[::2], T[1::2], strict=True):
-        carry = Carry(index, index, there @ se3.inverse(here))
-        cells = rng.choice(index.possible, 400)
-        drawn, depth = index.draw(cells, rng)
-        settled, ok = space.settle(drawn, depth)
-        expected.append(carry.reached()[cells % index.places][ok])
-        happened.append(space.caster.penetration(space.sensor, carry.T_there_here @ settled[ok]) > 0)
+    for carry, places, T in carried(plug, rng):
+        expected.append(carry.reached()[places])
+        happened.append(plug.space.caster.penetration(plug.sensor, T) > 0)
     expected, happened = np.concatenate(expected), np.concatenate(happened)
     assert 0.8 < expected.mean() / happened.mean() < 1.4
     assert expected.max() <= 1 + 1e-6

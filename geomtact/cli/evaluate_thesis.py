@@ -37,14 +37,12 @@ def judge_thesis_table(
     Prints median errors, absolute and normalised, and writes them and every outcome to --out.
     """
     from geomtact.evaluation import known_approach
-    from geomtact.evaluation.scores import FELT, THESIS_PARTS
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.evaluation.scores import FELT
     from geomtact.inference.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 
     content, strength, gel = study_file.load(out, SCHEMA), study_options.noise_named(noise), Sensor.load(sensor)
-    meshes = [load_mesh(part, unit, sensor=gel) for part in parts or THESIS_PARTS]
-    for mesh in meshes:
+    for mesh in study_options.meshes(parts, unit, gel):
         settings = {
             "object": mesh.name,
             "object_sha256": mesh.sha256,

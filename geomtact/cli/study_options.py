@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
     from geomtact.inference.localizer import Localizer
     from geomtact.sensing.noise import Noise
+    from geomtact.sensing.sensor import Sensor
 
 
 class FeltName(StrEnum):
@@ -53,6 +54,14 @@ def noise_named(name: str) -> Noise:
     return {"none": noise.CLEAN, "moderate": noise.MODERATE, "heavy": noise.HEAVY}[name]
 
 
+def meshes(parts: Sequence[str | Path] | None, unit: str | None, sensor: Sensor) -> list[Mesh]:
+    """The meshes of the parts, the thesis's four by default: a wrong name is told before any work is done."""
+    from geomtact.evaluation.scores import THESIS_PARTS
+    from geomtact.geometry.mesh import load_mesh
+
+    return [load_mesh(part, unit, sensor=sensor) for part in parts or THESIS_PARTS]
+
+
 def localizers(
     parts: Sequence[str | Path] | None,
     unit: str | None,
@@ -63,14 +72,11 @@ def localizers(
 ) -> Iterator[Localizer]:
     """A localizer for each part, the thesis's four by default, prepared when its turn comes."""
     from geomtact.contact_space.resolution import MAX_POSES
-    from geomtact.evaluation.scores import THESIS_PARTS
-    from geomtact.geometry.mesh import load_mesh
     from geomtact.inference.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 
     gel = Sensor.load(sensor)
-    meshes = [load_mesh(part, unit, sensor=gel) for part in parts or THESIS_PARTS]  # a wrong name is told at once
-    for mesh in meshes:
+    for mesh in meshes(parts, unit, gel):
         with progress_bar(f"preparing {mesh.name}") as progress:
             localizer = Localizer.prepare(
                 mesh,

@@ -29,8 +29,7 @@ def divided_at_corners(surface: Surface, near: float) -> tuple[Faces, int]:
     """The faces with one open edge of each, at most, divided at the corners of open edges that lie on it; and how many were."""
     from scipy.spatial import cKDTree
 
-    edges, number, uses = surface.half_edges
-    bare = np.flatnonzero(uses[number] % 2 == 1)
+    edges, bare = surface.half_edges[0], surface.open_half_edges
     if not len(bare):
         return surface.faces, 0
     corners = np.unique(edges[bare])
@@ -41,15 +40,14 @@ def divided_at_corners(surface: Surface, near: float) -> tuple[Faces, int]:
     for i, half in enumerate(bare.tolist()):
         column, face = divmod(half, len(surface.faces))
         some = corners[around[i]]
-        along = (surface.vertices[some] - a[i]) @ (b[i] - a[i]) / max(length[i], 1e-300)
-        off = np.linalg.norm(
-            surface.vertices[some] - a[i] - along[:, None] * (b[i] - a[i]) / max(length[i], 1e-300), axis=1
-        )
+        way, from_a = (b[i] - a[i]) / max(length[i], 1e-300), surface.vertices[some] - a[i]
+        along = from_a @ way
+        off = np.linalg.norm(from_a - along[:, None] * way, axis=1)
         on = (off < near) & (along > near) & (along < length[i] - near)
         if on.any() and face not in fans:
             start, end, opposite = surface.faces[face, [column, (column + 1) % 3, (column + 2) % 3]]
-            way = [start, *some[on][np.argsort(along[on])], end]
-            fans[face] = np.array([[p, q, opposite] for p, q in itertools.pairwise(way)])
+            rim = [start, *some[on][np.argsort(along[on])], end]
+            fans[face] = np.array([[p, q, opposite] for p, q in itertools.pairwise(rim)])
     if not fans:
         return surface.faces, 0
     return np.concatenate([np.delete(surface.faces, list(fans), axis=0), *fans.values()]), len(fans)
@@ -111,13 +109,6 @@ def _about_an_edge(surface: Surface, edges: Faces, face: Faces, half: NDArray[np
                 todo = [t for t in todo if t not in (a, b)]
                 break
     return half[np.array(pairs)]
-
-
-def disagree(surface: Surface) -> bool:
-    """Whether two faces walk an edge that they share the same way."""
-    edges, number, uses = surface.half_edges
-    net = np.bincount(number, np.where(edges[:, 0] < edges[:, 1], 1, -1))
-    return bool((np.abs(net) > uses % 2).any())
 
 
 def canonical(faces: Faces) -> Faces:

@@ -35,8 +35,7 @@ def draw(name: str, unit: str, before: Surface, work: Work, proof: Proof, bound:
     for row, towards in zip(axes, _VIEWS, strict=True):
         image, extent, plane = _shaded(before, lambda _, face: np.tile(_PART, (len(face), 1)), towards, after)
         row[0].imshow(image, extent=extent)
-        edges, number, uses = before.half_edges
-        bare = before.vertices[edges[uses[number] % 2 == 1][:4000]] @ plane.T
+        bare = before.vertices[before.half_edges[0][before.open_half_edges[:4000]]] @ plane.T
         for line in bare:
             row[0].plot(*line.T, color=_OPEN, lw=1)
         row[1].imshow(_shaded(after, lambda _, face: colours[face], towards, after)[0], extent=extent)
@@ -69,7 +68,7 @@ def draw_values(
         image, extent, _ = _shaded(surface, lambda point, _: scale.to_rgba(value(point))[:, :3], towards, surface)
         each.imshow(image, extent=extent)
         each.set_xlabel(f"[{unit}]")
-    figure.colorbar(mpl.cm.ScalarMappable(mpl.colors.Normalize(low, high), "viridis"), ax=axes, shrink=0.8, label=words)
+    figure.colorbar(scale, ax=axes, shrink=0.8, label=words)
     out = io.BytesIO()
     canvas.print_png(out)
     return out.getvalue()

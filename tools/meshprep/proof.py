@@ -8,6 +8,7 @@ import numpy as np
 import pymeshlab
 import trimesh
 
+from geomtact.geometry.mesh import Mesh
 from meshprep.repair import Work
 from meshprep.surface import Array, Surface
 
@@ -86,17 +87,8 @@ def is_solid(path: str) -> str | None:
 
 def _points(surface: Surface) -> Array:
     """Corners, the middles of faces, and points spread evenly (n, 3)."""
-    rng = np.random.default_rng(0)
-    share = surface.areas / surface.areas.sum()
-    face = rng.choice(len(share), SAMPLES, p=share)
-    u, v = rng.random((2, SAMPLES, 1))
-    fold = u + v > 1
-    u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
-    a, b, c = np.moveaxis(surface.corners[face], 1, 0)
-    solid = surface.areas > 0
-    return np.concatenate(
-        [surface.corners.reshape(-1, 3), surface.corners[solid].mean(1), a + u * (b - a) + v * (c - a)]
-    )
+    spread = Mesh(surface.vertices, surface.faces, "", "").surface_points(SAMPLES)
+    return np.concatenate([surface.corners.reshape(-1, 3), surface.corners[surface.areas > 0].mean(1), spread])
 
 
 def _without(before: Surface, dropped: list[Surface]) -> Surface:

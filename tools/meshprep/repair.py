@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pymeshlab
-from numpy.typing import NDArray
 
 from meshprep import Refused
-from meshprep.edges import canonical, cut_up, disagree, divided_at_corners, without_repeats
+from meshprep.edges import canonical, cut_up, divided_at_corners, without_repeats
 from meshprep.surface import Array, Surface, label_faces
 
 _SEAM = 1e-5  # of the size, by which a corner may lie beside an edge that it divides
@@ -143,15 +142,15 @@ def cut(work: Work, options: Options) -> None:
 def winding(work: Work, options: Options) -> None:
     """Neighbouring faces agree about the outside, and every body is turned so that its outside is outside."""
     surface = work.surface
-    before, coherent = canonical(surface.faces), not disagree(surface)
-    work.coherent = coherent
-    if not coherent and not surface.crowded_edges:
+    before = canonical(surface.faces)
+    work.coherent = surface.coherent
+    if not work.coherent and not surface.crowded_edges:
         meshes = _meshset(surface)
         meshes.meshing_re_orient_faces_coherently()
         surface = _kept_exactly(_surface(meshes), surface)
         if len(surface.faces) != len(before):
             raise Refused("the surface has only one side (as a Moebius strip has); export the part as a solid")
-    surface = _outwards(surface, coherent)
+    surface = _outwards(surface, work.coherent)
     turned = int((canonical(surface.faces) != before).any(1).sum())
     if turned:
         work.changes["winding"] = f"{turned} of {len(before)} faces turned round"
@@ -170,14 +169,11 @@ def holes(work: Work, options: Options) -> None:
     if (filled.faces[: len(surface.faces)] != surface.faces).any():
         raise Refused("its holes could not be filled; close the surface in a mesh editor")
     piece = label_faces(new)
-    _check_rims(
-        filled, [np.unique(new[piece == k]) for k in range(int(piece.max(initial=-1)) + 1)], 2 * options.max_error
-    )
-    for k in range(int(piece.max(initial=-1)) + 1):
-        rim = filled.vertices[np.unique(new[piece == k])]
-        span = _span(rim)
-        area = float(filled.areas[len(surface.faces) :][piece == k].sum())
-        work.holes.append(Hole(area, span, rim.mean(0).tolist()))
+    rims = [filled.vertices[np.unique(new[piece == k])] for k in range(int(piece.max(initial=-1)) + 1)]
+    _check_rims(rims, 2 * options.max_error)
+    areas = np.bincount(piece, filled.areas[len(surface.faces) :])
+    for rim, area in zip(rims, areas.tolist(), strict=True):
+        work.holes.append(Hole(area, _span(rim), rim.mean(0).tolist()))
     widest = max(work.holes, key=lambda hole: hole.span, default=None)
     if widest is not None and widest.span > options.max_hole:
         where = ", ".join(f"{x:.4g}" for x in widest.middle)
@@ -323,16 +319,16 @@ def _outwards(surface: Surface, coherent: bool) -> Surface:
     return surface.with_faces(faces)
 
 
-def _check_rims(surface: Surface, rims: list[NDArray[np.int64]], near: float) -> None:
-    """Refuse to fill holes whose rims lie on each other: the two sides of a seam, behind which there is no hole."""
+def _check_rims(rims: list[Array], near: float) -> None:
+    """Refuse to fill holes whose rims, (n, 3) each, lie on each other: two sides of a seam, behind which there is no hole."""
     from scipy.spatial import cKDTree
 
     for i, rim in enumerate(rims):
-        tree = cKDTree(surface.vertices[rim])
+        tree = cKDTree(rim)
         for other in rims[i + 1 :]:
-            apart = tree.query(surface.vertices[other])[0]
+            apart = tree.query(other)[0]
             if apart.max() <= near:
-                where = ", ".join(f"{x:.4g}" for x in surface.vertices[other].mean(0))
+                where = ", ".join(f"{x:.4g}" for x in other.mean(0))
                 raise Refused(
                     f"two rims lie {apart.max():.2g} apart about ({where}): a seam, not a hole; join them with --merge "
                     f"{1.5 * apart.max():.1g} (in the file's unit)"

@@ -44,15 +44,21 @@ class Surface:
         return 0.5 * np.linalg.norm(self.crosses, axis=1)
 
     @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Least and largest coordinates (3,), (3,) of the vertices that faces use."""
+        used = self.vertices[np.unique(self.faces)]
+        return used.min(0), used.max(0)
+
+    @property
     def size(self) -> float:
         """Diagonal of the bounding box."""
-        used = self.vertices[np.unique(self.faces)]
-        return float(np.linalg.norm(used.max(0) - used.min(0)))
+        low, high = self.bounds
+        return float(np.linalg.norm(high - low))
 
-    @cached_property
+    @property
     def middle(self) -> Array:
-        used = self.vertices[np.unique(self.faces)]
-        return np.asarray(0.5 * (used.max(0) + used.min(0)))
+        low, high = self.bounds
+        return np.asarray(0.5 * (high + low))
 
     @cached_property
     def half_edges(self) -> tuple[Faces, NDArray[np.int64], NDArray[np.int64]]:
@@ -68,15 +74,31 @@ class Surface:
         return int((self.half_edges[2] % 2 == 1).sum())
 
     @cached_property
+    def open_half_edges(self) -> NDArray[np.int64]:
+        """Which of the half-edges (m,) run along open edges."""
+        _, number, uses = self.half_edges
+        return np.flatnonzero(uses[number] % 2 == 1)
+
+    @cached_property
     def crowded_edges(self) -> int:
         """Edges of more than two faces."""
         return int((self.half_edges[2] > 2).sum())
 
     @cached_property
+    def _walked(self) -> NDArray[np.float64]:
+        """How much oftener each edge is walked one way than the other."""
+        edges, number, _ = self.half_edges
+        return np.bincount(number, np.where(edges[:, 0] < edges[:, 1], 1, -1))
+
+    @property
     def torn_edges(self) -> int:
         """Edges that are not walked as often one way as the other."""
-        edges, number, _ = self.half_edges
-        return int((np.bincount(number, np.where(edges[:, 0] < edges[:, 1], 1, -1)) != 0).sum())
+        return int((self._walked != 0).sum())
+
+    @property
+    def coherent(self) -> bool:
+        """Whether no two faces walk an edge that they share the same way."""
+        return bool((np.abs(self._walked) <= self.half_edges[2] % 2).all())
 
     @cached_property
     def bodies(self) -> NDArray[np.int64]:

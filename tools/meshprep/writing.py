@@ -34,8 +34,8 @@ def write(before: Surface, work: Work, name: str, unit: str, out: Path, options:
     bound = options["max_deviation_mm"] / mm
     after = work.surface
     if after.open_edges:
-        edges, number, uses = after.half_edges
-        where = ", ".join(f"{mm * x:.4g}" for x in after.vertices[edges[(uses % 2 == 1)[number]][0]].mean(0))
+        edges, _, uses = after.half_edges
+        where = ", ".join(f"{mm * x:.4g}" for x in after.vertices[edges[after.open_half_edges[0]]].mean(0))
         raise Refused(
             f"{after.open_edges} of {len(uses)} edges are left open, one at ({where}) mm; close the surface in CAD"
         )
