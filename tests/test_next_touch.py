@@ -310,7 +310,7 @@ def test_the_choice_does_not_depend_on_the_frame(plug, a_touch, posterior):
 
 def test_cells_are_drawn_by_their_probability(plug, posterior, rng):
     sharp = replace(posterior, cells=posterior.cells[:3], log_prob=np.log([0.5, 0.5, 1e-12]), runs=None)
-    T = draw_cells(sharp, 20, rng)
+    T = draw_cells(sharp, 20, rng, 5)
     assert T.shape == (5, 20, 4, 4)
     held = plug.index.lookup(T.reshape(-1, 4, 4), plug.space.penetration(T.reshape(-1, 4, 4)))
     assert set(held.reshape(5, 20)[0]) <= set(posterior.cells[:2])

@@ -37,7 +37,7 @@ def draw_within(
             break
         new, pressed = index.draw(ids[todo], rng)
         new, ok = space.settle(new, pressed)
-        ok[ok] = np.isfinite(space.penetration(new[ok]))
+        ok[ok] = space.admits(new[ok])
         ok[ok] = index.lookup(new[ok], pressed[ok]) == ids[todo][ok]
         T[todo[ok]], depth[todo[ok]] = new[ok], pressed[ok]
         todo = todo[~ok]

@@ -15,8 +15,7 @@ from geomtact.se3 import Array, random_rotations, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
 
-# a pose may press deeper than the gel allows, or not quite touch, by a rounding error
-_ROUNDING = 1e-7
+# a pose settles to this, and so may press deeper than the gel allows, or not quite touch, by as much
 _SETTLED = 1e-6  # m
 
 
@@ -47,12 +46,18 @@ class ContactSpace:
         """Depth (n,) [m] of the deepest point in the window at ``T`` (n, 4, 4); NaN outside the contact pose space."""
         T = np.asarray(T, float).reshape(-1, 4, 4)
         depth = self.caster.penetration(self.sensor, T)
-        inside = (depth >= -_ROUNDING) & (depth <= self.sensor.max_penetration + _ROUNDING)
-        inside &= self.approaches(T)
-        if self.sensor.housing_depth is not None and inside.any():
-            lowest = self.caster.lowest_outside(self.sensor, T[inside])
-            inside[inside] = lowest >= -self.sensor.housing_depth - _ROUNDING
+        inside = (depth >= -_SETTLED) & (depth <= self.sensor.max_penetration + _SETTLED)
+        inside[inside] = self.admits(T[inside])
         return np.where(inside, np.clip(depth, 0, self.sensor.max_penetration), np.nan)
+
+    def admits(self, T: ArrayLike) -> NDArray[np.bool_]:
+        """Whether the approach and the sensor's housing allow the object at ``T`` (n, 4, 4), however deep it presses."""
+        T = np.asarray(T, float).reshape(-1, 4, 4)
+        allowed = self.approaches(T)
+        if self.sensor.housing_depth is not None and allowed.any():
+            lowest = self.caster.lowest_outside(self.sensor, T[allowed])
+            allowed[allowed] = lowest >= -self.sensor.housing_depth - _SETTLED
+        return allowed
 
     def settle(self, T: ArrayLike, depth: ArrayLike, steps: int = 30) -> tuple[Array, NDArray[np.bool_]]:
         """``T`` (n, 4, 4) moved along z until the deepest point in the window is ``depth`` (n,) [m] below the membrane.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.inference.posterior import Posterior, Refined
-from geomtact.inference.refine import TRUST, Refinery
+from geomtact.inference.refine import Refinery
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.observability import Spread, moved
 from geomtact.registration.protocol import Problem
@@ -34,9 +34,9 @@ _HOPEFUL = 4  # of the poses tried for a cell, that are asked for by more than t
 _KEPT = 3  # poses of a cell that are registered
 _ROUNDS, _AROUND = 3, 12  # of the last search, each in half the width of the one before
 _CHECKED = 4  # of the poses tried for each cell, whether they touch
-# Shares of their mass that cells keep where a pose was found that explains all: those looked into, whatever is likely within
-# them, and all others, in which as good a one may lie. Chosen on scenes that the study does not judge (docs/several-sensors.md)
-_DOUBT, _ELSEWHERE = 0.03, 0.5
+# Of the joint likelihood at one pose, and share of their mass that the cells looked into keep, whatever is likely within them.
+# Chosen, as is 1 / N below, on scenes that the study does not judge (docs/several-sensors.md)
+_TRUST, _DOUBT = 0.3, 0.03
 _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
 # nats, for each sensor, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 _ALIKE, _UNLIKE = 3.0, 8.0
@@ -103,7 +103,7 @@ def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: i
     drawn, merit = search.drawn(looked_into)
     within = merit.max(1)  # so likely is what is seen somewhere in each cell
     prior = posterior.cell_log_density(looked_into) + index.log_weight[looked_into]
-    chosen = np.argsort(-(prior + TRUST * within), kind="stable")[: _PER_MODE * k]
+    chosen = np.argsort(-(prior + _TRUST * within), kind="stable")[: _PER_MODE * k]
     tried, merit = search.around_the_best(*search.registered(drawn[chosen], merit[chosen]))
     home, poses, merit = search.best_of_each_cell(tried.reshape(-1, 4, 4), merit.ravel(), _CHECKED * len(chosen))
     held = posterior.cell_log_density(home) > -np.inf
@@ -116,8 +116,9 @@ def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: i
     np.maximum.at(likely, np.searchsorted(judged, home), merit)
     unexplained = (search.most.sum() - merit.max(initial=-np.inf)) / len(views)
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
-    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, _ELSEWHERE))
-    posterior = posterior.shared_anew(judged, TRUST * likely, doubt, elsewhere, _BEFORE)
+    # in cells not looked into as good a pose may lie, but the more sensors there are to be explained, the more seldom
+    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, 1 / len(views)))
+    posterior = posterior.shared_anew(judged, _TRUST * likely, doubt, elsewhere, _BEFORE)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: len(chosen)]
     return replace(posterior, refined=search.told(home[leading], poses[leading]))

@@ -201,18 +201,18 @@ def next_touch(
     tried = [a if isinstance(a, Touch | Probe) else Touch(np.asarray(a)) for a in actions]
     if not tried:
         raise UsageError("next_touch: no actions to choose from; give some, or none at all for a grid of touches")
-    T = draw_cells(posterior, n, np.random.default_rng(seed))
+    T = draw_cells(posterior, n, np.random.default_rng(seed), len(_PRESSED))
     judged = [judge(posterior.space, action, T, number) for number, action in enumerate(tried, 1)]
     return sorted(judged, key=lambda a: -round(a.expected_nats / a.cost, 9))
 
 
-def draw_cells(posterior: Belief, n: int, rng: np.random.Generator) -> Array:
-    """Poses (d, n, 4, 4) of the object: ``n`` cells drawn from the posterior, and ``d`` poses within each."""
+def draw_cells(posterior: Belief, n: int, rng: np.random.Generator, within: int = 1) -> Array:
+    """Poses (d, n, 4, 4) of the object: ``n`` cells drawn from the posterior, and d = ``within`` poses in each."""
     p = np.exp(np.asarray(posterior.log_prob, float))
     row = rng.choice(len(p), n, p=p / p.sum())
     runs = np.ones(n, np.int64) if posterior.runs is None else posterior.runs[row]
     cells = posterior.index.within_runs(posterior.cells[row], runs, rng.random(n))
-    T, _, _ = draw_within(posterior.index, posterior.space, np.tile(cells, len(_PRESSED)), rng)
+    T, _, _ = draw_within(posterior.index, posterior.space, np.tile(cells, within), rng)
     return posterior.T_frame_sensor @ T.reshape(-1, n, 4, 4)
 
 
