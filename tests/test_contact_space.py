@@ -308,6 +308,13 @@ def test_the_budget_of_poses_is_about_kept(localizer):
     assert 0.4 * 20_000 < len(localizer.index) < 2.2 * 60_000
 
 
+def test_a_rotation_at_which_nothing_touches_borrows_the_places_of_another(tmp_path):
+    """On a grid of so few poses none of the points at which touching is looked for touches, at some rotations."""
+    index = open_index(load_mesh("bracket"), Sensor.load("gelslim"), None, 3_000, tmp_path)
+    empty = np.setdiff1d(np.arange(len(index.table)), index.rotation)
+    assert len(empty) and (index.table[empty] >= 0).all()
+
+
 # --- the cache
 
 

@@ -132,7 +132,8 @@ def _touches(there: HeightMap, turn: float, frame: Frame, window: Window) -> _Tu
     z = np.where(seen, z, z.max(0))
     kept = share.any(0)
     cell, centres, masks, z, share = cell[kept], centres[kept], masks[:, kept], z[:, kept], share[:, kept]
-    summed = moments(masks.reshape(-1, *window.mask_shape), window.sensor).reshape(*masks.shape[:2], -1)
+    summed = moments(masks.reshape(-1, *window.mask_shape), window.sensor)
+    summed = summed.reshape(*masks.shape[:2], summed.shape[-1])  # there may be no place at all
     packed = pack(masks).swapaxes(1, 2)
     return _Turn(cell, -centres, z, share, packed, masks.sum(2), np.moveaxis(summed, 2, 0))
 

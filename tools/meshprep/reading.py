@@ -26,7 +26,7 @@ _THREE_MF = {
     "m": "m",
     "in": "inch",
 }
-_STEP_TOLERANCE = 0.01  # of tessellation [mm]
+TESSELLATION = 0.01  # of STEP files: how far from their surface its triangles may lie [mm]
 
 
 def read(path: Path, unit: str | None, sensor: Sensor) -> tuple[Surface, str]:
@@ -80,7 +80,7 @@ def _scene(path: Path):
             import cascadio  # noqa: F401
         except ImportError:
             raise Refused("STEP files need cascadio; install the extra with pip install 'geomtact[step]'") from None
-        options = {"tol_linear": _STEP_TOLERANCE, "tol_angular": 0.1}
+        options = {"tol_linear": TESSELLATION, "tol_angular": 0.1}
     try:
         # process=False: trimesh would merge, drop and reorder by rules of its own
         return trimesh.load_scene(str(path), process=False, **options)
