@@ -25,7 +25,8 @@ SCHEMA = "geomtact/scores/2"
 
 @dataclass(frozen=True)
 class Options:
-    """What a study's figures depend on, beside the parts and the scores: ``felt`` is one of ``scores.FELT``."""
+    """What a study's figures depend on, beside the parts and the scores: ``felt`` is one of ``scores.FELT``, ``only`` a class
+    of contact or None for all."""
 
     sensor: Sensor
     touches: int
@@ -34,14 +35,18 @@ class Options:
     effort: str
     seed: int
     max_poses: int
+    only: str | None
 
     def __str__(self) -> str:
-        return f"{self.touches} touches on {self.sensor.name}, {self.felt}, {self.noise} noise"
+        kind = f"{self.only} " if self.only else ""
+        return f"{self.touches} {kind}touches on {self.sensor.name}, {self.felt}, {self.noise} noise"
 
     def settings(self) -> dict[str, Any]:
         """As they stand in the file."""
         strength = study_options.noise_named(self.noise)
-        named = {"sensor": self.sensor.name, "noise": {"name": self.noise, **asdict(strength)}}
+        named: dict[str, Any] = {"sensor": self.sensor.name, "noise": {"name": self.noise, **asdict(strength)}}
+        if self.only:
+            named["only"] = self.only
         return named | {key: getattr(self, key) for key in ("touches", "felt", "effort", "seed", "max_poses")}
 
 
@@ -95,6 +100,7 @@ def judge_scores(
     effort: study_options.EffortLevel = Effort.balanced,
     seed: study_options.Seed = 1,
     max_poses: study_options.MaxPoses = None,
+    only: study_options.Only = None,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
@@ -118,6 +124,7 @@ def judge_scores(
         effort=effort.value,
         seed=seed,
         max_poses=max_poses or MAX_POSES,
+        only=only and only.value,
     )
     content = study_file.load(out, SCHEMA)
     settings = plain(options.settings())
@@ -197,7 +204,7 @@ def _judge(
 
     if len(outcomes) < options.touches and not touches:
         elastic, strength = scores.FELT[options.felt], study_options.noise_named(options.noise)
-        touches += study.make_touches(localizer, options.touches, options.seed, strength, elastic=elastic)
+        touches += study.make_touches(localizer, options.touches, options.seed, strength, None, elastic, options.only)
     todo = scores.judged(localizer, touches[len(outcomes) :], effort, options.seed)
     keep(study_file.collect(outcomes, todo, options.touches, f"judging {mesh.name}, {name}", keep))
     tell(f"{mesh.name}, {name}: done")

@@ -27,6 +27,14 @@ class FeltName(StrEnum):
     both = "both"
 
 
+class ClassName(StrEnum):
+    flat = "flat"
+    edge = "edge"
+    corner = "corner"
+    cylinder = "cylinder"
+    texture = "texture"
+
+
 Parts = Annotated[list[str], typer.Argument(metavar="OBJECT...", help="Parts (see 'geomtact objects') or mesh files.")]
 ThesisParts = Annotated[
     list[str] | None,
@@ -35,6 +43,9 @@ ThesisParts = Annotated[
 SensorName = Annotated[str, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
 NoiseLevel = Annotated[NoiseName, typer.Option("--noise", help="How strongly the masks are spoilt.")]
 Felt = Annotated[FeltName, typer.Option("--felt", help="What the gel is.")]
+Only = Annotated[
+    ClassName | None, typer.Option("--only", help="Touches of one kind of contact; all by default.", show_default=False)
+]
 EffortLevel = Annotated[Effort, typer.Option("--effort", help="How much to compute.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
 MaxPoses = Annotated[

@@ -58,14 +58,22 @@ class Outcome:
 
 
 def make_touches(
-    scene: Any, n: int, seed: int, noise: Noise, felt: Felt | None = None, elastic: bool | None = None
+    scene: Any,
+    n: int,
+    seed: int,
+    noise: Noise,
+    felt: Felt | None = None,
+    elastic: bool | None = None,
+    only: str | None = None,
 ) -> list[Touch]:
     """``n`` touches of ``scene`` (anything with a ``space``), geometric and elastic in turn unless ``elastic`` says which.
+
+    ``only`` names a class of contact, as in ``touches.random_touches``.
 
     ``felt`` (space, T, elastic) -> (H, W) bool replaces the elastic touches' masks: with another solver than the one
     that the posterior was calibrated with.
     """
-    touches = random_touches(scene, n, seed, elastic, noise)
+    touches = random_touches(scene, n, seed, elastic, noise, only)
     if felt is None:
         return touches
     from geomtact.contact_space.touch import spoilt

@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
+from geomtact.errors import InputError
+from geomtact.evaluation.contact_class import contact_class
 from geomtact.se3 import Array
 from geomtact.sensing.noise import MODERATE, Noise
 
 PENETRATION = (0.3e-3, 1.5e-3)
+_TRIED = 2000  # touches, at most, for each one found of a class
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,12 @@ def counts(space: ContactSpace, mask: NDArray[np.bool_]) -> bool:
 
 
 def random_touches(
-    localizer: Any, n: int, seed: int, elastic: bool | None = None, noise: Noise = MODERATE
+    localizer: Any,
+    n: int,
+    seed: int,
+    elastic: bool | None = None,
+    noise: Noise = MODERATE,
+    only: str | None = None,
 ) -> list[Touch]:
     """``n`` touches of ``localizer.mesh`` on ``localizer.sensor``.
 
@@ -48,13 +56,28 @@ def random_touches(
     Parameters
     ----------
     elastic : True for an elastic gel, False for the thesis's threshold, None for one after the other
+    only : the class of contact that they all are of, one of ``contact_class.CLASSES``; None for touches of any class
+
+    Raises
+    ------
+    InputError
+        Hardly any touch of the object is of that class.
     """
     rng = np.random.default_rng(seed)
     space: ContactSpace = localizer.space
     out: list[Touch] = []
+    tried = 0
     while len(out) < n:
-        T, depth = space.sample(min(64, 2 * (n - len(out)) + 8), rng, penetrations(space))
+        some = 64 if only else min(64, 2 * (n - len(out)) + 8)
+        T, depth = space.sample(some, rng, penetrations(space))
+        tried += len(T)
+        if tried > _TRIED * (len(out) + 1):
+            raise InputError(
+                f"{space.mesh.name}: {tried:,} touches gave {len(out)} of class {only!r}; take another part"
+            )
         for pose, d in zip(T, depth, strict=True):
+            if only is not None and contact_class(space, pose) != only:
+                continue
             soft = len(out) % 2 == 1 if elastic is None else elastic
             mask = felt_mask(space, pose, soft)
             if counts(space, mask) and len(out) < n:
