@@ -37,7 +37,7 @@ def judge_touches(
 
     Prints gain, coverage and pose errors for each number of sensors, and writes them and every outcome to --out.
     """
-    from geomtact.evaluation import multitouch, study
+    from geomtact.evaluation import sensors_study, study
     from geomtact.evaluation.scores import FELT
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
@@ -53,13 +53,13 @@ def judge_touches(
         done = study_file.earlier(content["parts"].get(name), settings)
 
         def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
-            flat = [multitouch.Fused(**study_file.numbers(o)) for some in outcomes for o in some]
-            figures = multitouch.summarise(flat)
+            flat = [sensors_study.Fused(**study_file.numbers(o)) for some in outcomes for o in some]
+            figures = sensors_study.summarise(flat)
             study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=outcomes)
 
         if len(done) < scenes:
-            made = multitouch.make_scenes(localizer, scenes, seed, strength, FELT[felt])
-            more = multitouch.fuse_scenes(localizer, made, effort, seed, first=len(done))
+            made = sensors_study.make_scenes(localizer, scenes, seed, strength, FELT[felt])
+            more = sensors_study.fuse_scenes(localizer, made, effort, seed, first=len(done))
             done = study_file.collect(
                 done, ([asdict(o) for o in some] for some in more), scenes, f"fusing {name}", keep
             )
