@@ -17,6 +17,7 @@ from geomtact.cli.evaluate_kitting import judge_kitting
 from geomtact.cli.evaluate_next_touch import judge_next_touch
 from geomtact.cli.evaluate_registration import judge_registration
 from geomtact.cli.evaluate_scores import judge_scores
+from geomtact.cli.evaluate_stability import judge_stability
 from geomtact.cli.evaluate_thesis import judge_thesis_table
 from geomtact.cli.evaluate_touches import judge_touches
 from geomtact.cli.evaluate_track import judge_track
@@ -172,3 +173,4 @@ evaluate.command("triplets")(one_line_errors(judge_triplets))
 evaluate.command("track")(one_line_errors(judge_track))
 evaluate.command("next-touch")(one_line_errors(judge_next_touch))
 evaluate.command("kitting")(one_line_errors(judge_kitting))
+evaluate.command("stability")(one_line_errors(judge_stability))

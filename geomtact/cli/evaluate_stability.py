@@ -1,0 +1,85 @@
+"""``geomtact evaluate stability``: conditions made worse step by step, and whether the answers know that they are worse."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import typer
+
+from geomtact.cli import study_file, study_options
+from geomtact.cli.library import CacheDir
+from geomtact.cli.localize import Effort
+from geomtact.cli.prepare import Unit
+from geomtact.cli.shell import print_table, tell
+
+SCHEMA = "geomtact/stability/1"
+
+
+def judge_stability(
+    parts: study_options.ThesisParts = None,
+    unit: Unit = None,
+    sweep: Annotated[
+        list[str] | None, typer.Option("--sweep", help="A condition to make worse; may be repeated; all by default.")
+    ] = None,
+    sensor: study_options.SensorName = "gelslim",
+    touches: Annotated[int, typer.Option("--touches", min=1, help="How many of each part at each level.")] = 200,
+    effort: study_options.EffortLevel = Effort.balanced,
+    seed: study_options.Seed = 1,
+    max_poses: study_options.MaxPoses = None,
+    out: study_options.Out = None,
+    plot: study_options.Plot = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Judge stability: noise, wrong pixels, wrong meshes, small contacts and wrong rigs, from easy to broken.
+
+    Prints for each level what is known, how often the answer is wrong, and how often nothing says so; and writes all to --out.
+    """
+    from geomtact.errors import UsageError, nearest_name
+    from geomtact.evaluation import stability, study
+
+    names = sweep or list(stability.SWEEPS)
+    for name in names:
+        if name not in stability.SWEEPS:
+            raise UsageError(f"no sweep named {name!r}{nearest_name(name, stability.SWEEPS)}")
+    content = study_file.load(out, SCHEMA)
+    for localizer in study_options.localizers(parts, unit, sensor, cache_dir, max_poses):
+        settings = study.describe(localizer) | {"touches": touches, "effort": effort.value, "seed": seed}
+        part = localizer.mesh.name
+        found = content["parts"].get(part)
+        sweeps = dict(found["sweeps"]) if found is not None and study_file.same(found, settings) else {}
+        for name in names:
+            one = stability.SWEEPS[name]
+            done = sweeps.setdefault(name, {"title": one.title, "inside": list(one.inside), "levels": []})["levels"]
+            for level in one.levels[len(done) :]:
+                todo = stability.swept(localizer, one, level, touches, seed, effort)
+                told = study_file.collect([], todo, touches, f"{part}: {one.title} {level:g}", lambda _: None)
+                if told:
+                    figures = stability.summarise(told)
+                    done.append({"level": level, "figures": figures, "answers": [asdict(a) for a in told]})
+                study_file.keep(out, content, part, settings=settings, sweeps=sweeps)
+        study_file.keep(out, content, part, settings=settings, sweeps=sweeps)
+        _print(part, {name: sweeps[name] for name in names})
+    if plot is not None:
+        from geomtact.report.stability_plot import draw_stability
+
+        study_file.draw(draw_stability(content), plot)
+
+
+def _print(part: str, sweeps: Mapping[str, Any]) -> None:
+    rows = []
+    for sweep in sweeps.values():
+        for at in sweep["levels"]:
+            f = at["figures"]
+            mark = "" if at["level"] in sweep["inside"] else "*"
+            held = [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in f["coverage"]]
+            shares = ["-" if f[k] is None else f"{100 * f[k]:.0f} %" for k in ("wrong", "warned", "silent", "alarmed")]
+            nats = "-" if f["gain_mean"] is None else f"{f['gain_mean']:.2f}"
+            told = [nats, f"{f['claimed_mean']:.2f}", f"{100 * f['ruled_out']:.0f} %"]
+            rows.append([sweep["title"], f"{at['level']:g}{mark}", str(f["n"]), *told, *held, *shares])
+    numbers = ["level", "n", "gain [nats]", "claimed", "ruled out", "in 50 %", "in 90 %"]
+    shares = ["wrong", "warned", "silent", "right but warned"]
+    typer.echo(f"{part}: levels marked * lie outside what is promised; silent are wrong ones that nothing gives away")
+    print_table(["condition", *numbers, *shares], rows, [*numbers, *shares])
+    tell(f"{part}: done")

@@ -1,0 +1,322 @@
+"""Stability: what is touched, and how, made worse step by step, while the localizer is left as it was prepared.
+
+Each sweep leads from what the localizer was made for to what breaks it. A wrong answer is found out if it carries a warning
+or its first mode says itself that it holds less than half; it is silent otherwise. Silent ones are what a sweep looks for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
+from geomtact.errors import NoPoseAgreesError
+from geomtact.evaluation.pose_error import coverage, mssd
+from geomtact.evaluation.sensors_study import make_scenes
+from geomtact.evaluation.study import CERTAIN, WRONG_MM
+from geomtact.evaluation.touches import penetrations
+from geomtact.geometry.mesh import Mesh
+from geomtact.inference.localizer import Localizer
+from geomtact.inference.posterior import Posterior
+from geomtact.se3 import Array, exp
+from geomtact.sensing.noise import MODERATE, Noise
+from geomtact.sensing.sensor import Sensor
+
+_TRIED = 500  # touches, at most, for each one that a sweep takes
+_BUMP = 3e-3  # m over which a scanned surface is off alike
+_SENSORS = 3  # that touch at once, where the rig is wrong
+
+
+@dataclass(frozen=True)
+class World:
+    """What is touched and how, unknown to the localizer.
+
+    Attributes
+    ----------
+    pressed : (least, largest) penetration [m]
+    threshold : a rigid gel feels what is so deep [m]; None for rigid and elastic gels in turn
+    area : (least, largest) area of contact [m^2], without noise
+    border : (least, largest) share of the contact's outline that the window's border cuts off
+    """
+
+    mesh: Mesh
+    sensor: Sensor
+    noise: Noise
+    pressed: tuple[float, float]
+    threshold: float | None = None
+    area: tuple[float, float] = (LEAST_CONTACT, np.inf)
+    border: tuple[float, float] = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One condition that gets worse.
+
+    Attributes
+    ----------
+    title : what it is, with its unit
+    levels : from easy to broken
+    inside : those of them that the documentation promises to hold
+    world : of one touch at a level; None for sweeps of a rig
+    rig : (6,) standard deviation by which each sensor of a rig is off at a level [rad, m]
+    """
+
+    title: str
+    levels: tuple[float, ...]
+    inside: tuple[float, ...]
+    world: Callable[[World, float], World] | None = None
+    rig: Callable[[float], Array] | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was told of one touch, or one scene. Lengths in millimetres, information in nats.
+
+    Attributes
+    ----------
+    gain : log density at the true pose; -inf where it was given no probability
+    claimed : minus the entropy
+    level : credible level of the true pose
+    mssd_mm, probability : of the first mode; inf and 0 where there is none
+    warned : whether a warning came with it; an error in place of an answer counts as one
+    """
+
+    gain: float
+    claimed: float
+    level: float
+    mssd_mm: float
+    probability: float
+    warned: bool
+
+    @property
+    def wrong(self) -> bool:
+        return self.mssd_mm > WRONG_MM
+
+    @property
+    def silent(self) -> bool:
+        """Wrong, and nothing says so."""
+        return self.wrong and self.probability >= CERTAIN and not self.warned
+
+
+def larger(mesh: Mesh, percent: float) -> Mesh:
+    """The mesh grown by so much about its centre."""
+    return replace(mesh, vertices=mesh.centre + (1 + percent / 100) * (mesh.vertices - mesh.centre))
+
+
+def scanned(mesh: Mesh, rms: float, seed: int = 0) -> Mesh:
+    """The mesh as a scanner might give it: divided finely, and its surface displaced by a smooth random field of ``rms`` [m]."""
+    import trimesh
+
+    if rms == 0:
+        return mesh
+    fine = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _BUMP / 2))
+    rng = np.random.default_rng(seed)
+    # plane waves of random directions and lengths: smooth, and nowhere special
+    waves = rng.normal(size=(64, 3)) / _BUMP
+    phase = fine.vertices @ waves.T + rng.uniform(0, 2 * np.pi, 64)
+    off = rms * np.sqrt(2 / 64) * np.cos(phase).sum(1)
+    return replace(mesh, vertices=fine.vertices + off[:, None] * fine.vertex_normals, faces=fine.faces)
+
+
+def coarser(mesh: Mesh, percent: float) -> Mesh:
+    """The mesh with so many of its faces kept."""
+    import open3d as o3d
+
+    if percent >= 100:
+        return mesh
+    vertices, faces = o3d.utility.Vector3dVector(mesh.vertices.copy()), o3d.utility.Vector3iVector(mesh.faces.copy())
+    full = o3d.geometry.TriangleMesh(vertices, faces)
+    some = full.simplify_quadric_decimation(max(4, int(len(mesh.faces) * percent / 100)))
+    return replace(mesh, vertices=np.asarray(some.vertices), faces=np.asarray(some.triangles))
+
+
+def _both(factor: float, pitch: tuple[float, float]) -> tuple[float, float]:
+    return factor * pitch[0], factor * pitch[1]
+
+
+SWEEPS = {
+    "noise": Sweep(
+        "outline displaced by [mm rms]",
+        (0.0, 0.1, 0.2, 0.5, 1.0),
+        (0.0, 0.1, 0.2, 0.5),
+        lambda w, x: replace(w, noise=replace(w.noise, outline_rms=1e-3 * x)),
+    ),
+    "specks": Sweep(
+        "specks of dirt", (0, 2, 6, 20, 60), (0, 2, 6), lambda w, x: replace(w, noise=replace(w.noise, specks=int(x)))
+    ),
+    "depth": Sweep(
+        "pressed in by [mm]",
+        (0.1, 0.3, 0.8, 1.5, 2.5, 4.0),
+        (0.3, 0.8, 1.5),
+        lambda w, x: replace(
+            w,
+            pressed=(0.9e-3 * x, 1.1e-3 * x),
+            sensor=replace(w.sensor, max_penetration=max(w.sensor.max_penetration, 1.2e-3 * x)),
+        ),
+    ),
+    "pitch": Sweep(
+        "pixels larger than said by [%]",
+        (0, 1, 2, 5, 10),
+        (0, 1, 2),
+        lambda w, x: replace(w, sensor=replace(w.sensor, pixel_pitch=_both(1 + x / 100, w.sensor.pixel_pitch))),
+    ),
+    "size": Sweep(
+        "part larger than its mesh by [%]", (0, 1, 2, 5), (0, 1), lambda w, x: replace(w, mesh=larger(w.mesh, x))
+    ),
+    "surface": Sweep(
+        "surface off its mesh by [mm rms]",
+        (0, 0.05, 0.1, 0.2, 0.5),
+        (0, 0.05, 0.1),
+        lambda w, x: replace(w, mesh=scanned(w.mesh, 1e-3 * x)),
+    ),
+    "faces": Sweep(
+        "faces kept of the mesh [%]", (100, 30, 10, 3), (100, 30), lambda w, x: replace(w, mesh=coarser(w.mesh, x))
+    ),
+    "threshold": Sweep(
+        "gel feels nothing shallower than [mm]",
+        (0, 0.05, 0.1, 0.2, 0.4),
+        (0, 0.05),
+        lambda w, x: replace(w, threshold=1e-3 * x),
+    ),
+    "area": Sweep(
+        "area of contact, to twice as much [mm2]",
+        (16, 8, 4, 2, 1, 0.5, 0.1),
+        (16, 8, 4, 2, 1),
+        lambda w, x: replace(w, area=(1e-6 * x, 2e-6 * x), pressed=(0.2 * w.pressed[0], w.pressed[1])),
+    ),
+    "border": Sweep(
+        "outline cut off by the border, at least [%]",
+        (0, 10, 25, 40),
+        (0, 10, 25),
+        lambda w, x: replace(w, border=(x / 100, 1.0) if x else (0.0, 0.0)),
+    ),
+    "rig_shift": Sweep(
+        "each of three sensors off by [mm rms]",
+        (0, 0.5, 1, 2, 5, 10),
+        (0, 0.5),
+        rig=lambda x: np.array([0, 0, 0, 1, 1, 1]) * 1e-3 * x / np.sqrt(3),
+    ),
+    "rig_turn": Sweep(
+        "each of three sensors turned by [deg rms]",
+        (0, 0.5, 1, 2, 5, 10),
+        (0, 0.5),
+        rig=lambda x: np.array([1, 1, 1, 0, 0, 0]) * np.radians(x) / np.sqrt(3),
+    ),
+}
+
+
+def swept(localizer: Localizer, sweep: Sweep, level: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
+    """Answers to ``n`` touches, or scenes of three, at a level of a sweep."""
+    if sweep.rig is not None:
+        yield from _rigs(localizer, sweep.rig(level), n, seed, effort)
+        return
+    assert sweep.world is not None
+    here = World(localizer.mesh, localizer.sensor, MODERATE, penetrations(localizer.space))
+    for T, mask in touches(sweep.world(here, level), n, seed):
+        yield judged(
+            localizer, _knowable(localizer.space, T), localizer.localize(mask, "mask", effort=effort, seed=seed)
+        )
+
+
+def _knowable(space: ContactSpace, T: Array) -> Array:
+    """``T`` (4, 4), moved along z into the contact pose space where another world's contact lies outside."""
+    if np.isfinite(space.penetration(T[None])[0]):
+        return T
+    depth = space.caster.penetration(space.sensor, T[None])[0]
+    settled, ok = space.settle(T[None], np.clip(depth, 1e-6, space.sensor.max_penetration - 1e-6))
+    return settled[0] if ok[0] else T
+
+
+def touches(world: World, n: int, seed: int) -> Iterator[tuple[Array, NDArray[np.bool_]]]:
+    """Up to ``n`` touches of a world, uniform over its contact pose space: the true pose (4, 4), and what is felt (H, W).
+
+    Fewer where hardly any touch is as the world wants it.
+    """
+    rng, space = np.random.default_rng(seed), ContactSpace(world.mesh, world.sensor)
+    pixel = float(np.prod(world.sensor.pixel_pitch))
+    found = 0
+    for _ in range(_TRIED * n // 32):
+        for T in space.sample(32, rng, world.pressed)[0]:
+            mask = _felt(space, T, world.threshold, found % 2 == 1)
+            if not (world.area[0] <= mask.sum() * pixel <= world.area[1]):
+                continue
+            if not (world.border[0] <= cut_off(mask) <= world.border[1]):
+                continue
+            yield T, spoilt(mask, space, world.noise, rng)
+            found += 1
+            if found == n:
+                return
+
+
+def _felt(space: ContactSpace, T: Array, threshold: float | None, elastic: bool) -> NDArray[np.bool_]:
+    if threshold is None:
+        return felt_mask(space, T, elastic)
+    return np.asarray(space.caster.depths(space.sensor, T[None])[0] > threshold)
+
+
+def cut_off(mask: NDArray[np.bool_]) -> float:
+    """Share of the outline of ``mask`` (H, W) that lies on the image's border, by pixel edges."""
+    inner = np.count_nonzero(mask[1:] != mask[:-1]) + np.count_nonzero(mask[:, 1:] != mask[:, :-1])
+    outer = mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum()
+    return float(outer / max(1, inner + outer))
+
+
+def _rigs(localizer: Localizer, off: Array, n: int, seed: int, effort: str) -> Iterator[Answer]:
+    """Scenes of three sensors whose poses are told wrongly, each off at random by ``off`` (6,), but the first."""
+    rng = np.random.default_rng([seed, 7])
+    for scene in make_scenes(localizer, n, seed, MODERATE, None):
+        T = scene.T_world_sensor[:_SENSORS].copy()
+        T[1:] = T[1:] @ np.array([exp(off * rng.normal(size=6)) for _ in T[1:]])
+        masks = [touch.mask for touch in scene.touches[:_SENSORS]]
+        try:
+            yield judged(
+                localizer,
+                scene.T_world_object,
+                localizer.localize(masks, "mask", T_world_sensor=T, effort=effort, seed=seed),
+            )
+        except NoPoseAgreesError:
+            yield Answer(-np.inf, 0.0, 1.0, np.inf, 0.0, True)
+
+
+def judged(localizer: Localizer, T: Array, posterior: Posterior) -> Answer:
+    """A posterior held against the truth ``T`` (4, 4)."""
+    modes = posterior.modes(1)
+    poses = np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
+    return Answer(
+        gain=float(posterior.log_density(T)),
+        claimed=-float(posterior.entropy_nats),
+        level=float(posterior.credible_level(T)),
+        mssd_mm=float(1e3 * mssd(T, poses, localizer.mesh).min(initial=np.inf)),
+        probability=modes[0].probability if modes else 0.0,
+        warned=bool(posterior.warnings),
+    )
+
+
+def summarise(answers: Sequence[Answer]) -> dict[str, Any]:
+    """Figures of the answers at one level.
+
+    ``ruled_out`` is the share of truths that were given no probability; ``found_out`` the share of wrong answers that carry a
+    warning or hold less than half, ``alarmed`` that of right ones which carry a warning; both None where there are no such.
+    Gains are of the truths not ruled out. Coverage has 99 % intervals.
+    """
+    gain = np.array([a.gain for a in answers])
+    felt = np.isfinite(gain)
+    wrong, right = [a for a in answers if a.wrong], [a for a in answers if not a.wrong]
+    return {
+        "n": len(answers),
+        "gain_mean": float(gain[felt].mean()) if felt.any() else None,
+        "claimed_mean": float(np.mean([a.claimed for a in answers])),
+        "ruled_out": float(1 - felt.mean()),
+        "mssd_mm_median": float(np.median([a.mssd_mm for a in answers])),
+        "wrong": len(wrong) / len(answers),
+        "warned": float(np.mean([a.warned for a in answers])),
+        "silent": float(np.mean([a.silent for a in answers])),
+        "found_out": float(np.mean([not a.silent for a in wrong])) if wrong else None,
+        "alarmed": float(np.mean([a.warned for a in right])) if right else None,
+        "coverage": [asdict(c) for c in coverage([a.level for a in answers], (0.5, 0.9), 0.99)],
+    }

@@ -1,0 +1,74 @@
+"""A picture of how answers hold as conditions get worse, drawn from the study's JSON alone."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from geomtact.report.touches_plot import COLOURS
+
+_ACROSS = 4
+
+
+def draw_stability(content: Mapping[str, Any]) -> bytes:
+    """A PNG: for each sweep the information told and claimed; and below how many truths the 90 % region holds, with 99 %
+    intervals, and how many answers are wrong while nothing says so.
+
+    What is promised lies on a light ground. Parts are told apart by colour.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    parts = content["parts"]
+    names = list(dict.fromkeys(name for part in parts.values() for name in part["sweeps"]))
+    across = min(_ACROSS, max(1, len(names)))
+    down = -(-len(names) // across)
+    figure = Figure(figsize=(4.2 * across, 4.4 * down + 0.4), dpi=100, layout="constrained", facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    grid = figure.subplots(2 * down, across, squeeze=False, height_ratios=[3, 2] * down)
+    for axes in grid.ravel():
+        axes.set_visible(False)
+    for number, name in enumerate(names):
+        row, column = divmod(number, across)
+        pair = grid[2 * row, column], grid[2 * row + 1, column]
+        _draw(pair, [(part, sweeps["sweeps"][name]) for part, sweeps in parts.items() if name in sweeps["sweeps"]])
+    handles = [figure.axes[0].plot([], [], "o-", color=c, label=p)[0] for p, c in zip(parts, COLOURS, strict=False)]
+    styles = (("o-", "told; below, in the 90 % region"), ("--", "claimed"), (":", "wrong, and nothing says so"))
+    handles += [figure.axes[0].plot([], [], style, color="0.4", label=label)[0] for style, label in styles]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    out = io.BytesIO()
+    canvas.print_png(out)
+    return out.getvalue()
+
+
+def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
+    """One sweep into the two axes of ``pair``."""
+    nats, shares = pair
+    _, sweep = parts[0]
+    labels = [f"{at['level']:g}" for at in sweep["levels"]]
+    x = range(len(labels))
+    for (_, each), colour in zip(parts, COLOURS, strict=False):
+        figures = [at["figures"] for at in each["levels"]]
+        here = range(len(figures))
+        nats.plot(here, [f["gain_mean"] for f in figures], "o-", color=colour, ms=4)
+        nats.plot(here, [f["claimed_mean"] for f in figures], "--", color=colour)
+        held = [f["coverage"][1] for f in figures]
+        beyond = [[100 * (c["share"] - c["low"]) for c in held], [100 * (c["high"] - c["share"]) for c in held]]
+        shares.errorbar(here, [100 * c["share"] for c in held], beyond, fmt="o-", color=colour, ms=4, elinewidth=0.8)
+        shares.plot(here, [100 * f["silent"] for f in figures], ":", color=colour)
+    for axes in pair:
+        axes.set_visible(True)
+        for i in x:
+            if sweep["levels"][i]["level"] in sweep["inside"]:
+                axes.axvspan(i - 0.5, i + 0.5, color="0.94", zorder=0, lw=0)
+        axes.set_xlim(-0.5, len(labels) - 0.5)
+        axes.set_xticks(list(x), labels)
+        axes.spines[["top", "right"]].set_visible(False)
+    shares.axhline(90, color="0.7", lw=0.8)
+    nats.tick_params(labelbottom=False)
+    nats.axhline(0, color="0.7", lw=0.8)
+    nats.set_ylabel("information [nats]")
+    shares.set_ylabel("share [%]")
+    shares.set_ylim(-3, 103)
+    shares.set_xlabel(sweep["title"])
