@@ -33,10 +33,10 @@ def evaluate(folder):
     """
     made, make = {}, study.make_touches
 
-    def touches_of(scene, *args, elastic):
-        key = scene.mesh.name, *args, elastic
+    def touches_of(scene, *args, **options):
+        key = scene.mesh.name, *args, *options.values()
         if key not in made:
-            made[key] = make(scene, *args, elastic=elastic)
+            made[key] = make(scene, *args, **options)
         return made[key]
 
     def run(*words, status=0, touches=TOUCHES):

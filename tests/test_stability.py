@@ -1,0 +1,208 @@
+"""Stability: each sweep changes what it says and nothing else, and its figures follow from the answers."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from geomtact import load_mesh
+from geomtact.cli import app, evaluate_stability, study_file, study_options
+from geomtact.errors import NoPoseAgreesError
+from geomtact.evaluation import stability
+from geomtact.evaluation.sensors_study import make_scenes
+from geomtact.evaluation.stability import SWEEPS, Answer, World, coarser, cut_off, larger, scanned
+from geomtact.evaluation.touches import penetrations
+from geomtact.report.stability_plot import draw_stability
+from geomtact.se3 import inverse
+from geomtact.sensing.noise import CLEAN, MODERATE
+
+MM = 1e-3
+
+
+@pytest.fixture(scope="module")
+def here(plug):
+    return World(plug.mesh, plug.sensor, MODERATE, penetrations(plug.space))
+
+
+# --- worlds
+
+
+def test_the_first_level_of_what_may_be_wrong_is_the_localizers_own_world(here):
+    for name in ("pitch", "size", "surface", "faces"):
+        world = SWEEPS[name].world(here, SWEEPS[name].levels[0])
+        assert np.array_equal(world.mesh.faces, here.mesh.faces)
+        assert world.mesh.vertices == pytest.approx(here.mesh.vertices, abs=1e-12)
+        assert replace(world, mesh=here.mesh) == here
+    for name in ("rig_shift", "rig_turn"):
+        assert (SWEEPS[name].rig(SWEEPS[name].levels[0]) == 0).all()
+    for sweep in SWEEPS.values():
+        assert set(sweep.inside) < set(sweep.levels) and (sweep.world is None) != (sweep.rig is None)
+
+
+def test_a_larger_part_grows_about_its_centre():
+    mesh = load_mesh("connector_plug")
+    grown = larger(mesh, 5)
+    assert grown.centre == pytest.approx(mesh.centre, abs=1e-9)
+    assert grown.vertices - mesh.centre == pytest.approx(1.05 * (mesh.vertices - mesh.centre), abs=1e-9)
+
+
+def test_a_scanned_part_is_off_by_what_is_said():
+    """How far points of the scan lie from a ball's surface is the displacement itself."""
+    ball = load_mesh("ball")
+    radius = np.linalg.norm(ball.vertices - ball.centre, axis=1).mean()
+    off = np.linalg.norm(scanned(ball, 0.2 * MM).vertices - ball.centre, axis=1) - radius
+    assert np.sqrt((off**2).mean()) == pytest.approx(0.2 * MM, rel=0.15)
+    assert abs(off.mean()) < 0.1 * MM
+    assert np.array_equal(scanned(ball, 0.2 * MM).vertices, scanned(ball, 0.2 * MM).vertices)
+
+
+def test_a_coarser_part_keeps_so_many_faces():
+    mesh = load_mesh("connector_plug")
+    assert len(coarser(mesh, 30).faces) == pytest.approx(0.3 * len(mesh.faces), rel=0.05)
+
+
+def test_pixels_that_are_larger_than_said_show_a_smaller_contact(here, plug):
+    world = replace(SWEEPS["pitch"].world(here, 10), noise=CLEAN, threshold=0.0)
+    for T, mask in stability.touches(world, 4, 3):
+        if cut_off(mask) == 0:
+            assert plug.simulate(T).mask.sum() == pytest.approx(1.21 * mask.sum(), rel=0.03)
+
+
+@pytest.mark.parametrize(("name", "level"), [("area", 4), ("area", 1), ("border", 10), ("border", 0)])
+def test_touches_are_as_the_sweep_wants_them(here, name, level):
+    world = replace(SWEEPS[name].world(here, level), noise=CLEAN)
+    pixel = np.prod(world.sensor.pixel_pitch)
+    found = list(stability.touches(world, 4, 1))
+    assert len(found) == 4
+    for _, mask in found:
+        assert world.area[0] <= mask.sum() * pixel <= world.area[1]
+        assert world.border[0] <= cut_off(mask) <= world.border[1]
+
+
+def test_what_no_touch_fulfils_ends(here, monkeypatch):
+    monkeypatch.setattr(stability, "_TRIED", 40)
+    assert list(stability.touches(replace(here, area=(1.0, 2.0), threshold=0.0), 1, 0)) == []
+
+
+def test_the_outline_cut_off_is_counted_in_pixel_edges():
+    mask = np.zeros((6, 8), bool)
+    assert cut_off(mask) == 0
+    mask[2:4, 2:4] = True
+    assert cut_off(mask) == 0
+    assert cut_off(np.ones((6, 8), bool)) == 1
+    mask[:] = False
+    mask[:2, 3:6] = True  # three edges of ten at the top
+    assert cut_off(mask) == pytest.approx(0.3)
+
+
+# --- answers
+
+
+def test_a_world_as_it_is_said_to_be_gives_the_localizers_own_answers(plug, here):
+    told = list(stability.swept(plug, SWEEPS["size"], 0, 2, 5, "fast"))
+    for answer, (T, mask) in zip(told, stability.touches(here, 2, 5), strict=True):
+        assert answer == stability.judged(plug, T, plug.localize(mask, "mask", effort="fast", seed=5))
+        assert np.isfinite(answer.gain)
+
+
+def test_a_pose_of_another_world_is_moved_along_the_sensors_axis_into_the_space(plug, here):
+    (T, _), *_ = stability.touches(replace(here, threshold=0.0), 1, 2)
+    assert stability._knowable(plug.space, T) is T
+    off = T.copy()
+    off[2, 3] -= plug.sensor.max_penetration
+    back = stability._knowable(plug.space, off)
+    assert np.isfinite(plug.space.penetration(back[None])[0])
+    assert (inverse(off) @ back)[:3, :3] == pytest.approx(np.eye(3)) and back[:2, 3] == pytest.approx(off[:2, 3])
+
+
+def test_a_rig_is_off_by_what_is_said_but_for_its_first_sensor(plug, monkeypatch):
+    told = []
+
+    def localize(masks, kind, T_world_sensor, **options):
+        told.append(T_world_sensor)
+        raise NoPoseAgreesError("none")
+
+    monkeypatch.setattr(plug.__class__, "localize", lambda self, *args, **options: localize(*args, **options))
+    answers = list(stability.swept(plug, SWEEPS["rig_shift"], 5, 8, 1, "fast"))
+    assert answers == [Answer(-np.inf, 0.0, 1.0, np.inf, 0.0, True)] * 8
+    true = [scene.T_world_sensor[:3] for scene in make_scenes(plug, 8, 1, MODERATE, None)]
+    off = inverse(np.array(true)) @ np.array(told)
+    assert off[:, 0] == pytest.approx(np.tile(np.eye(4), (8, 1, 1)))
+    assert off[..., :3, :3] == pytest.approx(np.tile(np.eye(3), (8, 3, 1, 1)))
+    # 16 distances, of which each has the mean square 25
+    assert np.sqrt((off[:, 1:, :3, 3] ** 2).sum(-1).mean()) == pytest.approx(5 * MM, rel=0.3)
+
+
+def test_figures_follow_from_the_answers():
+    answers = [
+        Answer(2.0, 1.0, 0.3, 1.0, 0.9, False),  # right
+        Answer(1.0, 1.0, 0.7, 1.0, 0.9, True),  # right, and yet warned
+        Answer(-1.0, 1.0, 0.95, 50.0, 0.9, False),  # wrong, and nothing says so
+        Answer(0.0, 1.0, 0.6, 50.0, 0.2, False),  # wrong, not sure
+        Answer(-np.inf, 1.0, 1.0, np.inf, 0.9, True),  # wrong, warned
+    ]
+    figures = stability.summarise(answers)
+    assert [a.silent for a in answers] == [False, False, True, False, False]
+    assert figures | {"coverage": None} == {
+        "n": 5,
+        "gain_mean": 0.5,
+        "claimed_mean": 1.0,
+        "ruled_out": pytest.approx(0.2),
+        "mssd_mm_median": 50.0,
+        "wrong": 0.6,
+        "warned": 0.4,
+        "silent": 0.2,
+        "found_out": pytest.approx(2 / 3),
+        "alarmed": 0.5,
+        "coverage": None,
+    }
+    assert [c["share"] for c in figures["coverage"]] == [0.2, 0.6]
+
+
+# --- the command
+
+
+@pytest.fixture(scope="module")
+def command(plug):
+    def run(*words, status=0):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(study_options, "localizers", lambda *_: iter([plug]))
+            done = CliRunner().invoke(app, [str(w) for w in ("evaluate", "stability", "connector_plug", *words)])
+            assert done.exit_code == status, done.output
+            return done
+
+    return run
+
+
+def test_a_stopped_study_goes_on_and_its_picture_comes_from_the_file_alone(command, tmp_path, monkeypatch):
+    words = ["--touches", 1, "--effort", "fast", "--sweep", "specks", "--sweep", "size"]
+    done = command(*words, "--out", tmp_path / "whole.json", "--plot", tmp_path / "whole.png")
+    assert "specks of dirt" in done.output and "60*" in done.output
+    whole = json.loads((tmp_path / "whole.json").read_text("utf-8"))
+    assert (tmp_path / "whole.png").read_bytes() == draw_stability(whole)
+    sweep = whole["parts"]["connector_plug"]["sweeps"]["size"]
+    answers = [Answer(**study_file.numbers(a)) for a in sweep["levels"][0]["answers"]]
+    assert sweep["levels"][0]["figures"]["gain_mean"] == pytest.approx(stability.summarise(answers)["gain_mean"])
+    assert asdict(answers[0]).keys() == sweep["levels"][0]["answers"][0].keys()
+
+    swept, calls = stability.swept, []
+
+    def stops(localizer, sweep, level, *args):
+        calls.append(level)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return swept(localizer, sweep, level, *args)
+
+    monkeypatch.setattr(stability, "swept", stops)
+    command(*words, "--out", tmp_path / "part.json", status=130)
+    monkeypatch.setattr(stability, "swept", swept)
+    assert len(json.loads((tmp_path / "part.json").read_text("utf-8"))["parts"]["connector_plug"]["sweeps"]) == 1
+    command(*words, "--out", tmp_path / "part.json")
+    assert json.loads((tmp_path / "part.json").read_text("utf-8")) == whole
+    assert whole["schema"] == evaluate_stability.SCHEMA
+
+
+def test_a_sweep_that_is_none_is_said(command):
+    assert "no sweep named 'nois'" in command("--sweep", "nois", status=2).output
