@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
     from geomtact.inference.posterior import Mode, Posterior
     from geomtact.inference.prior import GaussianPrior
-    from geomtact.planning.next_touch import Action, Probe, Touch
+    from geomtact.planning.actions import Probe, Touch
+    from geomtact.planning.next_touch import Action
     from geomtact.sensing.contact import Contact
     from geomtact.sensing.local_shape import contact_mask
     from geomtact.sensing.sensor import Sensor
@@ -40,10 +41,10 @@ _MODULE_OF = {
     "Mesh": "geomtact.geometry.mesh",
     "Mode": "geomtact.inference.posterior",
     "Posterior": "geomtact.inference.posterior",
-    "Probe": "geomtact.planning.next_touch",
+    "Probe": "geomtact.planning.actions",
     "RigStd": "geomtact.contact_space.carry",
     "Sensor": "geomtact.sensing.sensor",
-    "Touch": "geomtact.planning.next_touch",
+    "Touch": "geomtact.planning.actions",
     "contact_mask": "geomtact.sensing.local_shape",
     "load_mesh": "geomtact.geometry.mesh",
 }

@@ -16,14 +16,13 @@ from geomtact.errors import GeomtactError, InputError, PoseError, UsageError
 from geomtact.evaluation import next_touch_study
 from geomtact.evaluation.fixture import upwards
 from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.planning.actions import Probe, Touch
+from geomtact.planning.belief import draw_cells
+from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.next_touch import (
     LEAST,
-    Probe,
-    Touch,
     ambiguity,
     discarded,
-    draw_cells,
-    grid_of_touches,
     information,
     judge,
     likelihoods,

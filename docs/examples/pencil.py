@@ -11,7 +11,8 @@ import numpy as np
 import trimesh
 
 from geomtact import Localizer, Touch, load_mesh
-from geomtact.planning.next_touch import Probe, ambiguity, next_touch
+from geomtact.planning.actions import Probe
+from geomtact.planning.next_touch import ambiguity, next_touch
 from geomtact.report.next_touch_plot import draw_next_touch
 from geomtact.se3 import inverse, transform
 

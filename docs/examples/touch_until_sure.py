@@ -8,7 +8,9 @@ import numpy as np
 
 from geomtact import Localizer
 from geomtact.geometry.distance import PoseDistance
-from geomtact.planning.next_touch import Touch, ambiguity, grid_of_touches, next_touch
+from geomtact.planning.actions import Touch
+from geomtact.planning.grid import grid_of_touches
+from geomtact.planning.next_touch import ambiguity, next_touch
 from geomtact.se3 import exp, inverse, transform
 
 SURE, MOST_TOUCHES = 0.9, 10

@@ -14,7 +14,8 @@ from geomtact.errors import GeomtactError, InputError, nearest_name
 
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Posterior
-    from geomtact.planning.next_touch import Action, Probe, Touch
+    from geomtact.planning.actions import Probe, Touch
+    from geomtact.planning.next_touch import Action
 
 SCHEMA = "geomtact/next-touch/1"
 _FIRST = 10  # actions on the screen
@@ -100,7 +101,7 @@ def read_actions(path: Path) -> list[Touch | Probe]:
 
 
 def _action(entry: Any) -> Touch | Probe:
-    from geomtact.planning.next_touch import Probe, Touch
+    from geomtact.planning.actions import Probe, Touch
 
     if not isinstance(entry, Mapping) or ("T_world_sensor" in entry) == ("probe" in entry):
         raise InputError('expected either "T_world_sensor" (4x4) or "probe"')

@@ -24,14 +24,15 @@ from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.refine import TRUST, Refinery
 from geomtact.inference.refine_together import View
-from geomtact.planning.next_touch import grid_of_touches, judge
+from geomtact.planning.grid import grid_of_touches
+from geomtact.planning.next_touch import judge
 from geomtact.se3 import Array, apply, exp, inverse, transform
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.noise import MODERATE, Noise
 
 SURE = 0.95  # estimated probability of fitting from which the part is placed
 _MODES = 10  # of the posterior that are sampled with their covariances
-_DRAWS = 300  # poses that are believed
+_DRAWS = 1000  # poses that are believed
 _ASKED = 60  # of these, by their weights, of which it is asked whether they fit
 _MISSED = 2.0  # a jaw that met nothing swept its way: that no contact is shown there counts twice
 _MOST_OPEN = 80e-3  # m between the fingers

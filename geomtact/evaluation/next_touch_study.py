@@ -19,8 +19,9 @@ from geomtact.evaluation.pose_error import mssd
 from geomtact.evaluation.touches import PENETRATION, Touch, random_touches
 from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
-from geomtact.planning.next_touch import Touch as Planned
-from geomtact.planning.next_touch import grid_of_touches, next_touch
+from geomtact.planning.actions import Touch as Planned
+from geomtact.planning.grid import grid_of_touches
+from geomtact.planning.next_touch import next_touch
 from geomtact.se3 import Array, inverse, random_rotations, transform
 from geomtact.sensing.noise import Noise
 

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.planning.next_touch import Action, Touch, ambiguity, draw_cells
+from geomtact.planning.actions import Touch
+from geomtact.planning.belief import draw_cells
+from geomtact.planning.next_touch import Action, ambiguity
 from geomtact.report.figure import FIRST, SIMULATED
 from geomtact.se3 import Array, apply, inverse, transform
 from geomtact.sensing.sensor import Sensor
