@@ -319,7 +319,7 @@ def test_cells_are_drawn_by_their_probability(plug, posterior, rng):
 def test_touches_start_clear_of_the_object_and_meet_it(plug, posterior):
     touches = grid_of_touches(posterior)
     assert len(touches) >= 17
-    T = draw_cells(posterior, 32, np.random.default_rng(0))
+    T = draw_cells(posterior, 32, np.random.default_rng(0), 2)
     assert all(judge(plug.space, replace(t, travel=0.0), T).contact < 0.1 for t in touches[::4])
     assert np.mean([judge(plug.space, t, T).contact for t in touches[::4]]) > 0.5
     assert all(t.T_world_sensor[2, 2] < 0.1 for t in touches)  # none comes from the first sensor's side

@@ -53,14 +53,12 @@ def judge_samples(
 
     from geomtact.contact_space.space import ContactSpace
     from geomtact.evaluation.study import make_touches
-    from geomtact.geometry.mesh import load_mesh
     from geomtact.sensing.sensor import Sensor
 
     pressed, strength = Sensor.load(sensor), study_options.noise_named(noise)
     pixel_mm2 = 1e6 * float(np.prod(pressed.pixel_pitch))
     rows = []
-    for part in parts:
-        mesh = load_mesh(part, unit, sensor=pressed)
+    for mesh in study_options.meshes(parts, unit, pressed):
         made = make_touches(SimpleNamespace(space=ContactSpace(mesh, pressed)), touches, seed, strength)
         for name, elastic in (("geometric", False), ("elastic", True)):
             some = [t for t in made if t.elastic == elastic]

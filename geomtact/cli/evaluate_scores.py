@@ -111,7 +111,6 @@ def judge_scores(
     """
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.errors import InputError
-    from geomtact.geometry.mesh import load_mesh
     from geomtact.report.result import plain
     from geomtact.sensing.sensor import Sensor
 
@@ -132,8 +131,7 @@ def judge_scores(
         other = ", ".join(key for key in settings if content["settings"].get(key) != settings[key])
         raise InputError(f"{out}: holds a study with other settings ({other}); give another file with --out")
     content.pop("overall", None)
-    meshes = [load_mesh(part, unit, sensor=options.sensor) for part in chosen]  # a wrong name is told before hours pass
-    for mesh in meshes:
+    for mesh in study_options.meshes(chosen, unit, options.sensor):
         part = _part(content, mesh, options.sensor)
         made: list = []  # touches, when first needed, and the same ones for every score
         for name in names:
