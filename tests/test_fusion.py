@@ -177,6 +177,21 @@ def test_a_sensor_that_feels_nothing_speaks_against_poses_that_would_touch_it(pl
     assert np.corrcoef(share, ratio)[0, 1] < -0.9 and ratio[share.argmin()] > 0 > ratio[share.argmax()]
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (3, 4, 0, 1, 2), (0, 3, 1, 4, 2)])
+def test_refinement_learns_nothing_from_sensors_out_of_reach_wherever_they_stand(plug, order):
+    touches = random_touches(plug, 3, 11)
+    _, sensors = world(touches, np.random.default_rng(1))
+    far = [se3.transform(np.eye(3), [0, 0, z]) @ sensors[0] for z in (2.0, 3.0)]
+    masks, T = [t.mask for t in touches], [*sensors, *far]
+    masks += [np.zeros_like(masks[0])] * 2
+    alone = plug.localize(masks[:3], "mask", None, T[:3])
+    told = plug.localize([masks[i] for i in order], "mask", None, [T[i] for i in order])
+    assert abs(np.exp(told.log_prob) - np.exp(alone.log_prob)).sum() < 1e-3
+    assert told.entropy_nats == pytest.approx(alone.entropy_nats, abs=1e-3)
+    for one, other in zip(alone.modes(3), told.modes(3), strict=True):
+        assert one.T == pytest.approx(other.T, abs=1e-6)
+
+
 def test_no_contact_anywhere_leaves_what_touches_nothing(plug, rng):
     touches = random_touches(plug, 2, 8)
     T, sensors = world(touches, rng)

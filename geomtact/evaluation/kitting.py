@@ -131,8 +131,8 @@ def touch_with_jaw(
 ) -> Felt:
     """The jaw closes at ``T_world_jaw`` (4, 4), each finger until the part presses 0.3 to 1.5 mm into it: nobody is told.
 
-    Where neither finger meets the part, that one of them met nothing is felt, at the jaw's origin. A finger stopped by too small
-    a contact tells nothing.
+    Where neither finger meets the part, that both met nothing is felt, at the jaw's origin. A finger stopped by too small a
+    contact tells nothing.
     """
     stopped, touches = close_jaw(space, T_world_part, T_world_jaw, rng.uniform(*PENETRATION, 2))
     T, masks = [], []
@@ -142,7 +142,8 @@ def touch_with_jaw(
             T.append(T_world_sensor)
             masks.append(spoilt(mask, space, noise, rng))
     if not touches.any():
-        return Felt(T_world_jaw[None], [np.zeros(space.sensor.image_size_px[::-1], bool)])
+        nothing = np.zeros(space.sensor.image_size_px[::-1], bool)
+        return Felt(T_world_jaw @ np.stack([np.eye(4), _OPPOSITE]), [nothing, nothing])
     return Felt(np.array(T).reshape(-1, 4, 4), masks)
 
 

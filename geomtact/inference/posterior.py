@@ -174,11 +174,11 @@ class Posterior:
         row, which = np.unique(self._rows_of(cells)[0], return_inverse=True)
         likeliest = np.full(len(row), -np.inf)
         np.maximum.at(likeliest, which, np.asarray(log_likelihood, float))
-        if not np.isfinite(likeliest).any():
-            return self
         had = self.log_prob[row].astype(float)
         with np.errstate(invalid="ignore"):
             gets = had + likeliest - (1 - before) * np.where(had > -np.inf, self._log_density_of(row), 0.0)
+        if not np.isfinite(gets).any():
+            return self
         held = np.logaddexp.reduce(had)
         gets += held - np.logaddexp.reduce(gets)
         with np.errstate(divide="ignore"):

@@ -38,7 +38,7 @@ _CHECKED = 4  # of the poses tried for each cell, whether they touch
 # Chosen, as is 1 / N below, on scenes that the study does not judge (docs/several-sensors.md)
 _TRUST, _DOUBT = 0.3, 0.03
 _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
-# nats, for each sensor, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
+# nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 _ALIKE, _UNLIKE = 3.0, 8.0
 _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
 _UNFELT = np.log(0.1)  # that a sensor shows nothing where the object would touch it
@@ -93,8 +93,8 @@ def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: i
     """``posterior``, on the first sensor's cells, with its leading modes refined against all ``views`` and weighed anew.
 
     As in ``Refinery.refine``, each cell keeps the pose at which what is seen is likeliest, and what the cells hold together
-    is shared out anew by these likelihoods: but only as far as the likeliest pose explains what all sensors show, nearly as well
-    as other poses do what each of them shows. If none does, the right one was not looked into.
+    is shared out anew by these likelihoods: but only as far as the likeliest pose explains what all sensors show, in the mean
+    nearly as well as other poses do what each of them shows. If none does, the right one was not looked into.
     """
     looked_into = posterior.likeliest_cells(_CELLS)
     if not len(looked_into):
@@ -114,10 +114,10 @@ def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: i
     likely = np.full(len(judged), -np.inf)
     np.maximum.at(likely, np.searchsorted(judged, looked_into), within)
     np.maximum.at(likely, np.searchsorted(judged, home), merit)
-    unexplained = (search.most.sum() - merit.max(initial=-np.inf)) / len(views)
+    unexplained = (search.most.sum() - merit.max(initial=-np.inf)) / search.felt
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
-    # in cells not looked into as good a pose may lie, but the more sensors there are to be explained, the more seldom
-    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, 1 / len(views)))
+    # in cells not looked into as good a pose may lie, but the more contacts there are to be explained, the more seldom
+    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, 1 / search.felt))
     posterior = posterior.shared_anew(judged, _TRUST * likely, doubt, elsewhere, _BEFORE)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: len(chosen)]
@@ -129,13 +129,16 @@ class _Search:
 
     Attributes
     ----------
+    views : those with contact first; nearly any pose explains the others
+    felt : how many have contact
     most : (V,) how likely what each sensor shows is at the pose that suits it best, of all that were tried
     """
 
     def __init__(self, index: Index, views: Sequence[View], rng: np.random.Generator):
-        self.index, self.views, self.rng = index, views, rng
+        self.index, self.rng = index, rng
+        self.views = sorted(views, key=lambda view: view.contact is None)
         touching = [(view, view.contact) for view in views if view.contact is not None]
-        self.base = touching[0][0]
+        self.base, self.felt = self.views[0], len(touching)
         self.first = self.base.refinery
         self.problem = Problem.joined(
             [make_problem(view.mask, view.refinery.space.sensor, contact.height) for view, contact in touching],
@@ -171,7 +174,7 @@ class _Search:
         rise[~np.isfinite(rise)] = 0
         T[..., 2, 3] += rise.reshape(depth.shape)
         known = self.base.likely(depths - rise[:, None, None].astype(np.float32)).reshape(depth.shape)
-        return T, self.log_likelihood(T, known if self.base is self.views[0] else None)
+        return T, self.log_likelihood(T, known)
 
     def registered(self, T: Array, merit: Array) -> tuple[Array, Array]:
         """``T`` (n, d, 4, 4) and ``merit`` (n, d), and what registration makes of the best of each row."""

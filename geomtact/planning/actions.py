@@ -126,14 +126,15 @@ def _advance(
     space: ContactSpace, T_sensor_object: Array, travel: float, pressed: ArrayLike
 ) -> tuple[Array, NDArray[np.floating]]:
     """How far (n,) [m] the sensor goes along z until the object at ``T_sensor_object`` (n, 4, 4) presses ``pressed`` [m] deep,
-    at most ``travel``; and how deep the object then lies below the membrane (n, h, w) [m].
+    at most ``travel``; and how deep the object then lies below the membrane (n, h, w) [m]. It stops short of where it starts
+    if the object is in its way, but for one that is merely placed.
 
     By rays parallel to z, so that one cast serves all heights: the slant of a camera's rays moves the contacts of all poses
     alike.
     """
     sensor = _straight(space.sensor)
     below = space.caster.depths(sensor, T_sensor_object, sensor.along(_SHAPE))
-    advance = np.minimum(np.asarray(pressed) - below.max((1, 2)), travel)
+    advance = np.minimum(np.asarray(pressed) - below.max((1, 2)), travel) if travel else np.zeros(len(below))
     return advance, below + advance[:, None, None].astype(np.float32)
 
 
