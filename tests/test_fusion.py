@@ -189,7 +189,7 @@ def test_refinement_learns_nothing_from_sensors_out_of_reach_wherever_they_stand
     assert abs(np.exp(told.log_prob) - np.exp(alone.log_prob)).sum() < 1e-3
     assert told.entropy_nats == pytest.approx(alone.entropy_nats, abs=1e-3)
     for one, other in zip(alone.modes(3), told.modes(3), strict=True):
-        assert one.T == pytest.approx(other.T, abs=1e-6)
+        np.testing.assert_allclose(one.T, other.T, atol=1e-6)
 
 
 def test_no_contact_anywhere_leaves_what_touches_nothing(plug, rng):
