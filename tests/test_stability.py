@@ -205,4 +205,5 @@ def test_a_stopped_study_goes_on_and_its_picture_comes_from_the_file_alone(comma
 
 
 def test_a_sweep_that_is_none_is_said(command):
+    assert evaluate_stability._NAMES.split(", ") == list(SWEEPS)
     assert "no sweep named 'nois'" in command("--sweep", "nois", status=2).output

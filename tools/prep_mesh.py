@@ -229,6 +229,10 @@ def _said(result: dict[str, Any]) -> str:
     return f"{result['outcome']}{': ' if changes else ''}{changes}"
 
 
+def _short(reason: str) -> str:
+    return reason if len(reason) <= 70 else reason[:69] + "…"
+
+
 def _table(results: Sequence[dict[str, Any]]) -> None:
     from geomtact.cli.shell import print_table
 
@@ -239,7 +243,7 @@ def _table(results: Sequence[dict[str, Any]]) -> None:
             holes = str(len(r["holes"]))
             row += [f"{r['deviation_mm']:.4f}", holes, str(r["faces"]), r["symmetry"]["kind"], ""]
         else:
-            row += ["", "", "", "", str(r["reason"])[:70]]
+            row += ["", "", "", "", _short(str(r["reason"]))]
         rows.append(row)
     headings = ("mesh", "outcome", "s", "deviation [mm]", "holes", "faces", "symmetry", "why")
     print_table(headings, rows, headings[2:6])

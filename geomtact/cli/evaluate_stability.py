@@ -15,13 +15,15 @@ from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import print_table, tell
 
 SCHEMA = "geomtact/stability/1"
+_NAMES = "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, rig_shift, rig_turn"
 
 
 def judge_stability(
     parts: study_options.ThesisParts = None,
     unit: Unit = None,
     sweep: Annotated[
-        list[str] | None, typer.Option("--sweep", help="A condition to make worse; may be repeated; all by default.")
+        list[str] | None,
+        typer.Option("--sweep", help=f"What to make worse; may be repeated; all by default: {_NAMES}."),
     ] = None,
     sensor: study_options.SensorName = "gelslim",
     touches: Annotated[int, typer.Option("--touches", min=1, help="How many of each part at each level.")] = 200,
@@ -80,6 +82,9 @@ def _print(part: str, sweeps: Mapping[str, Any]) -> None:
             rows.append([sweep["title"], f"{at['level']:g}{mark}", str(f["n"]), *told, *held, *shares])
     numbers = ["level", "n", "gain [nats]", "claimed", "ruled out", "in 50 %", "in 90 %"]
     shares = ["wrong", "warned", "silent", "right but warned"]
-    typer.echo(f"{part}: levels marked * lie outside what is promised; silent are wrong ones that nothing gives away")
+    typer.echo(
+        f"{part}: wrong, the first mode is more than 10 mm off (from one touch most are, and say so by holding little); silent, "
+        "wrong, holding half or more, without a warning; * no longer promised to hold"
+    )
     print_table(["condition", *numbers, *shares], rows, [*numbers, *shares])
     tell(f"{part}: done")

@@ -150,7 +150,10 @@ def localize(
     else:
         _print(posterior, modes, out)
     if not posterior.contact:
-        tell("no contact found in the image; give a --background, or say what it is with --kind")
+        where = "the image" if len(images) == 1 else f"any of the {len(images)} images"
+        blank = posterior.observation.kind == "mask"
+        advice = "a mask's contact is what is not 0" if blank else "give a --background, or say what it is with --kind"
+        tell(f"no contact found in {where}; {advice}")
         raise typer.Exit(NO_CONTACT)
 
 

@@ -23,7 +23,9 @@ _KEYS = ("T_world_sensor", "travel", "cost", "probe")
 
 
 def next_touch(
-    posterior: Annotated[Path, typer.Argument(help="posterior.npz of what is known now.", show_default=False)],
+    posterior: Annotated[
+        Path, typer.Argument(help="posterior.npz of what is known now, or its folder.", show_default=False)
+    ],
     actions: Annotated[
         Path | None, typer.Option(help="JSON with the touches and probes to choose from; else some all round.")
     ] = None,
@@ -36,15 +38,15 @@ def next_touch(
 ) -> None:
     """Say which touch is expected to tell most about the pose, for its cost.
 
-    Actions are in the posterior's frame: {"actions": [{"T_world_sensor": 4x4, "travel": 0.1, "cost": 1}, {"probe": {"point":
-    [x, y, z], "direction": [x, y, z]}}]}, lengths in metres.
+    Actions are in the posterior's frame, in metres: {"actions": LIST}, each {"T_world_sensor": 4x4, "travel": 0.1, "cost": 1}
+    or {"probe": {"point": XYZ, "direction": XYZ}}.
     """
     from geomtact.inference.posterior import Posterior
     from geomtact.planning import next_touch as planning
 
     check_folder(out)
     given = None if actions is None else read_actions(actions)
-    known = Posterior.load(posterior, cache_dir)
+    known = Posterior.load(posterior / "posterior.npz" if posterior.is_dir() else posterior, cache_dir)
     ranked = planning.next_touch(known, given, seed=seed)
     note = planning.ambiguity(ranked)
     content = _content(

@@ -11,6 +11,7 @@ import numpy as np
 
 from geomtact.contact_space.carry import RigStd
 from geomtact.errors import InputError, nearest_name
+from geomtact.inference.localizer import check_rig
 from geomtact.se3 import Array, check_transforms
 
 _KEYS = ("T_world_sensor", "sensor", "std_mm", "std_deg")
@@ -47,9 +48,10 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
             f'--sensor-poses {path}: no such file; write {{"T_world_sensor": [4x4 for each image]}}'
         ) from None
     except (OSError, ValueError) as error:
-        raise InputError(f"--sensor-poses {path}: cannot be read as JSON ({error})") from None
+        raise InputError(f"--sensor-poses {path}: cannot be read as JSON ({error}); mend it there") from None
     if not isinstance(content, dict) or "T_world_sensor" not in content:
-        raise InputError(f'--sensor-poses {path}: expected {{"T_world_sensor": [4x4 for each image]}}')
+        got = f"the keys {', '.join(content) or 'none'}" if isinstance(content, dict) else f"a {type(content).__name__}"
+        raise InputError(f'--sensor-poses {path}: expected {{"T_world_sensor": [4x4 for each image]}}, got {got}')
     for key in content:
         if key not in _KEYS:
             raise InputError(f"--sensor-poses {path}: unknown key {key!r}{nearest_name(key, _KEYS)}")
@@ -58,17 +60,25 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
     except (ValueError, TypeError):
         T = np.zeros(0)
     if T.shape != (images, 4, 4):
-        given = len(content["T_world_sensor"]) if isinstance(content["T_world_sensor"], list) else "none"
-        raise InputError(f"--sensor-poses {path}: expected a 4x4 matrix for each of {images} images, got {given}")
+        listed = content["T_world_sensor"]
+        given = str(len(listed)) if isinstance(listed, list) else "none"
+        if T.shape == (4, 4):
+            given = "one 4x4; put it into a list"
+        wanted = f"for each of {images} images" if images > 1 else "for the image"
+        raise InputError(f"--sensor-poses {path}: T_world_sensor: expected a 4x4 matrix {wanted}, got {given}")
     names = content.get("sensor")
     if names is not None and (not isinstance(names, list) or len(names) != images):
-        raise InputError(f"--sensor-poses {path}: sensor must list {images} names or TOML files, one for each image")
+        got = str(len(names) if isinstance(names, list) else names)
+        raise InputError(f"--sensor-poses {path}: sensor must list a name or TOML file for each of {images}, got {got}")
     std = {key: content.get(key, 0.0) for key in ("std_mm", "std_deg")}
     for key, value in std.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0:
             raise InputError(f"--sensor-poses {path}: {key} must be a number >= 0, got {value!r}")
+    name = f"--sensor-poses {path}: T_world_sensor"
+    T = check_transforms(T, name)
+    check_rig(T, name)
     return SensorPoses(
-        check_transforms(T, f"{path}: T_world_sensor"),
+        T,
         None if names is None else [_beside(path, name) for name in names],
         RigStd(float(np.radians(std["std_deg"])), 1e-3 * std["std_mm"]),
     )

@@ -151,7 +151,8 @@ def fused_posterior(
         runs=None,
         log_evidence=sum(t.log_evidence for t in touches) + fused.log_evidence,
         observations=first.observations + [o for touch in touches if touch is not first for o in touch.observations],
-        settings=first.settings | {"T_world_sensor": [t.T_frame_sensor.tolist() for t in touches]},
+        settings=first.settings
+        | {"T_world_sensor": [t.T_frame_sensor.tolist() for t in touches], "touched": [t.contact for t in touches]},
         timing_ms=timing,
         warnings=each + ([against] if against else []),
     )
@@ -189,13 +190,13 @@ def disagreement(fused: Fused) -> str | None:
         return None
     if len(fused.support) == 2:
         return (
-            "the two sensors disagree: hardly any pose agrees with both; check T_world_sensor, or whether one of them "
-            "touches something else"
+            "the two sensors disagree: hardly any pose agrees with both; check T_world_sensor (sensor to world, not the "
+            "inverse), or whether one of them touches something else"
         )
     worst = int(against[fused.support[against].argmin()])
     return (
         f"sensor {worst + 1} of {len(fused.support)} disagrees with the others: they make what it shows less likely than chance "
-        "does; check its T_world_sensor, or whether it touches something else"
+        "does; check its T_world_sensor (sensor to world, not the inverse), or whether it touches something else"
     )
 
 

@@ -297,18 +297,30 @@ def _views(image: Any, T_world_sensor: Any) -> tuple[list[Any], str, Array]:
     if T.shape not in ([(4, 4), (1, 4, 4)] if n == 1 else [(n, 4, 4)]):
         raise UsageError(f"T_world_sensor: expected one pose for each of {n} images, ({n}, 4, 4), got shape {T.shape}")
     T = T.reshape(n, 4, 4)
-    for i, j in combinations(range(n), 2):
+    check_rig(T)
+    return images, "world", T
+
+
+def check_rig(T_world_sensor: Array, name: str = "T_world_sensor") -> None:
+    """Whether sensors at ``T_world_sensor`` (n, 4, 4) can stand together; ``name`` is theirs in messages.
+
+    Raises
+    ------
+    InputError
+        Two are farther apart than a room is long, or at the same pose.
+    """
+    T = T_world_sensor
+    for i, j in combinations(range(len(T)), 2):
         apart = float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]))
         if apart > _ROOM:
             raise InputError(
-                f"T_world_sensor: sensors {i + 1} and {j + 1} are {apart:.3g} m apart; give translations in metres"
+                f"{name}: sensors {i + 1} and {j + 1} are {apart:.3g} m apart; give translations in metres"
             )
         if np.abs(T[i] - T[j]).max() < 1e-6:
             raise InputError(
-                f"T_world_sensor: sensors {i + 1} and {j + 1} are at the same pose; give each sensor its own, or follow "
+                f"{name}: sensors {i + 1} and {j + 1} are at the same pose; give each sensor its own, or follow "
                 "one sensor over time with track"
             )
-    return images, "world", T
 
 
 @contextmanager

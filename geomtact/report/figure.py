@@ -83,7 +83,11 @@ def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummar
     image_axes, contact_axes, words = band.subplots(1, 3)
     for observation in posterior.observations[:1]:
         image = _displayable(observation.image)
-        _in_window(image_axes, posterior, image, "The image")
+        touched = posterior.settings.get("touched", [True])
+        of_several = (
+            f" of sensor {touched.index(True) + 1} of {len(touched)}" if len(touched) > 1 and any(touched) else ""
+        )
+        _in_window(image_axes, posterior, image, f"The image{of_several}")
         outline(contact_axes, posterior, observation.contact, OBSERVED)
         shown = np.where(observation.contact.mask, 0.75, 0.97)
         title = f"The contact ({_area_mm2(observation.contact, posterior):.1f} mm², read as {observation.kind})"

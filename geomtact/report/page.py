@@ -27,6 +27,12 @@ details { margin: 1rem 0; } summary { cursor: pointer; }
 pre { background: var(--soft); padding: .8rem; overflow-x: auto; font-size: .85rem; border-radius: 6px; }
 """
 
+# what the axes of a frame are, in words
+_AXES = {
+    "sensor": ": x along image columns, y along image rows downwards, z out of the sensor towards the part",
+    "world": ", the one in which the sensors' poses are given",
+}
+
 
 def page(
     content: dict[str, Any], rows: Sequence[Sequence[str]], facts: Sequence[str], pictures: dict[str, bytes]
@@ -47,10 +53,9 @@ def page(
     if rows:
         parts += ["<h2>Where the part may be</h2>", _table(HEADINGS, rows)]
         parts += [
-            f"<p>In the {escape(content['frame'])} frame: x along image columns, y along image rows downwards, z out of "
-            "the sensor towards the part. ± is the standard deviation in the least certain direction, within the mode. "
-            "Tilts are about x and y, turns about z, through the middle of the contact. The exact matrices are in "
-            "result.json and below.</p>"
+            f"<p>In the {escape(content['frame'])} frame{_AXES[content['frame']]}. ± is the standard deviation in the least "
+            "certain direction, within the mode. Tilts are about x and y, turns about z, through the middle of the contact. "
+            "The exact matrices are in result.json and below.</p>"
         ]
     parts += _picture("The touch", "the image and the contact found in it", pictures.get("touch"))
     parts += _picture(

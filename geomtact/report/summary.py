@@ -137,7 +137,14 @@ def facts(posterior: Posterior) -> list[str]:
     if not posterior.contact:
         return ["No contact was found in the image."]
     known = max(0.0, -posterior.entropy_nats)
+    empty = [str(number) for number, touched in enumerate(posterior.settings.get("touched", []), 1) if not touched]
+    said = (
+        [f"No contact on sensor {' and '.join(empty)}: it counts against poses that would touch there."]
+        if empty
+        else []
+    )
     return [
+        *said,
         f"{known:.1f} nats are known: one part in {np.exp(min(known, 700)):,.0f} of all poses that touch is left."
         if known < 14
         else f"{known:.1f} nats are known: less than one part in a million of all poses that touch is left.",
