@@ -6,7 +6,10 @@ import io
 from collections.abc import Mapping
 from typing import Any
 
-_STYLES = {"best": ("#0072B2", "-", "the most expected information"), "random": ("#D55E00", "--", "at random")}
+_STYLES = {
+    "best": ("#0072B2", "-", "touches chosen for the most expected information"),
+    "random": ("#D55E00", "--", "at random"),
+}
 
 
 def draw_touches_until_sure(content: Mapping[str, Any]) -> bytes:
@@ -29,7 +32,7 @@ def draw_touches_until_sure(content: Mapping[str, Any]) -> bytes:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("runs in which one mode holds 95 % [%]")
-    figure.axes[0].legend(frameon=False, fontsize=8, loc="lower right", title="touches chosen for", title_fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     out = io.BytesIO()
     canvas.print_png(out)
     return out.getvalue()
