@@ -61,7 +61,7 @@ def random_touches(
     Raises
     ------
     InputError
-        Hardly any touch of the object is of that class.
+        Hardly any touch of the object is of that class, or large enough to count.
     """
     rng = np.random.default_rng(seed)
     space: ContactSpace = localizer.space
@@ -72,9 +72,8 @@ def random_touches(
         T, depth = space.sample(some, rng, penetrations(space))
         tried += len(T)
         if tried > _TRIED * (len(out) + 1):
-            raise InputError(
-                f"{space.mesh.name}: {tried:,} touches gave {len(out)} of class {only!r}; take another part"
-            )
+            kind = f"{only} ones" if only else "large enough"
+            raise InputError(f"{space.mesh.name}: of {tried:,} touches {len(out)} were {kind}; take another part")
         for pose, d in zip(T, depth, strict=True):
             if only is not None and contact_class(space, pose) != only:
                 continue
