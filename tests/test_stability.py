@@ -204,6 +204,22 @@ def test_a_stopped_study_goes_on_and_its_picture_comes_from_the_file_alone(comma
     assert whole["schema"] == evaluate_stability.SCHEMA
 
 
+def test_a_level_that_no_touch_fulfils_is_left_out_and_the_others_are_judged_once(command, tmp_path, monkeypatch):
+    asked = []
+
+    def swept(localizer, sweep, level, *args):
+        asked.append(level)
+        return iter([] if level == 6 else [Answer(1.0, 1.0, 0.3, 1.0, 0.9, False)])
+
+    monkeypatch.setattr(stability, "swept", swept)
+    words = ["--touches", 1, "--sweep", "specks", "--out", tmp_path / "a.json"]
+    command(*words)
+    command(*words, "--plot", tmp_path / "a.png")
+    assert asked == [0, 2, 6, 20, 60, 6]
+    part = json.loads((tmp_path / "a.json").read_text("utf-8"))["parts"]["connector_plug"]
+    assert [at["level"] for at in part["sweeps"]["specks"]["levels"]] == [0, 2, 20, 60]
+
+
 def test_a_sweep_that_is_none_is_said(command):
     assert evaluate_stability._NAMES.split(", ") == list(SWEEPS)
     assert "no sweep named 'nois'" in command("--sweep", "nois", status=2).output

@@ -54,14 +54,14 @@ def judge_stability(
         for name in names:
             one = stability.SWEEPS[name]
             done = sweeps.setdefault(name, {"title": one.title, "inside": list(one.inside), "levels": []})["levels"]
-            for level in one.levels[len(done) :]:
+            judged = {at["level"] for at in done}  # at a level that no touch fulfils there is nothing to keep
+            for level in (level for level in one.levels if level not in judged):
                 todo = stability.swept(localizer, one, level, touches, seed, effort)
                 told = study_file.collect([], todo, touches, f"{part}: {one.title} {level:g}", lambda _: None)
                 if told:
                     figures = stability.summarise(told)
                     done.append({"level": level, "figures": figures, "answers": [asdict(a) for a in told]})
                 study_file.keep(out, content, part, settings=settings, sweeps=sweeps)
-        study_file.keep(out, content, part, settings=settings, sweeps=sweeps)
         _print(part, {name: sweeps[name] for name in names})
     if plot is not None:
         from geomtact.report.stability_plot import draw_stability
@@ -75,11 +75,10 @@ def _print(part: str, sweeps: Mapping[str, Any]) -> None:
         for at in sweep["levels"]:
             f = at["figures"]
             mark = "" if at["level"] in sweep["inside"] else "*"
-            held = [f"{100 * c['share']:.0f} ({100 * c['low']:.0f}-{100 * c['high']:.0f})" for c in f["coverage"]]
             shares = ["-" if f[k] is None else f"{100 * f[k]:.0f} %" for k in ("wrong", "warned", "silent", "alarmed")]
             nats = "-" if f["gain_mean"] is None else f"{f['gain_mean']:.2f}"
             told = [nats, f"{f['claimed_mean']:.2f}", f"{100 * f['ruled_out']:.0f} %"]
-            rows.append([sweep["title"], f"{at['level']:g}{mark}", str(f["n"]), *told, *held, *shares])
+            rows.append([sweep["title"], f"{at['level']:g}{mark}", str(f["n"]), *told, *study_file.inside(f), *shares])
     numbers = ["level", "n", "gain [nats]", "claimed", "ruled out", "in 50 %", "in 90 %"]
     shares = ["wrong", "warned", "silent", "right but warned"]
     typer.echo(

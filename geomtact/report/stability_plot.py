@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 from geomtact.report.touches_plot import COLOURS
@@ -21,6 +22,7 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
     from matplotlib.figure import Figure
 
     parts = content["parts"]
+    colours = dict(zip(parts, cycle(COLOURS), strict=False))
     names = list(dict.fromkeys(name for part in parts.values() for name in part["sweeps"]))
     across = min(_ACROSS, max(1, len(names)))
     down = -(-len(names) // across)
@@ -32,8 +34,8 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
     for number, name in enumerate(names):
         row, column = divmod(number, across)
         pair = grid[2 * row, column], grid[2 * row + 1, column]
-        _draw(pair, [(part, sweeps["sweeps"][name]) for part, sweeps in parts.items() if name in sweeps["sweeps"]])
-    handles = [figure.axes[0].plot([], [], "o-", color=c, label=p)[0] for p, c in zip(parts, COLOURS, strict=False)]
+        _draw(pair, [(colours[p], part["sweeps"][name]) for p, part in parts.items() if name in part["sweeps"]])
+    handles = [figure.axes[0].plot([], [], "o-", color=c, label=p)[0] for p, c in colours.items()]
     styles = (("o-", "told; below, in the 90 % region"), ("--", "claimed"), (":", "wrong, and nothing says so"))
     handles += [figure.axes[0].plot([], [], style, color="0.4", label=label)[0] for style, label in styles]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
@@ -43,14 +45,13 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
 
 
 def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
-    """One sweep into the two axes of ``pair``."""
+    """One sweep of each part, with its colour, into the two axes of ``pair``. A part may lack levels that others have."""
     nats, shares = pair
-    _, sweep = parts[0]
-    labels = [f"{at['level']:g}" for at in sweep["levels"]]
-    x = range(len(labels))
-    for (_, each), colour in zip(parts, COLOURS, strict=False):
+    sweep = max((each for _, each in parts), key=lambda each: len(each["levels"]))
+    levels = list(dict.fromkeys(at["level"] for each in (sweep, *(e for _, e in parts)) for at in each["levels"]))
+    for colour, each in parts:
         figures = [at["figures"] for at in each["levels"]]
-        here = range(len(figures))
+        here = [levels.index(at["level"]) for at in each["levels"]]
         nats.plot(here, [f["gain_mean"] for f in figures], "o-", color=colour, ms=4)
         nats.plot(here, [f["claimed_mean"] for f in figures], "--", color=colour)
         held = [f["coverage"][1] for f in figures]
@@ -59,11 +60,11 @@ def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -
         shares.plot(here, [100 * f["silent"] for f in figures], ":", color=colour)
     for axes in pair:
         axes.set_visible(True)
-        for i in x:
-            if sweep["levels"][i]["level"] in sweep["inside"]:
+        for i, level in enumerate(levels):
+            if level in sweep["inside"]:
                 axes.axvspan(i - 0.5, i + 0.5, color="0.94", zorder=0, lw=0)
-        axes.set_xlim(-0.5, len(labels) - 0.5)
-        axes.set_xticks(list(x), labels)
+        axes.set_xlim(-0.5, len(levels) - 0.5)
+        axes.set_xticks(range(len(levels)), [f"{level:g}" for level in levels])
         axes.spines[["top", "right"]].set_visible(False)
     shares.axhline(90, color="0.7", lw=0.8)
     nats.tick_params(labelbottom=False)
