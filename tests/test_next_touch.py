@@ -28,7 +28,7 @@ from geomtact.planning.next_touch import (
     likelihoods,
     next_touch,
 )
-from geomtact.se3 import exp, inverse, transform
+from geomtact.se3 import exp, inverse, log, transform
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.sensor import Sensor
 
@@ -314,6 +314,18 @@ def test_cells_are_drawn_by_their_probability(plug, posterior, rng):
     held = plug.index.lookup(T.reshape(-1, 4, 4), plug.space.penetration(T.reshape(-1, 4, 4)))
     assert set(held.reshape(5, 20)[0]) <= set(posterior.cells[:2])
     assert (held.reshape(5, 20) == held.reshape(5, 20)[0]).mean() > 0.9
+
+
+def test_a_refined_cell_is_drawn_as_registration_left_it(plug, a_touch):
+    world = plug.localize(a_touch(plug)[1], T_world_sensor=T_MOVED)
+    mode = next(mode for mode in world.modes() if mode.refined)
+    cell = next(c for c, found in world.refined.items() if np.allclose(T_MOVED @ found.T, mode.T))
+    row = np.flatnonzero(world.cells == cell)
+    known = replace(world, cells=world.cells[row], log_prob=np.zeros(1), runs=None)
+    T = draw_cells(known, 2, np.random.default_rng(0), 4000)
+    white = np.linalg.solve(np.linalg.cholesky(mode.covariance), log(inverse(mode.T) @ T).reshape(-1, 6).T)
+    assert white.mean(1) == pytest.approx(np.zeros(6), abs=0.06)
+    assert np.cov(white) == pytest.approx(np.eye(6), abs=0.08)
 
 
 def test_touches_start_clear_of_the_object_and_meet_it(plug, posterior):
