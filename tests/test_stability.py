@@ -11,8 +11,9 @@ from geomtact import load_mesh
 from geomtact.cli import app, evaluate_stability, study_file, study_options
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import stability
+from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.stability import SWEEPS, Answer, World, coarser, cut_off, larger, scanned
+from geomtact.evaluation.stability import SWEEPS, World, coarser, cut_off, larger, scanned
 from geomtact.evaluation.touches import penetrations
 from geomtact.report.stability_plot import draw_stability
 from geomtact.se3 import inverse
@@ -103,7 +104,7 @@ def test_the_outline_cut_off_is_counted_in_pixel_edges():
 def test_a_world_as_it_is_said_to_be_gives_the_localizers_own_answers(plug, here):
     told = list(stability.swept(plug, SWEEPS["size"], 0, 2, 5, "fast"))
     for answer, (T, mask) in zip(told, stability.touches(here, 2, 5), strict=True):
-        assert answer == stability.judged(plug, T, plug.localize(mask, "mask", effort="fast", seed=5))
+        assert answer == judged(plug.mesh, T, plug.localize(mask, "mask", effort="fast", seed=5))
         assert np.isfinite(answer.gain)
 
 
@@ -126,7 +127,7 @@ def test_a_rig_is_off_by_what_is_said_but_for_its_first_sensor(plug, monkeypatch
 
     monkeypatch.setattr(plug.__class__, "localize", lambda self, *args, **options: localize(*args, **options))
     answers = list(stability.swept(plug, SWEEPS["rig_shift"], 5, 8, 1, "fast"))
-    assert answers == [Answer(-np.inf, 0.0, 1.0, np.inf, 0.0, True)] * 8
+    assert answers == [REFUSED] * 8
     true = [scene.T_world_sensor[:3] for scene in make_scenes(plug, 8, 1, MODERATE, None)]
     off = inverse(np.array(true)) @ np.array(told)
     assert off[:, 0] == pytest.approx(np.tile(np.eye(4), (8, 1, 1)))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
+from geomtact.cli.evaluate_choices import judge_choices
 from geomtact.cli.evaluate_kitting import judge_kitting
 from geomtact.cli.evaluate_next_touch import judge_next_touch
 from geomtact.cli.evaluate_registration import judge_registration
@@ -172,3 +173,4 @@ evaluate.command("track")(one_line_errors(judge_track))
 evaluate.command("next-touch")(one_line_errors(judge_next_touch))
 evaluate.command("kitting")(one_line_errors(judge_kitting))
 evaluate.command("stability")(one_line_errors(judge_stability))
+evaluate.command("choices")(one_line_errors(judge_choices))

@@ -14,6 +14,7 @@ from geomtact.contact_space.index import Index
 from geomtact.contact_space.store import open_index
 from geomtact.evaluation import study
 from geomtact.evaluation.touches import Touch
+from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
 from geomtact.progress import Progress
@@ -62,16 +63,22 @@ class Stopwatch:
 
 
 def prepare(
-    mesh: Mesh, sensor: Sensor, scorer: str, max_poses: int, cache_dir: Path | None, progress: Progress | None = None
+    mesh: Mesh,
+    sensor: Sensor,
+    scorer: str,
+    max_poses: int,
+    cache_dir: Path | None,
+    progress: Progress | None = None,
+    approach: Approach | None = None,
 ) -> tuple[Localizer, dict[str, float | None]]:
     """A localizer with ``scorer``, and the seconds that building the index, describing its contacts and calibrating the
     score took; None for what was read from the cache."""
     watch = Stopwatch(progress)
-    open_index(mesh, sensor, None, max_poses, cache_dir, watch)
+    open_index(mesh, sensor, approach, max_poses, cache_dir, watch)
     index_s = watch.total() if watch.seconds else None
     watch = Stopwatch(progress)
     localizer = Localizer.prepare(
-        mesh, sensor=sensor, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir, progress=watch
+        mesh, None, sensor, approach, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir, progress=watch
     )
     described = watch.of("describing")
     stores = isinstance(localizer.scorer.scorer, VectorScorer) or localizer.scorer.cascade is not None

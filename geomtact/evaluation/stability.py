@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
 from geomtact.errors import NoPoseAgreesError
-from geomtact.evaluation.pose_error import coverage, mssd
+from geomtact.evaluation.answer import REFUSED, Answer, judged
+from geomtact.evaluation.pose_error import coverage
 from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.study import CERTAIN, WRONG_MM
 from geomtact.evaluation.touches import penetrations
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
-from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array, exp
 from geomtact.sensing.noise import MODERATE, Noise
 from geomtact.sensing.sensor import Sensor
@@ -71,36 +70,6 @@ class Sweep:
     inside: tuple[float, ...]
     world: Callable[[World, float], World] | None = None
     rig: Callable[[float], Array] | None = None
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What was told of one touch, or one scene. Lengths in millimetres, information in nats.
-
-    Attributes
-    ----------
-    gain : log density at the true pose; -inf where it was given no probability
-    claimed : minus the entropy
-    level : credible level of the true pose
-    mssd_mm, probability : of the first mode; inf and 0 where there is none
-    warned : whether a warning came with it; an error in place of an answer counts as one
-    """
-
-    gain: float
-    claimed: float
-    level: float
-    mssd_mm: float
-    probability: float
-    warned: bool
-
-    @property
-    def wrong(self) -> bool:
-        return self.mssd_mm > WRONG_MM
-
-    @property
-    def silent(self) -> bool:
-        """Wrong, and nothing says so."""
-        return self.wrong and self.probability >= CERTAIN and not self.warned
 
 
 def larger(mesh: Mesh, percent: float) -> Mesh:
@@ -218,9 +187,8 @@ def swept(localizer: Localizer, sweep: Sweep, level: float, n: int, seed: int, e
     assert sweep.world is not None
     here = World(localizer.mesh, localizer.sensor, MODERATE, penetrations(localizer.space))
     for T, mask in touches(sweep.world(here, level), n, seed):
-        yield judged(
-            localizer, _knowable(localizer.space, T), localizer.localize(mask, "mask", effort=effort, seed=seed)
-        )
+        posterior = localizer.localize(mask, "mask", effort=effort, seed=seed)
+        yield judged(localizer.mesh, _knowable(localizer.space, T), posterior)
 
 
 def _knowable(space: ContactSpace, T: Array) -> Array:
@@ -274,27 +242,11 @@ def _rigs(localizer: Localizer, off: Array, n: int, seed: int, effort: str) -> I
         T[1:] = T[1:] @ np.array([exp(off * rng.normal(size=6)) for _ in T[1:]])
         masks = [touch.mask for touch in scene.touches[:_SENSORS]]
         try:
-            yield judged(
-                localizer,
-                scene.T_world_object,
-                localizer.localize(masks, "mask", T_world_sensor=T, effort=effort, seed=seed),
-            )
+            posterior = localizer.localize(masks, "mask", T_world_sensor=T, effort=effort, seed=seed)
         except NoPoseAgreesError:
-            yield Answer(-np.inf, 0.0, 1.0, np.inf, 0.0, True)
-
-
-def judged(localizer: Localizer, T: Array, posterior: Posterior) -> Answer:
-    """A posterior held against the truth ``T`` (4, 4)."""
-    modes = posterior.modes(1)
-    poses = np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
-    return Answer(
-        gain=float(posterior.log_density(T)),
-        claimed=-float(posterior.entropy_nats),
-        level=float(posterior.credible_level(T)),
-        mssd_mm=float(1e3 * mssd(T, poses, localizer.mesh).min(initial=np.inf)),
-        probability=modes[0].probability if modes else 0.0,
-        warned=bool(posterior.warnings),
-    )
+            yield REFUSED
+        else:
+            yield judged(localizer.mesh, scene.T_world_object, posterior)
 
 
 def summarise(answers: Sequence[Answer]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -130,7 +130,7 @@ class Localizer:
         background: Any = None,
         T_world_sensor: Any = None,
         prior: Any = None,
-        effort: str = "balanced",
+        effort: str | Effort = "balanced",
         seed: int = 0,
         rig: RigStd | None = None,
     ) -> Posterior:
@@ -146,7 +146,7 @@ class Localizer:
         prior : None, a Posterior, its path, a pair (poses, log weights), a GaussianPrior or a log density (see
             ``inference.prior``)
         effort : "fast" (the grid's blocks, nothing refined), "balanced" (its cells, five refined modes) or "exact" (every
-            cell, the pixels counted too where that tells more, twenty-five refined modes)
+            cell, the pixels counted too where that tells more, twenty-five refined modes), or an Effort of one's own
         seed : of the random choices made where credible levels tie, and in refining
         rig : how well the sensors' poses relative to each other are known
 
@@ -154,8 +154,7 @@ class Localizer:
         ------
         ImageError, PoseError, UsageError, InputError
         """
-        if effort not in EFFORTS:
-            raise UsageError(f"no effort named {effort!r}{nearest_name(effort, EFFORTS)}")
+        how = _effort(effort)
         images, frame, T_frame_sensor = _views(image, T_world_sensor)
         backgrounds = background if isinstance(background, list | tuple) else [background] * len(images)
         if len(backgrounds) != len(images):
@@ -166,7 +165,7 @@ class Localizer:
                 return touch
             with _timed(touch.timing_ms, "refine"):
                 contact = touch.observation.contact
-                return self.refinery.refine(touch, contact, EFFORTS[effort].modes, EFFORTS[effort].thorough)
+                return self.refinery.refine(touch, contact, how.modes, how.thorough)
         localizers = (self, *self.others) if self.others else (self,) * len(images)
         if len(localizers) != len(images):
             raise UsageError(
@@ -176,9 +175,7 @@ class Localizer:
             each.touch(shown, kind, empty, T, frame, None, effort, seed)
             for each, shown, empty, T in zip(localizers, images, backgrounds, T_frame_sensor, strict=True)
         ]
-        return fused_posterior(
-            touches, [each.refinery for each in localizers], prior, EFFORTS[effort].modes, rig, self.cache_dir
-        )
+        return fused_posterior(touches, [each.refinery for each in localizers], prior, how.modes, rig, self.cache_dir)
 
     def touch(
         self,
@@ -188,11 +185,12 @@ class Localizer:
         T_frame_sensor: Array,
         frame: str,
         prior: Any,
-        effort: str,
+        effort: str | Effort,
         seed: int,
     ) -> Posterior:
         """What one sensor at ``T_frame_sensor`` (4, 4) tells, not refined; the rest as in :meth:`localize`."""
         timing: dict[str, float] = {}
+        resolved = _effort(effort).resolved
         settings = self._settings(effort, seed)
         with _timed(timing, "read"):
             observation = read_observation(image, self.sensor, kind, background)
@@ -212,10 +210,10 @@ class Localizer:
         log_prior = None
         with _timed(timing, "score"):
             if prior is None:
-                rows = self.scorer.rows(self.index, mask, EFFORTS[effort].resolved)
+                rows = self.scorer.rows(self.index, mask, resolved)
             else:
                 log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame, self.cache_dir)
-                rows = self.scorer.cells(self.index, mask, log_prior, EFFORTS[effort].resolved == "all")
+                rows = self.scorer.cells(self.index, mask, log_prior, resolved == "all")
         with _timed(timing, "posterior"):
             common["settings"] |= _worth(rows.by, rows.calibration)
             log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
@@ -265,9 +263,9 @@ class Localizer:
     def refinery(self) -> Refinery:
         return Refinery(self.space)
 
-    def _settings(self, effort: str, seed: int) -> dict[str, Any]:
+    def _settings(self, effort: str | Effort, seed: int) -> dict[str, Any]:
         return {
-            "effort": effort,
+            "effort": effort if isinstance(effort, str) else asdict(effort),
             "seed": seed,
             "scorer": self.scorer.name,
             "max_poses": self.max_poses,
@@ -277,6 +275,14 @@ class Localizer:
             if self.index.approach is None
             else [(np.asarray(v, float).tolist(), float(a)) for v, a in self.index.approach],
         }
+
+
+def _effort(effort: str | Effort) -> Effort:
+    if isinstance(effort, Effort):
+        return effort
+    if effort not in EFFORTS:
+        raise UsageError(f"no effort named {effort!r}{nearest_name(effort, EFFORTS)}")
+    return EFFORTS[effort]
 
 
 def _worth(scored_by: str, calibration: Calibration) -> dict[str, Any]:

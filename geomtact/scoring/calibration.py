@@ -23,6 +23,7 @@ from geomtact.contact_space.touch import CALIBRATION_NOISE, LEAST_CONTACT, draw_
 from geomtact.progress import Progress
 from geomtact.scoring.protocol import Scorer
 from geomtact.se3 import Array
+from geomtact.sensing.noise import Noise
 
 TEMPERATURES = np.geomspace(0.01, 30.0, 240)  # in units of the spread of the scores, whatever their scale
 _BINS = 1 << 12
@@ -64,8 +65,16 @@ class Calibration:
     gain: float
 
 
-def simulate_touches(index: Index, n: int, seed: int, progress: Progress | None = None) -> Touches:
-    """``n`` touches uniform over the contact pose space, half elastic, with noise of any strength up to heavy.
+def simulate_touches(
+    index: Index,
+    n: int,
+    seed: int,
+    progress: Progress | None = None,
+    elastic: bool | None = None,
+    noise: Noise = CALIBRATION_NOISE,
+) -> Touches:
+    """``n`` touches uniform over the contact pose space, with noise of any strength up to ``noise``; rigid and elastic in turn,
+    unless ``elastic`` says which.
 
     Poses are drawn within the cells, not at their centres: the score has to bridge what lies between.
     """
@@ -82,10 +91,10 @@ def simulate_touches(index: Index, n: int, seed: int, progress: Progress | None 
         cells = np.minimum(drawn, len(weight) - 1)
         T, _, found = draw_within(index, space, cells, rng, tries=5)
         for pose, i in zip(T[found], cells[found], strict=True):
-            mask = felt_mask(space, pose, elastic=len(masks) % 2 == 1, shape=shape)
+            mask = felt_mask(space, pose, len(masks) % 2 == 1 if elastic is None else elastic, shape)
             if mask.sum() * pixel < min(LEAST_CONTACT, 12 * pixel):
                 continue
-            masks.append(spoilt(mask, space, draw_noise(CALIBRATION_NOISE, rng), rng))
+            masks.append(spoilt(mask, space, draw_noise(noise, rng), rng))
             ids.append(int(i))
             if progress:
                 progress(len(masks) / n, "simulating sensor noise")

@@ -82,7 +82,7 @@ class Caster:
         """Which face the camera ray through each pixel (h, w) meets first at pose ``T`` (4, 4); -1 for none."""
         x, y = sensor.pixel_centres(shape)
         rays = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-        origin, direction, _, _ = self._rays(sensor, np.asarray(T, float)[None], rays)
+        origin, direction, _ = self._rays(sensor, np.asarray(T, float)[None], rays)
         return np.asarray(self._scene.run(origin, direction, query="INTERSECT"), np.int64).reshape(len(y), len(x))
 
     def penetration(self, sensor: Sensor, T: ArrayLike) -> Array:
@@ -125,37 +125,37 @@ class Caster:
         return pose, np.column_stack([xy, heights[pose, vertex]])
 
     def _cast(self, sensor: Sensor, T: Array, rays: Array) -> NDArray[np.float32]:
-        origin, direction, start, ray = self._rays(sensor, T, rays)
-        hit = self._scene.run(origin, direction, query="DISTANCE")
-        t = hit.reshape(len(T), len(rays))
-        p = start + t[..., None].astype(float) * ray
-        with np.errstate(over="ignore", invalid="ignore"):
-            depth = -p[..., 2] - sensor.sag(p[..., 0], p[..., 1])
-        return np.where(t < 1e30, depth, -np.inf).astype(np.float32)
+        origin, direction, below = self._rays(sensor, T, rays)
+        t = self._scene.run(origin, direction, query="DISTANCE").reshape(len(T), len(rays)).astype(float)
+        length = sensor.camera_distance or 1.0
+        missed = t > 1e30
+        depth = np.subtract(below[:, None], length * t, out=t)
+        if sensor.membrane_radius:
+            # a camera's rays spread: where they are when they have come so far
+            scale = 1 - depth / sensor.camera_distance if sensor.camera_distance else 1.0
+            with np.errstate(over="ignore", invalid="ignore"):
+                depth -= sensor.sag(scale * rays[:, 0], scale * rays[:, 1])
+        depth[missed] = -np.inf
+        return depth.astype(np.float32)
 
-    def _rays(
-        self, sensor: Sensor, T: Array, rays: Array
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], Array, Array]:
-        """Origins and directions (n m, 3) of rays in Embree's frame; the same in the sensor's, to be broadcast (n, m, 3)."""
+    def _rays(self, sensor: Sensor, T: Array, rays: Array) -> tuple[NDArray[np.float32], NDArray[np.float32], Array]:
+        """Origins and directions (n m, 3) of rays in Embree's frame, and how far below the membrane's plane they start (n,) [m].
+
+        A direction is so long that it nears that plane by the camera's distance, or by 1 m where there is no camera.
+        """
         R = T[:, :3, :3]
         if sensor.camera_distance:
-            start = np.broadcast_to([0.0, 0.0, -sensor.camera_distance], (len(T), 1, 3))
-            ray = np.concatenate([rays, np.full((len(rays), 1), sensor.camera_distance)], 1)[None]
+            below = np.full(len(T), sensor.camera_distance)
+            direction = _combined(R, rays, sensor.camera_distance)
         else:
             # far enough below for every pose that reaches the membrane at all
             below = np.linalg.norm(apply(T, self._centre[None])[:, 0], axis=-1) + 2 * self._radius
-            start = np.concatenate(
-                [
-                    np.broadcast_to(rays, (len(T), len(rays), 2)),
-                    np.broadcast_to(-below[:, None, None], (len(T), len(rays), 1)),
-                ],
-                -1,
-            )
-            ray = np.broadcast_to([0.0, 0.0, 1.0], (1, len(rays), 3))
-        origin = (start - T[:, None, :3, 3]) @ R - self._centre
-        direction = ray @ R
-        origin = np.ascontiguousarray(np.broadcast_to(origin, direction.shape), np.float32).reshape(-1, 3)
-        return origin, direction.astype(np.float32).reshape(-1, 3), start, ray
+            direction = R[:, 2, None]
+        middle = np.einsum("ni,nij->nj", below[:, None] * [0.0, 0.0, -1.0] - T[:, :3, 3], R) - self._centre
+        origin = middle[:, None] if sensor.camera_distance else middle[:, None] + _combined(R, rays, 0.0)
+        shape = (len(T), len(rays), 3)
+        rows = [np.ascontiguousarray(np.broadcast_to(each, shape), np.float32) for each in (origin, direction)]
+        return rows[0].reshape(-1, 3), rows[1].reshape(-1, 3), below
 
     def _camera_inside(self, sensor: Sensor, T: Array) -> NDArray[np.bool_]:
         if not sensor.camera_distance:
@@ -166,6 +166,18 @@ class Caster:
         hit = self._scene.run(camera.astype(np.float32), np.ascontiguousarray(direction), output=True)
         leaving = (hit["Ng"] * direction).sum(1) > 0
         return leaving & (hit["primID"] >= 0)
+
+
+def _combined(R: Array, rays: Array, z: float) -> NDArray[np.float32]:
+    """Vectors (x, y, z) of the sensor, x and y of ``rays`` (m, 2), in the object frame (n, m, 3), for rotations ``R`` (n, 3, 3).
+
+    In single precision, as Embree has it, and without matrix products: those of so small matrices wait for threads.
+    """
+    R, rays = R.astype(np.float32), rays.astype(np.float32)
+    out = rays[:, :1] * R[:, None, 0]
+    out += rays[:, 1:] * R[:, None, 1]
+    out += np.float32(z) * R[:, None, 2]
+    return np.asarray(out)
 
 
 def _border(sensor: Sensor) -> Array:

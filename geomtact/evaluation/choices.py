@@ -1,0 +1,233 @@
+"""What each choice brings and what it costs: the same touches localized in one way after another.
+
+Every way is the default but for one choice. All ways meet each touch in turn, so that their times may be compared.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from geomtact.contact_space.resolution import MAX_POSES
+from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.touch import CALIBRATION_NOISE
+from geomtact.errors import NoPoseAgreesError
+from geomtact.evaluation import scores
+from geomtact.evaluation.answer import REFUSED, Answer, judged
+from geomtact.evaluation.fixture import upwards
+from geomtact.evaluation.sensors_study import make_scenes
+from geomtact.evaluation.study import mean_with_interval
+from geomtact.evaluation.touches import random_touches
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.symmetry import Symmetry
+from geomtact.inference.localizer import EFFORTS, Effort, Localizer
+from geomtact.progress import Progress
+from geomtact.scoring.calibration import calibrate, simulate_touches
+from geomtact.scoring.catalogue import DEFAULT_SCORER
+from geomtact.se3 import Array
+from geomtact.sensing.noise import CLEAN, MODERATE, Noise
+from geomtact.sensing.sensor import Sensor
+
+SCENES = ("one touch", "three sensors", "known side")
+DEFAULT = "balanced"
+_SENSORS = 3
+_CALIBRATED_ON = 500  # touches, as ``scoring.fitted`` does
+_BALANCED = EFFORTS["balanced"]
+_ONE, _ALL = SCENES[:1], SCENES[:2]
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to localize.
+
+    Attributes
+    ----------
+    choice : in what it differs from the default
+    scenes : that it is judged on
+    cone : half angle [rad] about the known side to which touches are restricted; None for all directions
+    quotient : whether poses that look alike by symmetry count as one
+    noise, elastic : of the touches that the score is calibrated on, as of ``scoring.calibration.simulate_touches``
+    """
+
+    choice: str
+    scenes: tuple[str, ...] = _ONE
+    effort: Effort = _BALANCED
+    scorer: str = DEFAULT_SCORER
+    max_poses: int = MAX_POSES
+    cone: float | None = None
+    quotient: bool = True
+    noise: Noise = CALIBRATION_NOISE
+    elastic: bool | None = None
+
+    @property
+    def prepared(self) -> tuple[Any, ...]:
+        """What has to be prepared for it; ways with the same share it."""
+        return self.scorer, self.max_poses, self.cone, self.quotient
+
+
+WAYS = {
+    DEFAULT: Way("effort", SCENES),
+    "fast": Way("effort", _ALL, EFFORTS["fast"]),
+    "exact": Way("effort", _ALL, EFFORTS["exact"]),
+    "no mode refined": Way("modes", _ALL, replace(_BALANCED, modes=0)),
+    "1 mode": Way("modes", _ALL, replace(_BALANCED, modes=1)),
+    "15 modes": Way("modes", _ALL, replace(_BALANCED, modes=15)),
+    "ICP too": Way("registration", effort=replace(_BALANCED, thorough=True)),
+    "75k poses": Way("grid", _ALL, max_poses=75_000),
+    "300k poses": Way("grid", _ALL, max_poses=300_000),
+    "2.4M poses": Way("grid", _ALL, max_poses=2_400_000),
+    "moments": Way("score", scorer="moments"),
+    "cosine": Way("score", scorer="cosine"),
+    "iou": Way("score", scorer="iou"),
+    "l1": Way("score", scorer="l1"),
+    "symmetry ignored": Way("symmetry", quotient=False),
+    "calibrated without noise": Way("calibration", noise=CLEAN),
+    "calibrated on rigid gels": Way("calibration", elastic=False),
+    "within 30 degrees": Way("side", SCENES[2:], cone=np.radians(30)),
+    "this side alone": Way("side", SCENES[2:], cone=0.0, max_poses=50_000),
+}
+
+# what is modelled: (the way without it, the way with it). Known sides are not among them: their nats count from another uniform
+MODELLED = {
+    "every cell, not blocks": ("fast", DEFAULT),
+    "pixels and 25 modes (exact)": (DEFAULT, "exact"),
+    "a mode refined": ("no mode refined", "1 mode"),
+    "5 modes refined": ("1 mode", DEFAULT),
+    "15 modes refined": (DEFAULT, "15 modes"),
+    "ICP beside FilterReg": (DEFAULT, "ICP too"),
+    "300k poses, not 75k": ("75k poses", "300k poses"),
+    "1.2M poses, not 300k": ("300k poses", DEFAULT),
+    "2.4M poses, not 1.2M": (DEFAULT, "2.4M poses"),
+    "the network, not moments": ("moments", DEFAULT),
+    "symmetry": ("symmetry ignored", DEFAULT),
+    "noise, in calibrating": ("calibrated without noise", DEFAULT),
+    "elastic gels, in calibrating": ("calibrated on rigid gels", DEFAULT),
+}
+WORTH = 0.05  # nats that something modelled has to add on some part
+
+
+@dataclass(frozen=True)
+class Timed(Answer):
+    """An answer, with the time [ms] that localizing took."""
+
+    ms: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Something touched: the true pose (4, 4), the masks, and the sensors' poses (n, 4, 4), None in the sensor's own frame."""
+
+    T: Array
+    masks: list[Any]
+    T_world_sensor: Array | None = None
+
+
+def prepare(
+    mesh: Mesh, sensor: Sensor, name: str, cache_dir: Path, progress: Progress | None = None
+) -> tuple[Localizer, float | None]:
+    """The localizer of a way, and the seconds that preparing it took; None where it was in the cache."""
+    way = WAYS[name]
+    approach = None if way.cone is None else [(upwards(mesh), way.cone)]
+    if not way.quotient:
+        mesh = replace(mesh, symmetry=Symmetry("none", np.eye(4)[None], None, mesh.centre))
+    localizer, seconds = scores.prepare(mesh, sensor, way.scorer, way.max_poses, cache_dir, progress, approach)
+    if (way.noise, way.elastic) != (CALIBRATION_NOISE, None):
+        fitted = localizer.scorer
+        touches = simulate_touches(localizer.index, _CALIBRATED_ON, 20_200_531, progress, way.elastic, way.noise)
+        calibration = calibrate(fitted.scorer, localizer.index, touches)
+        localizer = replace(localizer, scorer=replace(fitted, calibration=calibration, cascade=None))
+    known = [s for s in seconds.values() if s is not None]
+    return localizer, sum(known) if len(known) == len(seconds) else None
+
+
+def make(kind: str, localizer: Localizer, n: int, seed: int) -> list[Scene]:
+    """``n`` scenes of a kind, rigid and elastic in turn, with moderate noise; ``localizer`` is the default's."""
+    if kind == "three sensors":
+        scenes = make_scenes(localizer, n, seed, MODERATE, None)
+        return [
+            Scene(s.T_world_object, [t.mask for t in s.touches[:_SENSORS]], s.T_world_sensor[:_SENSORS]) for s in scenes
+        ]
+    where: Any = localizer
+    if kind == "known side":
+        where = SimpleNamespace(space=ContactSpace(localizer.mesh, localizer.sensor, [(upwards(localizer.mesh), 0.0)]))
+    return [Scene(t.T_sensor_object, [t.mask]) for t in random_touches(where, n, seed, None, MODERATE)]
+
+
+def localized(
+    localizers: Mapping[str, Localizer], scenes: Sequence[Scene], kind: str, seed: int
+) -> Iterator[dict[str, Timed]]:
+    """For each scene what every way says of it."""
+    mesh = localizers[DEFAULT].mesh
+    for scene in scenes:
+        out = {}
+        for name, localizer in localizers.items():
+            if kind not in WAYS[name].scenes:
+                continue
+            images = scene.masks if len(scene.masks) > 1 else scene.masks[0]
+            T, effort = scene.T_world_sensor, WAYS[name].effort
+            began, posterior = time.perf_counter(), None
+            with suppress(NoPoseAgreesError):
+                posterior = localizer.localize(images, "mask", None, T, effort=effort, seed=seed)
+            ms = 1e3 * (time.perf_counter() - began)
+            answer = REFUSED if posterior is None else judged(mesh, scene.T, posterior)
+            out[name] = Timed(**asdict(answer), ms=ms)
+        yield out
+
+
+def summarise(answers: Mapping[str, Sequence[Timed]]) -> dict[str, dict[str, Any]]:
+    """Figures of each way on the same scenes; gains are of the truths not ruled out, times [ms] the 10, 50 and 90 % quantiles."""
+    out = {}
+    for name, some in answers.items():
+        gain = np.array([a.gain for a in some])
+        kept = gain[np.isfinite(gain)]
+        out[name] = {
+            "n": len(some),
+            "gain_mean": float(kept.mean()) if len(kept) else None,
+            "gain_standard_error": float(kept.std(ddof=1) / np.sqrt(len(kept))) if len(kept) > 1 else None,
+            "ruled_out": float((~np.isfinite(gain)).mean()),
+            "mssd_mm_median": float(np.median([a.mssd_mm for a in some])),
+            "ms_quantiles": [float(q) for q in np.quantile([a.ms for a in some], [0.1, 0.5, 0.9])],
+        }
+    return out
+
+
+def front(figures: Mapping[str, Mapping[str, Any]], what: str = "gain_mean", best: int = 1) -> list[str]:
+    """The ways that no other is as fast and as good as, the fastest first; ``best`` is 1 where more of ``what`` is better."""
+    out: list[str] = []
+    leader = -np.inf
+    known = {name: f for name, f in figures.items() if f[what] is not None}
+    for name in sorted(known, key=lambda each: (known[each]["ms_quantiles"][1], -best * known[each][what])):
+        if best * known[name][what] > leader:
+            leader = best * known[name][what]
+            out.append(name)
+    return out
+
+
+def beaten_by(answers: Mapping[str, Sequence[Timed]], figures: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The ways that are faster than the default, and tell more even at the lower end of the paired 95 % interval."""
+    own = figures[DEFAULT]["ms_quantiles"][1]
+    faster = [name for name, f in figures.items() if f["ms_quantiles"][1] < own]
+    return [name for name in faster if adds(answers[DEFAULT], answers[name])[1] > 0]
+
+
+def adds(without: Sequence[Answer], with_it: Sequence[Answer]) -> list[float]:
+    """Mean of what is told more [nats], and its paired 95 % bootstrap interval, where neither rules the truth out."""
+    more = np.array([b.gain - a.gain for a, b in zip(without, with_it, strict=True)])
+    return mean_with_interval(more[np.isfinite(more)], np.random.default_rng(0))
+
+
+def modelled(answers: Mapping[str, Sequence[Timed]]) -> dict[str, dict[str, Any]]:
+    """What each thing modelled adds [nats], of those whose two ways were judged; and its time as a factor."""
+    out = {}
+    for what, (without, with_it) in MODELLED.items():
+        if without in answers and with_it in answers:
+            ms = [float(np.median([a.ms for a in answers[name]])) for name in (without, with_it)]
+            out[what] = {"adds": adds(answers[without], answers[with_it]), "time_ratio": ms[1] / ms[0]}
+    return out

@@ -1,0 +1,166 @@
+"""What choices bring against what they cost, drawn from the study's JSON alone."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from typing import Any
+
+from geomtact.report.touches_plot import COLOURS
+
+_SHAPES = ("o", "s", "^", "D", "v", "P", "X")
+_DEFAULT = "balanced"
+
+
+def draw_costs(content: Mapping[str, Any]) -> bytes:
+    """A PNG with a row for each part and, for several, one for their mean: information and error against the time of one touch
+    and of three sensors, and information against the time of preparing.
+
+    The line joins the ways that no other is as fast and as good as; the default is ringed.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = {name: _points(part) for name, part in content["parts"].items()}
+    if len(rows) > 1:
+        rows[f"mean over {len(rows)} parts"] = _mean(list(rows.values()))
+    ways = next(iter(content["parts"].values()))["ways"]
+    choices = list(dict.fromkeys(way["choice"] for way in ways.values()))
+    looks = dict(zip(choices, zip(cycle(COLOURS), cycle(_SHAPES), strict=False), strict=False))
+    figure = Figure(figsize=(17, 3.9 * len(rows) + 0.5), dpi=90, layout="constrained", facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    grid = figure.subplots(len(rows), 4, squeeze=False)
+    panels = (
+        ("one touch", "ms", "gain", "time of a touch [ms]", "one touch: information [nats]", 1),
+        ("three sensors", "ms", "gain", "time of three touches [ms]", "three sensors: information [nats]", 1),
+        ("three sensors", "ms", "mssd", "time of three touches [ms]", "three sensors: median MSSD [mm]", -1),
+        ("one touch", "ready", "gain", "time of preparing [s]", "one touch: information [nats]", 1),
+    )
+    for line, (title, points) in zip(grid, rows.items(), strict=True):
+        for axes, (scene, x, y, xlabel, ylabel, best) in zip(line, panels, strict=True):
+            known = {n: (p[x], p[y]) for n, p in points.get(scene, {}).items()}
+            some = {n: (a, b) for n, (a, b) in known.items() if a is not None and b is not None}
+            _draw(axes, some, {n: looks[ways[n]["choice"]] for n in some}, best)
+            axes.set_xlabel(xlabel)
+            axes.set_ylabel(ylabel)
+        line[0].set_title(title, loc="left", fontweight="bold")
+    handles = [
+        figure.axes[0].plot([], [], shape, color=colour, label=choice)[0] for choice, (colour, shape) in looks.items()
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    return _png(canvas)
+
+
+def draw_modelled(content: Mapping[str, Any]) -> bytes:
+    """A PNG: what each thing modelled adds [nats] for each part, with paired 95 % intervals; one touch and three sensors."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    parts = content["parts"]
+    scenes = [s for s in ("one touch", "three sensors") if any(p["scenes"][s]["modelled"] for p in parts.values())]
+    names = list(dict.fromkeys(n for p in parts.values() for s in scenes for n in p["scenes"][s]["modelled"]))
+    figure = Figure(
+        figsize=(6.2 * len(scenes) + 1, 0.42 * len(names) + 1.4), dpi=100, layout="constrained", facecolor="white"
+    )
+    canvas = FigureCanvasAgg(figure)
+    grid = figure.subplots(1, len(scenes), squeeze=False, sharey=True)[0]
+    for axes, scene in zip(grid, scenes, strict=True):
+        for k, ((part, entry), colour) in enumerate(zip(parts.items(), cycle(COLOURS), strict=False)):
+            told = entry["scenes"][scene]["modelled"]
+            for i, name in enumerate(names):
+                if name in told:
+                    mean, low, high = told[name]["adds"]
+                    y = i + 0.16 * (k - (len(parts) - 1) / 2)
+                    axes.errorbar(mean, y, xerr=[[mean - low], [high - mean]], fmt="o", ms=4, color=colour, lw=1)
+            axes.plot([], [], "o", color=colour, label=part)
+        axes.axvspan(-0.05, 0.05, color="0.9", zorder=0, lw=0)
+        axes.axvline(0, color="0.6", lw=0.8)
+        axes.set_xscale("symlog", linthresh=0.2, linscale=0.6)
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.set_title(scene)
+        axes.set_xlabel("adds [nats]; grey: less than 0.05")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.3, axis="x")
+    grid[0].set_yticks(range(len(names)), names)
+    grid[0].invert_yaxis()
+    grid[0].legend(frameon=False, fontsize=8)
+    return _png(canvas)
+
+
+def _png(canvas: Any) -> bytes:
+    out = io.BytesIO()
+    canvas.print_png(out)
+    return out.getvalue()
+
+
+def _points(part: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float | None]]]:
+    """For each kind of scene what each way takes and tells."""
+    return {
+        scene: {
+            name: {
+                "ms": f["ms_quantiles"][1],
+                "gain": f["gain_mean"],
+                "mssd": f["mssd_mm_median"],
+                "ready": part["ways"][name]["prepare_s"],
+            }
+            for name, f in entry["figures"].items()
+        }
+        for scene, entry in part["scenes"].items()
+    }
+
+
+def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float | None]]]:
+    """The means over all parts; None where one is not known."""
+    out: dict[str, dict[str, dict[str, float | None]]] = {}
+    for scene, ways in parts[0].items():
+        for name, point in ways.items():
+            for key in point:
+                values = [part[scene][name][key] for part in parts]
+                mean = None if None in values else sum(values) / len(values)
+                out.setdefault(scene, {}).setdefault(name, {})[key] = mean
+    return out
+
+
+def _draw(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[str, Any], best: int) -> None:
+    """Points (time, value) with their names, and the front; ``best`` is 1 where more is better."""
+    front: list[tuple[float, float]] = []
+    for x, y in sorted(points.values(), key=lambda p: (p[0], -best * p[1])):
+        if not front or best * y > best * front[-1][1]:
+            front.append((x, y))
+    axes.plot(*zip(*front, strict=True), color="0.75", lw=1, zorder=1, drawstyle="steps-post")
+    for name, (x, y) in points.items():
+        colour, shape = looks[name]
+        axes.plot(x, y, shape, color=colour, ms=5, zorder=3)
+        if name == _DEFAULT:
+            axes.plot(x, y, "o", ms=13, mfc="none", mec="black", zorder=2)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("{x:g}")
+    axes.tick_params(axis="x", which="both", labelsize=7)
+    if best < 0:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
+        axes.tick_params(axis="y", which="both", labelsize=7)
+    axes.margins(0.12)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.25)
+    _name(axes, points, looks)
+
+
+def _name(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[str, Any]) -> None:
+    """Write each point's name beside it, above or below the others' where they would cover each other."""
+    low, high = axes.get_ylim()
+    placed: list[tuple[float, float]] = []
+    for name, (x, y) in sorted(points.items(), key=lambda item: item[1][1]):
+        up = axes.transData.transform((x, y))
+        at = up[1]
+        while any(abs(at - other) < 9 and abs(up[0] - across) < 90 for across, other in placed):
+            at += 3
+        placed.append((up[0], at))
+        offset = (at - up[1]) * 72 / axes.figure.dpi
+        axes.annotate(
+            name, (x, y), (6, offset), textcoords="offset points", fontsize=6.5, color=looks[name][0], va="center"
+        )
+    axes.set_ylim(low, high)

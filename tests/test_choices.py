@@ -1,0 +1,107 @@
+"""Choices: every way is the default but for what it names, and the figures follow from the answers."""
+
+import json
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from geomtact.cli import app
+from geomtact.evaluation import choices
+from geomtact.evaluation.choices import DEFAULT, MODELLED, WAYS, Timed, adds, beaten_by, front, modelled, summarise
+from geomtact.report.choices_plot import draw_costs, draw_modelled
+
+SMALL = 4000  # poses
+
+
+def told(gains, ms, mssd=5.0):
+    return [Timed(gain, 2.0, 0.5, mssd, 0.4, False, ms) for gain in gains]
+
+
+# --- ways
+
+
+def test_a_way_differs_from_the_default_in_one_thing():
+    """A side known exactly leaves so few poses that the grid is smaller, too."""
+    for name, way in WAYS.items():
+        changed = {
+            f.name
+            for f in fields(way)
+            if f.name not in ("choice", "scenes") and getattr(way, f.name) != getattr(WAYS[DEFAULT], f.name)
+        }
+        assert len(changed) == (0 if name == DEFAULT else 2 if name == "this side alone" else 1), name
+    assert all(a in WAYS and b in WAYS for a, b in MODELLED.values())
+    assert all(set(way.scenes) <= set(choices.SCENES) for way in WAYS.values())
+
+
+# --- figures of answers made by hand
+
+
+ANSWERS = {
+    DEFAULT: told([2.0, 4.0, 3.0], 40.0),
+    "fast": told([1.0, 3.5, 2.0], 10.0),
+    "exact": told([2.5, 4.0, 3.1], 100.0),
+    "1 mode": told([1.9, 3.9, 2.9], 50.0),
+}
+
+
+def test_the_front_holds_what_nothing_beats_in_both():
+    figures = summarise(ANSWERS)
+    assert front(figures) == ["fast", DEFAULT, "exact"]
+    assert front(figures, "mssd_mm_median", -1) == ["fast"]
+    assert figures[DEFAULT]["gain_mean"] == pytest.approx(3.0)
+    assert figures["fast"]["ms_quantiles"] == pytest.approx([10.0] * 3)
+
+
+def test_only_what_is_faster_and_surely_better_beats_the_default():
+    figures = summarise(ANSWERS)
+    assert beaten_by(ANSWERS, figures) == []
+    better = {**ANSWERS, "moments": told([2.5, 4.5, 3.5], 30.0), "iou": told([9.0, 0.0, 0.5], 30.0)}
+    assert beaten_by(better, summarise(better)) == ["moments"]
+
+
+def test_a_truth_that_is_ruled_out_is_counted_apart():
+    f = summarise({DEFAULT: told([1.0, -np.inf, 3.0], 1.0)})[DEFAULT]
+    assert (f["gain_mean"], f["ruled_out"]) == (2.0, pytest.approx(1 / 3))
+
+
+def test_what_is_modelled_adds_the_paired_difference():
+    assert adds(ANSWERS["fast"], ANSWERS[DEFAULT])[0] == pytest.approx((1 + 0.5 + 1) / 3)
+    found = modelled(ANSWERS)
+    assert set(found) == {"every cell, not blocks", "pixels and 25 modes (exact)", "5 modes refined"}
+    assert found["pixels and 25 modes (exact)"]["time_ratio"] == pytest.approx(2.5)
+    low, high = found["every cell, not blocks"]["adds"][1:]
+    assert 0.5 <= low <= 0.9 <= high <= 1.0
+
+
+# --- the study
+
+
+@pytest.fixture
+def few_ways(monkeypatch):
+    names = (DEFAULT, "no mode refined", "symmetry ignored", "calibrated on rigid gels", "this side alone")
+    monkeypatch.setattr(choices, "WAYS", {name: replace(WAYS[name], max_poses=SMALL) for name in names})
+    monkeypatch.setattr(choices, "_CALIBRATED_ON", 60)
+
+
+def test_the_study_judges_every_way_on_the_same_touches_and_goes_on_where_it_was(few_ways, tmp_path, monkeypatch):
+    out = tmp_path / "choices.json"
+    command = ["evaluate", "choices", "hex_nut", "--touches", "2", "--out", str(out)]
+    pictures = ["--plot", str(tmp_path / "a.png"), "--plot-modelled", str(tmp_path / "b.png")]
+    shown = CliRunner().invoke(app, [*command, *pictures])
+    assert shown.exit_code == 0, shown.output
+    content = json.loads(out.read_text("utf-8"))
+    part = content["parts"]["hex_nut"]
+    assert {kind: [len(told) for told in scene["answers"]] for kind, scene in part["scenes"].items()} == {
+        "one touch": [4, 4],
+        "three sensors": [2, 2],
+        "known side": [2, 2],
+    }
+    assert all(way["prepare_s"] > 0 for way in part["ways"].values())
+    assert part["ways"]["symmetry ignored"]["poses"] > 0
+    assert (tmp_path / "a.png").read_bytes() == draw_costs(content)
+    assert (tmp_path / "b.png").read_bytes() == draw_modelled(content)
+    monkeypatch.setattr(choices, "prepare", None)  # a study that is done prepares nothing
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert json.loads(out.read_text("utf-8"))["parts"] == content["parts"]

@@ -1,0 +1,1 @@
+"""geomtact against other libraries, method by method in turn; see tools/peers.py."""
