@@ -144,6 +144,7 @@ class Caster:
         A direction is so long that it nears that plane by the camera's distance, or by 1 m where there is no camera.
         """
         R = T[:, :3, :3]
+        direction: Array | NDArray[np.float32]
         if sensor.camera_distance:
             below = np.full(len(T), sensor.camera_distance)
             direction = _combined(R, rays, sensor.camera_distance)
