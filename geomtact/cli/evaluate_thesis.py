@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +15,11 @@ from geomtact.cli.localize import Effort
 from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import print_table, progress_bar, tell
 from geomtact.cli.simulate import NoiseName
+
+if TYPE_CHECKING:
+    from geomtact.geometry.mesh import Mesh
+    from geomtact.sensing.noise import Noise
+    from geomtact.sensing.sensor import Sensor
 
 SCHEMA = "geomtact/thesis-table/1"
 _POSES = 50_000  # of a part that is touched from a known side
@@ -28,20 +34,23 @@ def judge_thesis_table(
     noise: study_options.NoiseLevel = NoiseName.moderate,
     felt: study_options.Felt = study_options.FeltName.elastic,
     effort: study_options.EffortLevel = Effort.balanced,
+    ambiguity: Annotated[
+        int, typer.Option("--ambiguity", min=0, help="For how many of them to seek all poses that feel the same.")
+    ] = 0,
     seed: study_options.Seed = 1,
     out: study_options.Out = None,
+    plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
     """Judge one touch from a known side, as in the thesis's Table 1: the most probable pose, the best of ten, both refined.
 
-    Prints median errors, absolute and normalised, and writes them and every outcome to --out.
+    Prints median errors, absolute and normalised, and writes them and every outcome to --out; with --ambiguity also what the
+    first touches from each side leave open, whoever reads them.
     """
-    from geomtact.evaluation import known_approach
     from geomtact.evaluation.scores import FELT
-    from geomtact.inference.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 
-    content, strength, gel = study_file.load(out, SCHEMA), study_options.noise_named(noise), Sensor.load(sensor)
+    content, gel, strength = study_file.load(out, SCHEMA), Sensor.load(sensor), study_options.noise_named(noise)
     for mesh in study_options.meshes(parts, unit, gel):
         settings = {
             "object": mesh.name,
@@ -56,31 +65,71 @@ def judge_thesis_table(
             "effort": effort.value,
             "seed": seed,
         }
-        done = study_file.earlier(content["parts"].get(mesh.name), settings, known_approach.Outcome)
-        done = done[: len(done) // touches * touches]  # a side that was not finished is touched anew
-
-        def keep(done: list, name: str = mesh.name, settings: Mapping[str, Any] = settings) -> None:
-            figures = known_approach.summarise(done)
-            outcomes = [asdict(o) for o in done]
-            study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=outcomes)
-
-        approaches = known_approach.draw_sides(mesh, gel, sides, seed)
-        for side in range(len(done) // touches, sides):
-            with progress_bar(f"preparing {mesh.name}, side {side + 1} of {sides}") as progress:
-                localizer = Localizer.prepare(
-                    mesh,
-                    sensor=gel,
-                    approach=approaches[side],
-                    max_poses=_POSES,
-                    cache_dir=cache_dir,
-                    progress=progress,
-                )
-            judged = known_approach.judge_side(localizer, side, touches, seed, strength, effort.value, FELT[felt])
-            done = study_file.collect(done, judged, len(done) + touches, f"touching {mesh.name}", lambda _: None)
-            keep(done)
-        keep(done)
+        _judge_part(mesh, gel, strength, settings, ambiguity, content, out, cache_dir)
         tell(f"{mesh.name}: done")
     _print(content["parts"])
+    if plot is not None:
+        from geomtact.report.thesis_plot import draw_thesis
+
+        study_file.draw(draw_thesis(content), plot)
+
+
+def _judge_part(
+    mesh: Mesh,
+    gel: Sensor,
+    noise: Noise,
+    settings: Mapping[str, Any],
+    ambiguity: int,
+    content: dict[str, Any],
+    out: Path | None,
+    cache_dir: Path | None,
+) -> None:
+    """Judge what ``content`` does not hold yet of a part; a side that was not finished is touched anew."""
+    from geomtact.evaluation import ambiguity as open_set
+    from geomtact.evaluation import known_approach
+    from geomtact.inference.localizer import Localizer
+
+    sides, touches, seed, elastic = (settings[key] for key in ("sides", "touches", "seed", "elastic"))
+    done = study_file.earlier(content["parts"].get(mesh.name), dict(settings), known_approach.Outcome)
+    done = done[: len(done) // touches * touches]
+    before = content["parts"][mesh.name] if done else {}
+    grain = before.get("granularity_mm", [])
+    first = min(ambiguity, touches) or before.get("ambiguity", {"settings": {"touches": 0}})["settings"]["touches"]
+    found = study_file.earlier(before.get("ambiguity"), open_set.settings(first), open_set.Ambiguity)
+    found = found[: len(found) // first * first] if first else []
+
+    def keep() -> None:
+        entry = {"granularity_mm": grain, "figures": known_approach.summarise(done), "outcomes": _plain(done)}
+        if found:
+            figures = open_set.summarise(found, done, touches)
+            entry["ambiguity"] = {"settings": open_set.settings(first), "figures": figures, "outcomes": _plain(found)}
+        study_file.keep(out, content, mesh.name, settings=settings, **entry)
+
+    approaches = known_approach.draw_sides(mesh, gel, sides, seed)
+    for side in range(min(len(grain), len(done) // touches, len(found) // first if first else sides), sides):
+        with progress_bar(f"preparing {mesh.name}, side {side + 1} of {sides}") as progress:
+            localizer = Localizer.prepare(
+                mesh,
+                sensor=gel,
+                approach=approaches[side],
+                max_poses=_POSES,
+                cache_dir=cache_dir,
+                progress=progress,
+            )
+        if side >= len(grain):
+            grain.append(known_approach.granularity(localizer))
+        if side >= len(done) // touches:
+            judged = known_approach.judge_side(localizer, side, touches, seed, noise, settings["effort"], elastic)
+            study_file.collect(done, judged, len(done) + touches, f"touching {mesh.name}", lambda _: None)
+        if first and side >= len(found) // first:
+            others = open_set.judge_side(localizer, side, touches, first, seed, noise, elastic)
+            study_file.collect(found, others, len(found) + first, f"what else {mesh.name} may be", lambda _: None)
+        keep()
+    keep()
+
+
+def _plain(outcomes: Iterable[Any]) -> list[dict[str, Any]]:
+    return [asdict(outcome) for outcome in outcomes]
 
 
 def _print(parts: Mapping[str, Any]) -> None:
@@ -98,3 +147,18 @@ def _print(parts: Mapping[str, Any]) -> None:
         "Median error with quartiles; nearer, farther: than before refinement; of those near: from 10 mm off at most"
     )
     print_table(headings, rows, headings[2:])
+    rows = []
+    for name, part in parts.items():
+        if "ambiguity" not in part:
+            continue
+        figures = part["ambiguity"]["figures"]
+        left = [f"{figures['median'][key]:.1f}" for key in ("span_mm", "random_mm", "least_mm")]
+        for kind, table in figures["table"].items():
+            ours = [f"{table[row]['error_mm_quartiles'][1]:.1f}" for row in ("best", "answer", "refined best10")]
+            rows.append([name, kind, str(table["best"]["n"]), *(left if kind == "all" else [""] * 3), *ours])
+    if rows:
+        typer.echo(
+            "What a touch leaves open, whoever reads it, and the errors on touches that leave much and little: medians"
+        )
+        numbers = ["touches", "span [mm]", "a guess", "the best guess", "best", "answer", "best of ten"]
+        print_table(["part", "kind", *numbers], rows, numbers)

@@ -15,7 +15,7 @@ import numpy as np
 from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.registration import Seen, thesis_refinement
 from geomtact.evaluation.study import MODES, expected_random_add
-from geomtact.evaluation.touches import Touch, random_touches
+from geomtact.evaluation.touches import Touch, each_touch
 from geomtact.geometry.approach import Approach, approach_of
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
@@ -55,12 +55,31 @@ def draw_sides(mesh: Mesh, sensor: Sensor, n: int, seed: int) -> list[Approach]:
     return [[(direction, 0.0)] for direction in approach_of(T[:, :3, :3])]
 
 
+def granularity(localizer: Localizer, n: int = 100) -> float:
+    """Mean ADD [mm] from a pose of the grid to the nearest one that is not merely deeper, over ``n`` drawn at random."""
+    index, distance = localizer.index, PoseDistance(localizer.mesh)
+    least = []
+    for one in np.random.default_rng(0).choice(index.possible, n):
+        T, reach = index.poses([one])[0], 2 * index.resolution.step
+        near = index.perhaps_within(T, distance, reach)
+        near = near[near % index.places != one % index.places]
+        least.append(distance.mean(T, index.poses(near)).min(initial=reach))
+    return 1e3 * float(np.mean(least))
+
+
+def touches_of_side(
+    localizer: Localizer, side: int, n: int, seed: int, noise: Noise, elastic: bool | None
+) -> Iterator[Touch]:
+    """The ``n`` touches of a side, one by one: the same ones whoever asks."""
+    return each_touch(localizer, n, seed * 1000 + side, elastic, noise)
+
+
 def judge_side(
     localizer: Localizer, side: int, n: int, seed: int, noise: Noise, effort: str, elastic: bool | None
 ) -> Iterator[Outcome]:
     """``n`` touches of a part whose approach ``localizer`` knows; ``elastic`` as in ``touches.random_touches``."""
     distance, random_mm = PoseDistance(localizer.mesh), expected_random_add(localizer)
-    for touch in random_touches(localizer, n, seed * 1000 + side, elastic, noise):
+    for touch in touches_of_side(localizer, side, n, seed, noise, elastic):
         errors = [
             1e3 * float(distance.mean(touch.T_sensor_object, T).min()) for T in _answers(localizer, touch, effort)
         ]
@@ -83,7 +102,7 @@ def _answers(localizer: Localizer, touch: Touch, effort: str) -> list[Array]:
 
 
 def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """For each of ``ROWS`` the median error [mm] with its quartiles, and the median normalised error.
+    """For each of ``ROWS`` the median error [mm] with its quartiles, the mean, and the median normalised error.
 
     Of a refinement also which share of touches it brings nearer than the pose that it started from, and which farther; and of
     touches whose start was ``NEAR_MM`` off at most, their number and the median errors before and after: ``near``.
@@ -96,6 +115,7 @@ def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         figures: dict[str, Any] = {
             "n": len(error),
             "error_mm_quartiles": [float(q) for q in np.quantile(error[:, i], [0.25, 0.5, 0.75])],
+            "error_mm_mean": float(error[:, i].mean()),
             "normalised_median": float(np.median(normalised[:, i])),
         }
         if row in start:

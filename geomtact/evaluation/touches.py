@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,7 +49,19 @@ def random_touches(
     noise: Noise = MODERATE,
     only: str | None = None,
 ) -> list[Touch]:
-    """``n`` touches of ``localizer.mesh`` on ``localizer.sensor``.
+    """``n`` touches of ``localizer.mesh`` on ``localizer.sensor``, all at once: see :func:`each_touch`."""
+    return list(each_touch(localizer, n, seed, elastic, noise, only))
+
+
+def each_touch(
+    localizer: Any,
+    n: int,
+    seed: int,
+    elastic: bool | None = None,
+    noise: Noise = MODERATE,
+    only: str | None = None,
+) -> Iterator[Touch]:
+    """``n`` touches of ``localizer.mesh`` on ``localizer.sensor``, one by one.
 
     Poses are uniform over the contact pose space with a penetration of 0.3 to 1.5 mm and at least 1 mm^2 of contact.
     They come from casts at the exact pose, not from the index.
@@ -65,20 +78,21 @@ def random_touches(
     """
     rng = np.random.default_rng(seed)
     space: ContactSpace = localizer.space
-    out: list[Touch] = []
-    tried = 0
-    while len(out) < n:
-        some = 64 if only else min(64, 2 * (n - len(out)) + 8)
+    made = tried = 0
+    while made < n:
+        some = 64 if only else min(64, 2 * (n - made) + 8)
         T, depth = space.sample(some, rng, penetrations(space))
         tried += len(T)
-        if tried > _TRIED * (len(out) + 1):
+        if tried > _TRIED * (made + 1):
             kind = f"{only} ones" if only else "large enough"
-            raise InputError(f"{space.mesh.name}: of {tried:,} touches {len(out)} were {kind}; take another part")
+            raise InputError(f"{space.mesh.name}: of {tried:,} touches {made} were {kind}; take another part")
         for pose, d in zip(T, depth, strict=True):
             if only is not None and contact_class(space, pose) != only:
                 continue
-            soft = len(out) % 2 == 1 if elastic is None else elastic
+            soft = made % 2 == 1 if elastic is None else elastic
             mask = felt_mask(space, pose, soft)
-            if counts(space, mask) and len(out) < n:
-                out.append(Touch(pose, float(d), spoilt(mask, space, noise, rng), soft))
-    return out
+            if counts(space, mask):
+                yield Touch(pose, float(d), spoilt(mask, space, noise, rng), soft)
+                made += 1
+            if made == n:
+                return
