@@ -15,6 +15,7 @@ from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.sensors_study import make_scenes
 from geomtact.evaluation.stability import SWEEPS, World, coarser, cut_off, larger, scanned
 from geomtact.evaluation.touches import penetrations
+from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.report.stability_plot import draw_stability
 from geomtact.se3 import inverse
 from geomtact.sensing.noise import CLEAN, MODERATE
@@ -39,7 +40,26 @@ def test_the_first_level_of_what_may_be_wrong_is_the_localizers_own_world(here):
     for name in ("rig_shift", "rig_turn"):
         assert (SWEEPS[name].rig(SWEEPS[name].levels[0]) == 0).all()
     for sweep in SWEEPS.values():
-        assert set(sweep.inside) < set(sweep.levels) and (sweep.world is None) != (sweep.rig is None)
+        assert set(sweep.inside) < set(sweep.levels)
+        assert [sweep.world is not None, sweep.rig is not None, sweep.slips].count(True) == 1
+
+
+def test_whatever_is_said_of_another_part_is_wrong(plug):
+    sweep = SWEEPS["other_part"]
+    told = list(stability.swept(plug, sweep, 1, 4, 3, "fast"))
+    assert len(told) == 4 and all(a.wrong and a.gain == -np.inf and a.level == 1 for a in told)
+    assert all(a.gain > -np.inf for a in stability.swept(plug, sweep, 0, 4, 3, "fast"))
+
+
+def test_a_sequence_is_judged_at_its_last_frame(flat_nut, monkeypatch):
+    monkeypatch.setattr(stability, "_FRAMES", 4)
+    told = list(stability.swept(flat_nut, SWEEPS["slips"], 1, 2, 3, "fast"))
+    for number, answer in enumerate(told):
+        made = random_trajectory(flat_nut, 4, 3000 + number, 2 * MM, slips=(2,), elastic=number % 2 == 1)
+        last = list(flat_nut.track(made.masks, effort="fast", kind="mask", seed=3))[-1]
+        assert replace(answer, warned=False) == replace(
+            judged(flat_nut.mesh, made.T_sensor_object[-1], last), warned=False
+        )
 
 
 def test_a_larger_part_grows_about_its_centre():

@@ -15,7 +15,9 @@ from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import print_table, tell
 
 SCHEMA = "geomtact/stability/1"
-_NAMES = "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, rig_shift, rig_turn"
+_NAMES = (
+    "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, rig_shift, rig_turn, slips, other_part"
+)
 
 
 def judge_stability(

@@ -20,6 +20,7 @@ from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.pose_error import coverage
 from geomtact.evaluation.sensors_study import make_scenes
 from geomtact.evaluation.touches import penetrations
+from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
 from geomtact.se3 import Array, exp
@@ -29,6 +30,8 @@ from geomtact.sensing.sensor import Sensor
 _TRIED = 500  # touches, at most, for each one that a sweep takes
 _BUMP = 3e-3  # m over which a scanned surface is off alike
 _SENSORS = 3  # that touch at once, where the rig is wrong
+_FRAMES, _STEP = 12, 2e-3  # of a sequence, and how far the part creeps from one to the next [m]
+_OTHERS = ("gear", "connector_plug", "bracket")
 
 
 @dataclass(frozen=True)
@@ -61,8 +64,9 @@ class Sweep:
     title : what it is, with its unit
     levels : from easy to broken
     inside : those of them that the documentation promises to hold
-    world : of one touch at a level; None for sweeps of a rig
+    world : of one touch at a level; None for sweeps of a rig or a sequence
     rig : (6,) standard deviation by which each sensor of a rig is off at a level [rad, m]
+    slips : whether a level is how often the part slips in a sequence of ``_FRAMES`` frames
     """
 
     title: str
@@ -70,6 +74,7 @@ class Sweep:
     inside: tuple[float, ...]
     world: Callable[[World, float], World] | None = None
     rig: Callable[[float], Array] | None = None
+    slips: bool = False
 
 
 def larger(mesh: Mesh, percent: float) -> Mesh:
@@ -102,6 +107,13 @@ def coarser(mesh: Mesh, percent: float) -> Mesh:
     full = o3d.geometry.TriangleMesh(vertices, faces)
     some = full.simplify_quadric_decimation(max(4, int(len(mesh.faces) * percent / 100)))
     return replace(mesh, vertices=np.asarray(some.vertices), faces=np.asarray(some.triangles))
+
+
+def _other(mesh: Mesh, number: float) -> Mesh:
+    """Another bundled part, or ``mesh`` itself for 0."""
+    from geomtact.geometry.mesh import load_mesh
+
+    return load_mesh(_OTHERS[int(number) - 1]) if number else mesh
 
 
 def _both(factor: float, pitch: tuple[float, float]) -> tuple[float, float]:
@@ -176,6 +188,10 @@ SWEEPS = {
         (0, 0.5),
         rig=lambda x: np.array([1, 1, 1, 0, 0, 0]) * np.radians(x) / np.sqrt(3),
     ),
+    "slips": Sweep("slips in twelve frames", (0, 1, 2, 3), (0, 1), slips=True),
+    "other_part": Sweep(
+        "another part (1 gear, 2 plug, 3 bracket)", (0, 1, 2, 3), (0,), lambda w, x: replace(w, mesh=_other(w.mesh, x))
+    ),
 }
 
 
@@ -183,12 +199,18 @@ def swept(localizer: Localizer, sweep: Sweep, level: float, n: int, seed: int, e
     """Answers to ``n`` touches, or scenes of three, at a level of a sweep."""
     if sweep.rig is not None:
         yield from _rigs(localizer, sweep.rig(level), n, seed, effort)
-        return
-    assert sweep.world is not None
-    here = World(localizer.mesh, localizer.sensor, MODERATE, penetrations(localizer.space))
-    for T, mask in touches(sweep.world(here, level), n, seed):
-        posterior = localizer.localize(mask, "mask", effort=effort, seed=seed)
-        yield judged(localizer.mesh, _knowable(localizer.space, T), posterior)
+    elif sweep.slips:
+        yield from _sequences(localizer, int(level), n, seed, effort)
+    else:
+        assert sweep.world is not None
+        here = World(localizer.mesh, localizer.sensor, MODERATE, penetrations(localizer.space))
+        there = sweep.world(here, level)
+        for T, mask in touches(there, n, seed):
+            posterior = localizer.localize(mask, "mask", effort=effort, seed=seed)
+            answer = judged(localizer.mesh, _knowable(localizer.space, T), posterior)
+            if there.mesh.name != localizer.mesh.name:  # wherever it is said to be, it is not
+                answer = replace(answer, gain=-np.inf, level=1.0, mssd_mm=np.inf)
+            yield answer
 
 
 def _knowable(space: ContactSpace, T: Array) -> Array:
@@ -247,6 +269,16 @@ def _rigs(localizer: Localizer, off: Array, n: int, seed: int, effort: str) -> I
             yield REFUSED
         else:
             yield judged(localizer.mesh, scene.T_world_object, posterior)
+
+
+def _sequences(localizer: Localizer, slips: int, n: int, seed: int, effort: str) -> Iterator[Answer]:
+    """What is told at the last frame of sequences in which the part slips so often, at even distances; warned, if of any slip."""
+    at = tuple(_FRAMES * (i + 1) // (slips + 1) for i in range(slips))
+    for number in range(n):
+        made = random_trajectory(localizer, _FRAMES, seed * 1000 + number, _STEP, slips=at, elastic=number % 2 == 1)
+        told = list(localizer.track(made.masks, effort=effort, kind="mask", seed=seed))
+        slipped = any(warning.startswith("slip?") for posterior in told for warning in posterior.warnings)
+        yield replace(judged(localizer.mesh, made.T_sensor_object[-1], told[-1]), warned=slipped)
 
 
 def summarise(answers: Sequence[Answer]) -> dict[str, Any]:
