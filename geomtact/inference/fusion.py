@@ -30,12 +30,11 @@ from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, inverse
 
 _UNFELT = 0.1  # share of touching poses at which a sensor may yet show nothing: a contact too small or too shallow
-_CORRELATION = (
-    0.1  # of what two sensors show, at least: what a cell's width hides of the pose it hides from all of them
-)
-_DOUBTFUL = (
-    0.1  # density relative to the uniform distribution below which the first sensor's places are carried roughly
-)
+# Of what two sensors show, at least: what a cell's width hides of the pose it hides from all of them
+_CORRELATION = 0.1
+_NEGLIGIBLE = 25.0  # nats below the most probable place
+# Density relative to the uniform distribution below which the first sensor's places are carried roughly
+_DOUBTFUL = 0.1
 _DISAGREES = -2.0  # nats by which the other sensors may make a reading less likely than chance does
 
 
@@ -218,11 +217,15 @@ def _shares(log_prior: Array, logs: Array, felt: NDArray[np.bool_]) -> Array:
     without contact counts in full.
     """
     share, logs = np.ones(len(logs)), logs[felt]
-    possible = np.isfinite(logs).all(0) & np.isfinite(log_prior)
-    if len(logs) < 2 or not possible.any():
+    if len(logs) < 2:
         return share
+    joint = log_prior + logs.mean(0)
+    top = joint.max(initial=-np.inf)
+    if top == -np.inf:
+        return share
+    possible = joint > top - _NEGLIGIBLE
     logs = logs[:, possible]
-    weight = np.exp(normalised(log_prior[possible] + logs.mean(0)))
+    weight = np.exp(normalised(joint[possible]))
     off = (logs - (logs @ weight)[:, None]) * np.sqrt(weight)
     covariance = off @ off.T
     std = np.sqrt(np.maximum(covariance.diagonal(), 1e-12))
