@@ -37,7 +37,6 @@ _CHECKED = 4  # of the poses tried for each cell, whether they touch
 # Of the joint likelihood at one pose, and share of their mass that the cells looked into keep, whatever is likely within them.
 # Chosen, as is 1 / N below, on scenes that the study does not judge (docs/several-sensors.md)
 _TRUST, _DOUBT = 0.3, 0.03
-_SELDOM = 0.04  # share of theirs, at least, that cells not looked into keep, over the number of contacts
 _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
 # nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 _ALIKE, _UNLIKE = 3.0, 8.0
@@ -117,26 +116,12 @@ def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: i
     np.maximum.at(likely, np.searchsorted(judged, home), merit)
     unexplained = (search.most.sum() - merit.max(initial=-np.inf)) / search.felt
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
-    unlooked = _elsewhere(posterior, looked_into, within, search.felt)
-    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, unlooked))
+    # in cells not looked into as good a pose may lie, but the more contacts there are to be explained, the more seldom
+    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, 1 / search.felt))
     posterior = posterior.shared_anew(judged, _TRUST * likely, doubt, elsewhere, _BEFORE)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: len(chosen)]
     return replace(posterior, refined=search.told(home[leading], poses[leading]))
-
-
-def _elsewhere(posterior: Posterior, cells: NDArray[np.int64], within: Array, felt: int) -> float:
-    """The share that cells not looked into keep of their mass.
-
-    In them as good a pose may lie; but the more contacts have to be explained, the more seldom. How seldom, the least probable
-    quarter of the ``cells`` (n,) looked into tells: how much less likely what is seen is there, ``within`` (n,), than in all.
-    """
-    density = posterior.cell_log_density(cells)
-    had = density + posterior.index.log_weight[cells]
-    gets = had + _TRUST * within - (1 - _BEFORE) * density
-    last = np.argsort(-had, kind="stable")[3 * len(had) // 4 :]
-    least, mean = (np.logaddexp.reduce(gets[rows]) - np.logaddexp.reduce(had[rows]) for rows in (last, slice(None)))
-    return float(np.exp(np.clip(least - mean, np.log(_SELDOM), 0)) / felt)
 
 
 class _Search:
