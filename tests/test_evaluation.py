@@ -173,8 +173,10 @@ def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tm
     assert CliRunner().invoke(app, [*common, "--out", str(out)]).exit_code == 0
     assert asked == [2]
     assert json.loads(out.read_text())["parts"]["ball"] == part
-    assert CliRunner().invoke(app, [*common, "--out", str(out), "--seed", "2"]).exit_code == 0
-    assert asked == [2, 6], "other settings start anew"
+    held = out.read_bytes()
+    other = CliRunner().invoke(app, [*common, "--out", str(out), "--seed", "2"])
+    assert other.exit_code == 3 and "other settings (seed)" in other.output
+    assert asked == [2] and out.read_bytes() == held, "what was judged with other settings is kept"
 
 
 def _as_before(part, todo):

@@ -5,14 +5,17 @@ import json
 import re
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from geomtact import se3
+from geomtact.cli import app
 from geomtact.files import write_whole
 from geomtact.geometry.mesh import load_mesh
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
@@ -326,3 +329,46 @@ def test_pictures_open(touch):
     picture = draw(posterior, modes[:2], summaries_of(posterior, modes[:2]), simulate)
     sizes = {name: Image.open(io.BytesIO(png)).size for name, png in picture.bands.items()}
     assert sum(height for _, height in sizes.values()) == Image.open(io.BytesIO(picture.whole)).height
+
+
+# --- studies
+
+
+@pytest.mark.parametrize(
+    ("study", "which", "picture"),
+    [
+        ("kitting", None, "kitting"),
+        ("next_touch", None, "next_touch"),
+        ("registration", None, "registration"),
+        ("scores", None, "scores"),
+        ("stability", None, "stability"),
+        ("thesis", None, "thesis"),
+        ("touches", None, "touches"),
+        ("track", None, "track"),
+    ],
+)
+def test_every_committed_picture_is_drawn_from_its_study_alone(study, which, picture, tmp_path):
+    """Pixel for pixel."""
+    docs = Path(__file__).parents[1] / "docs"
+    arguments = [
+        str(docs / "results" / f"{study}.json"),
+        str(tmp_path / "again.png"),
+        *(["--picture", which] if which else []),
+    ]
+    shown = CliRunner().invoke(app, ["evaluate", "plot", *arguments])
+    assert shown.exit_code == 0, shown.output
+    committed = Image.open(docs / "images" / f"{picture}.png")
+    again = Image.open(tmp_path / "again.png")
+    assert np.array_equal(np.asarray(again), np.asarray(committed))
+
+
+def test_what_is_no_study_is_not_drawn(tmp_path):
+    (tmp_path / "a.json").write_text('{"schema": "geomtact/other/1"}', "utf-8")
+    (tmp_path / "b.json").write_text("[1]", "utf-8")
+    for name, told in (
+        ("a.json", "no picture is drawn of"),
+        ("b.json", "no JSON of a study"),
+        ("c.json", "cannot be read"),
+    ):
+        shown = CliRunner().invoke(app, ["evaluate", "plot", str(tmp_path / name), str(tmp_path / "out.png")])
+        assert shown.exit_code == 3 and why in shown.output and not (tmp_path / "out.png").exists()

@@ -16,6 +16,7 @@ from geomtact.cli import study_file, study_options
 from geomtact.cli.evaluate_choices import judge_choices
 from geomtact.cli.evaluate_kitting import judge_kitting
 from geomtact.cli.evaluate_next_touch import judge_next_touch
+from geomtact.cli.evaluate_plot import plot_study
 from geomtact.cli.evaluate_registration import judge_registration
 from geomtact.cli.evaluate_scores import judge_scores
 from geomtact.cli.evaluate_stability import judge_stability
@@ -174,3 +175,4 @@ evaluate.command("next-touch")(one_line_errors(judge_next_touch))
 evaluate.command("kitting")(one_line_errors(judge_kitting))
 evaluate.command("stability")(one_line_errors(judge_stability))
 evaluate.command("choices")(one_line_errors(judge_choices))
+evaluate.command("plot")(one_line_errors(plot_study))

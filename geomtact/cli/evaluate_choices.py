@@ -60,7 +60,7 @@ def judge_choices(
             }
         )
         found = content["parts"].get(mesh.name)
-        known = dict(found) if found is not None and study_file.same(found, settings) else {"ways": {}, "scenes": {}}
+        known = dict(found) if study_file.begun(found, settings) else {"ways": {}, "scenes": {}}
         part = known | {"settings": settings}
         done = {kind: list(part["scenes"].get(kind, {}).get("answers", [])) for kind in choices.SCENES}
         if any(len(some) < touches for some in done.values()):
@@ -71,11 +71,8 @@ def judge_choices(
         study_file.keep(out, content, **_named(part))
         _print(mesh.name, part)
         tell(f"{mesh.name}: done")
-    for path, draw in ((plot, "draw_costs"), (plot_modelled, "draw_modelled")):
-        if path is not None:
-            from geomtact.report import choices_plot
-
-            study_file.draw(getattr(choices_plot, draw)(content), path)
+    study_file.plot(content, plot)
+    study_file.plot(content, plot_modelled, "modelled")
 
 
 def _named(part: Mapping[str, Any]) -> dict[str, Any]:

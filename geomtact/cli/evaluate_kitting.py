@@ -61,10 +61,7 @@ def judge_kitting(
         keep(done)
         tell(f"{name}: done")
     _print(content["parts"])
-    if plot is not None:
-        from geomtact.report.kitting_plot import draw_kitting
-
-        study_file.draw(draw_kitting(content), plot)
+    study_file.plot(content, plot)
 
 
 def _print(parts: Mapping[str, Any]) -> None:

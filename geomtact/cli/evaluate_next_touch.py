@@ -67,10 +67,7 @@ def judge_next_touch(
         keep(study_file.collect(done, rows, runs, f"touching {name}", keep))
         tell(f"{name}: done")
     _print(content["parts"])
-    if plot is not None:
-        from geomtact.report.next_touch_study_plot import draw_touches_until_sure
-
-        study_file.draw(draw_touches_until_sure(content), plot)
+    study_file.plot(content, plot)
 
 
 def _numbers(run: Mapping[str, Any]) -> dict[str, Any]:

@@ -106,10 +106,8 @@ def judge_registration(
     content["figures"] = plain(registration.summarise(trials, 1e3 * half_pixel))
     study_file.save(out, content)
     _print(content["figures"])
-    if plot is not None and any(content["figures"]["success"].values()):
-        from geomtact.report.registration_plot import draw_registration
-
-        study_file.draw(draw_registration(content), plot)
+    if any(content["figures"]["success"].values()):
+        study_file.plot(content, plot)
 
 
 def _mesh(part: str, unit: str | None, sensor: Sensor) -> Mesh:

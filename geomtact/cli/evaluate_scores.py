@@ -147,10 +147,7 @@ def judge_scores(
         _print(f"mean over {', '.join(content['parts'])}", content["overall"])
     _print_coverage(tables)
     _print_classes(content["classes"])
-    if plot is not None:
-        from geomtact.report.score_plot import draw_scores
-
-        study_file.draw(draw_scores(content), plot)
+    study_file.plot(content, plot)
 
 
 def _part(content: dict[str, Any], mesh: Mesh, sensor: Sensor) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def judge_stability(
         settings = study.describe(localizer) | {"touches": touches, "effort": effort.value, "seed": seed}
         part = localizer.mesh.name
         found = content["parts"].get(part)
-        sweeps = dict(found["sweeps"]) if found is not None and study_file.same(found, settings) else {}
+        sweeps = dict(found["sweeps"]) if study_file.begun(found, settings) else {}
         for name in names:
             one = stability.SWEEPS[name]
             done = sweeps.setdefault(name, {"title": one.title, "inside": list(one.inside), "levels": []})["levels"]
@@ -65,10 +65,7 @@ def judge_stability(
                     done.append({"level": level, "figures": figures, "answers": [asdict(a) for a in told]})
                 study_file.keep(out, content, part, settings=settings, sweeps=sweeps)
         _print(part, {name: sweeps[name] for name in names})
-    if plot is not None:
-        from geomtact.report.stability_plot import draw_stability
-
-        study_file.draw(draw_stability(content), plot)
+    study_file.plot(content, plot)
 
 
 def _print(part: str, sweeps: Mapping[str, Any]) -> None:

@@ -68,10 +68,7 @@ def judge_thesis_table(
         _judge_part(mesh, gel, strength, settings, ambiguity, content, out, cache_dir)
         tell(f"{mesh.name}: done")
     _print(content["parts"])
-    if plot is not None:
-        from geomtact.report.thesis_plot import draw_thesis
-
-        study_file.draw(draw_thesis(content), plot)
+    study_file.plot(content, plot)
 
 
 def _judge_part(

@@ -66,10 +66,7 @@ def judge_touches(
         keep(done)
         tell(f"{name}: done")
     _print(content["parts"])
-    if plot is not None:
-        from geomtact.report.touches_plot import draw_touches
-
-        study_file.draw(draw_touches(content), plot)
+    study_file.plot(content, plot)
 
 
 def _print(parts: Mapping[str, Any]) -> None:

@@ -69,10 +69,7 @@ def judge_track(
     content["figures"] = plain(track_study.summarise(everything))
     study_file.save(out, content)
     _print(content)
-    if plot is not None:
-        from geomtact.report.track_plot import draw_track
-
-        study_file.draw(draw_track(content), plot)
+    study_file.plot(content, plot)
 
 
 def _followed(**entry: Any) -> Followed:

@@ -30,19 +30,41 @@ def load(out: Path | None, schema: str) -> dict[str, Any]:
 
 
 def earlier(entry: dict[str, Any] | None, settings: dict[str, Any], kind: Callable[..., Any] | None = None) -> list:
-    """The outcomes, each a ``kind`` or as written, of an earlier run with the very same settings."""
-    if entry is None or not same(entry, settings):
+    """The outcomes, each a ``kind`` or as written, of an earlier run."""
+    if entry is None or not begun(entry, settings):
         return []
     return outcomes(entry, kind) if kind is not None else entry.get("outcomes", [])
 
 
-def same(entry: dict[str, Any], settings: dict[str, Any]) -> bool:
-    """Whether an entry was made with ``settings``."""
+def begun(entry: dict[str, Any] | None, settings: dict[str, Any]) -> bool:
+    """Whether there is an entry to go on with.
+
+    Raises
+    ------
+    InputError
+        It was made with other settings: what it holds is not overwritten.
+    """
+    from geomtact.errors import InputError
+
+    if entry is None or same(entry, settings):
+        return entry is not None
+    other = ", ".join(key for key in {**entry["settings"], **settings} if not same(entry, settings, key))
+    raise InputError(
+        f"--out holds a study of {settings.get('object', 'this part')} with other settings ({other}); give another file, "
+        "or the same settings to go on with it"
+    )
+
+
+def same(entry: dict[str, Any], settings: dict[str, Any], key: str | None = None) -> bool:
+    """Whether an entry was made with ``settings``, all or the one named."""
     import json
 
     from geomtact.report.result import plain
 
-    return bool(entry["settings"] == json.loads(json.dumps(plain(settings))))
+    wanted = json.loads(json.dumps(plain(settings)))
+    if key is None:
+        return bool(entry["settings"] == wanted)
+    return bool(entry["settings"].get(key) == wanted.get(key))
 
 
 def outcomes(entry: dict[str, Any], kind: Callable[..., Any]) -> list:
@@ -88,12 +110,15 @@ def save(out: Path | None, content: dict[str, Any]) -> None:
         write_whole(out, lambda path: path.write_text(text, "utf-8"))
 
 
-def draw(picture: bytes, path: Path) -> None:
-    """Write a PNG."""
+def plot(content: Mapping[str, Any], path: Path | None, which: str | None = None) -> None:
+    """Write the picture of a study as PNG, if there is a file to write; ``which`` as of ``report.studies.draw``."""
     from geomtact.files import write_whole
+    from geomtact.report.studies import draw
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, lambda temporary: temporary.write_bytes(picture))
+    if path is not None:
+        picture = draw(content, which)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, lambda temporary: temporary.write_bytes(picture))
 
 
 def length(mm: float | None) -> str:

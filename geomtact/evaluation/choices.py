@@ -110,7 +110,6 @@ MODELLED = {
     "noise, in calibrating": ("calibrated without noise", DEFAULT),
     "elastic gels, in calibrating": ("calibrated on rigid gels", DEFAULT),
 }
-WORTH = 0.05  # nats that something modelled has to add on some part
 
 
 @dataclass(frozen=True)

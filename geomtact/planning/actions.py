@@ -18,6 +18,7 @@ from geomtact.sensing.sensor import Sensor
 # is compared with. The localizer is not told it either.
 PRESSED = (0.5, 0.2, 0.4, 0.6, 0.8)
 _SHAPE = (24, 32)  # of the casts
+_FARTHEST = 3.0  # m that a sensor travels at most: more is meant in millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class Touch:
     Attributes
     ----------
     T_world_sensor : (4, 4), in the posterior's frame
-    travel : [m]
+    travel : [m], at most 3
     cost : in any unit, the same for all actions
     """
 
@@ -40,8 +41,8 @@ class Touch:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_world_sensor", one_pose(self.T_world_sensor))
-        if not 0 <= self.travel < np.inf:
-            raise UsageError(f"Touch: expected a travel >= 0, in metres, got {self.travel}")
+        if not 0 <= self.travel <= _FARTHEST:
+            raise UsageError(f"Touch: expected a travel of 0 to {_FARTHEST:g} m, got {self.travel:g}; give metres")
         _check_cost(self.cost)
 
     def reached(self, space: ContactSpace, T_world_object: ArrayLike, pressed: float) -> Array:

@@ -7,10 +7,12 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
+from geomtact.report.names import Named, write_names
 from geomtact.report.touches_plot import COLOURS
 
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X")
 _DEFAULT = "balanced"
+_TICKS = (-5, -2, -1, -0.5, -0.2, -0.1, 0, 0.1, 0.2, 0.5, 1, 2, 5)  # nats
 
 
 def draw_costs(content: Mapping[str, Any]) -> bytes:
@@ -37,11 +39,14 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
         ("three sensors", "ms", "mssd", "time of three touches [ms]", "three sensors: median MSSD [mm]", -1),
         ("one touch", "ready", "gain", "time of preparing [s]", "one touch: information [nats]", 1),
     )
+    named: list[tuple[Any, list[Named]]] = []
     for line, (title, points) in zip(grid, rows.items(), strict=True):
         for axes, (scene, x, y, xlabel, ylabel, best) in zip(line, panels, strict=True):
             known = {n: (p[x], p[y]) for n, p in points.get(scene, {}).items()}
             some = {n: (a, b) for n, (a, b) in known.items() if a is not None and b is not None}
-            _draw(axes, some, {n: looks[ways[n]["choice"]] for n in some}, best)
+            if x == "ready":  # most ways are prepared as the default is
+                some = {n: p for n, p in some.items() if n == _DEFAULT or p[0] != some[_DEFAULT][0]}
+            named.append((axes, _draw(axes, some, {n: looks[ways[n]["choice"]] for n in some}, best)))
             axes.set_xlabel(xlabel)
             axes.set_ylabel(ylabel)
         line[0].set_title(title, loc="left", fontweight="bold")
@@ -49,6 +54,10 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
         figure.axes[0].plot([], [], shape, color=colour, label=choice)[0] for choice, (colour, shape) in looks.items()
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    canvas.draw()
+    figure.set_layout_engine("none")  # names are placed between the points as these now lie
+    for axes, points_here in named:
+        write_names(axes, points_here, 6.5)
     return _png(canvas)
 
 
@@ -77,7 +86,9 @@ def draw_modelled(content: Mapping[str, Any]) -> bytes:
         axes.axvspan(-0.05, 0.05, color="0.9", zorder=0, lw=0)
         axes.axvline(0, color="0.6", lw=0.8)
         axes.set_xscale("symlog", linthresh=0.2, linscale=0.6)
+        axes.set_xticks([t for t in _TICKS if axes.get_xlim()[0] <= t <= axes.get_xlim()[1]])
         axes.xaxis.set_major_formatter("{x:g}")
+        axes.minorticks_off()
         axes.set_title(scene)
         axes.set_xlabel("adds [nats]; grey: less than 0.05")
         axes.spines[["top", "right"]].set_visible(False)
@@ -122,8 +133,10 @@ def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, f
     return out
 
 
-def _draw(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[str, Any], best: int) -> None:
-    """Points (time, value) with their names, and the front; ``best`` is 1 where more is better."""
+def _draw(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[str, Any], best: int) -> list[Named]:
+    """Points (time, value) and the front, and what is to be named; ``best`` is 1 where more is better."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     front: list[tuple[float, float]] = []
     for x, y in sorted(points.values(), key=lambda p: (p[0], -best * p[1])):
         if not front or best * y > best * front[-1][1]:
@@ -135,32 +148,13 @@ def _draw(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[s
         if name == _DEFAULT:
             axes.plot(x, y, "o", ms=13, mfc="none", mec="black", zorder=2)
     axes.set_xscale("log")
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("{x:g}")
-    axes.tick_params(axis="x", which="both", labelsize=7)
     if best < 0:
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter("{x:g}")
-        axes.tick_params(axis="y", which="both", labelsize=7)
+    for axis in (axes.xaxis, axes.yaxis) if best < 0 else (axes.xaxis,):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     axes.margins(0.12)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)
-    _name(axes, points, looks)
-
-
-def _name(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[str, Any]) -> None:
-    """Write each point's name beside it, above or below the others' where they would cover each other."""
-    low, high = axes.get_ylim()
-    placed: list[tuple[float, float]] = []
-    for name, (x, y) in sorted(points.items(), key=lambda item: item[1][1]):
-        up = axes.transData.transform((x, y))
-        at = up[1]
-        while any(abs(at - other) < 9 and abs(up[0] - across) < 90 for across, other in placed):
-            at += 3
-        placed.append((up[0], at))
-        offset = (at - up[1]) * 72 / axes.figure.dpi
-        axes.annotate(
-            name, (x, y), (6, offset), textcoords="offset points", fontsize=6.5, color=looks[name][0], va="center"
-        )
-    axes.set_ylim(low, high)
+    return [Named(name, looks[name][0], x, y) for name, (x, y) in points.items()]

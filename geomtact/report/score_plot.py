@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 import io
-import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from geomtact.report.names import Named, write_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.transforms import Bbox
 
 # Okabe and Ito's colours without yellow, told apart by colour-blind readers too; the shape tells more scores apart
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9")
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X", "*")
 _SIZE = (4.6, 3.6)  # of a panel, inches
 _COLUMNS = 3
-
-
-@dataclass(frozen=True)
-class _Point:
-    name: str
-    colour: str
-    ms: float
-    gain: float
-    error: float
 
 
 def draw_scores(content: Mapping[str, Any]) -> bytes:
@@ -62,13 +50,13 @@ def draw_scores(content: Mapping[str, Any]) -> bytes:
         canvas.draw()
         figure.set_layout_engine("none")  # labels are placed between the points as these now lie
         for (axes, _), here in zip(shown, points, strict=True):
-            _label(axes, here)
+            write_names(axes, here)
         out = io.BytesIO()
         canvas.print_png(out)
     return out.getvalue()
 
 
-def _points(axes: Axes, title: str, entries: Mapping[str, Any], names: Sequence[str]) -> list[_Point]:
+def _points(axes: Axes, title: str, entries: Mapping[str, Any], names: Sequence[str]) -> list[Named]:
     """Draw each score that has been judged, and return what is to be labelled."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -80,7 +68,7 @@ def _points(axes: Axes, title: str, entries: Mapping[str, Any], names: Sequence[
         colour, shape = _COLOURS[k % len(_COLOURS)], _SHAPES[k % len(_SHAPES)]
         ms, gain, error = f["score_ms_median"], f["gain_mean"], f["gain_standard_error"]
         axes.errorbar(ms, gain, error, color=colour, marker=shape, ms=6, capsize=3, elinewidth=1)
-        out.append(_Point(name, colour, ms, gain, error or 0.0))
+        out.append(Named(name, colour, ms, gain, error or 0.0))
     axes.set_xscale("log")
     axes.set_title(title)
     axes.grid(alpha=0.3, lw=0.5)
@@ -92,34 +80,3 @@ def _points(axes: Axes, title: str, entries: Mapping[str, Any], names: Sequence[
     axes.set_xlabel("score and posterior [ms per touch]")
     axes.set_ylabel("gain [nats]")
     return out
-
-
-def _label(axes: Axes, points: Sequence[_Point]) -> None:
-    """Name each point, at the nearest place around it where the name covers no other name, no point and no bar."""
-    marks = [(p.ms, p.gain + part * p.error) for p in points for part in np.linspace(-1, 1, 9)]
-    marked = axes.transData.transform(marks) if marks else np.zeros((0, 2))
-    inside = axes.get_window_extent()
-    taken: list[Bbox] = []
-    angles = np.radians([0, 180, 45, 315, 135, 225, 90, 270])
-    for p in points:
-        for far, angle in itertools.product((9, 16, 24, 34, 46), angles):
-            right, up = np.cos(angle), np.sin(angle)
-            text = axes.annotate(
-                p.name,
-                (p.ms, p.gain),
-                (far * right, far * up),
-                textcoords="offset points",
-                color=p.colour,
-                ha="center" if abs(right) < 0.1 else "left" if right > 0 else "right",
-                va="center" if abs(up) < 0.1 else "bottom" if up > 0 else "top",
-            )
-            box = text.get_window_extent()
-            free = not box.count_overlaps(taken) and not box.padded(3).count_contains(marked)
-            if free and inside.count_contains(box.corners()) == 4:
-                break
-            text.remove()
-        else:  # too crowded: beside its point, over whatever is there
-            text = axes.annotate(
-                p.name, (p.ms, p.gain), (9, 0), textcoords="offset points", color=p.colour, va="center"
-            )
-        taken.append(text.get_window_extent())
