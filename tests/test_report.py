@@ -365,7 +365,7 @@ def test_every_committed_picture_is_drawn_from_its_study_alone(study, which, pic
 def test_what_is_no_study_is_not_drawn(tmp_path):
     (tmp_path / "a.json").write_text('{"schema": "geomtact/other/1"}', "utf-8")
     (tmp_path / "b.json").write_text("[1]", "utf-8")
-    for name, told in (
+    for name, why in (
         ("a.json", "no picture is drawn of"),
         ("b.json", "no JSON of a study"),
         ("c.json", "cannot be read"),
