@@ -12,7 +12,7 @@ import typer
 from geomtact.cli import study_file, study_options
 from geomtact.cli.library import CacheDir
 from geomtact.cli.localize import Effort
-from geomtact.cli.prepare import Unit
+from geomtact.cli.prepare import MaxPoses, Unit
 from geomtact.cli.shell import print_table, progress_bar, tell
 from geomtact.cli.simulate import NoiseName
 
@@ -99,7 +99,7 @@ def judge_scores(
     felt: study_options.Felt = study_options.FeltName.elastic,
     effort: study_options.EffortLevel = Effort.balanced,
     seed: study_options.Seed = 1,
-    max_poses: study_options.MaxPoses = None,
+    max_poses: MaxPoses = None,
     only: study_options.Only = None,
     out: study_options.Out = None,
     plot: study_options.Plot = None,

@@ -11,7 +11,7 @@ import typer
 from geomtact.cli import study_file, study_options
 from geomtact.cli.library import CacheDir
 from geomtact.cli.localize import Effort
-from geomtact.cli.prepare import Unit
+from geomtact.cli.prepare import MaxPoses, Unit
 from geomtact.cli.shell import print_table, tell
 
 SCHEMA = "geomtact/stability/1"
@@ -31,7 +31,7 @@ def judge_stability(
     touches: Annotated[int, typer.Option("--touches", min=1, help="How many of each part at each level.")] = 200,
     effort: study_options.EffortLevel = Effort.balanced,
     seed: study_options.Seed = 1,
-    max_poses: study_options.MaxPoses = None,
+    max_poses: MaxPoses = None,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,

@@ -12,6 +12,7 @@ import typer
 from geomtact.cli import study_file, study_options
 from geomtact.cli.library import CacheDir
 from geomtact.cli.localize import Effort
+from geomtact.cli.prepare import MaxPoses
 from geomtact.cli.shell import print_table, progress_bar, tell
 
 SCHEMA = "geomtact/triplets/1"
@@ -21,7 +22,7 @@ def judge_triplets(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="That of the data, hsp_digit_sim_ycb.")],
     effort: study_options.EffortLevel = Effort.balanced,
     seed: study_options.Seed = 1,
-    max_poses: study_options.MaxPoses = None,
+    max_poses: MaxPoses = None,
     out: study_options.Out = None,
     cache_dir: CacheDir = None,
 ) -> None:

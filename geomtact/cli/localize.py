@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from geomtact.cli.library import CacheDir
-from geomtact.cli.prepare import ScorerName, SensorName, Unit, open_localizer
+from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit, open_localizer
 from geomtact.cli.shell import NO_CONTACT, check_folder, print_table, tell
 from geomtact.errors import InputError, UsageError, nearest_name
 
@@ -64,6 +64,7 @@ def localize(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print result.json, and nothing else, to standard output.")
     ] = False,
+    max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
 ) -> None:
     """Localize a part from one image, or from those of several sensors: print the most probable poses and write a report.
@@ -103,7 +104,10 @@ def localize(
         if gel is not None:
             # a bad image is told before minutes go into an index
             read_observation(image, gel, kind, values["background"])
-    opened = {gel: open_localizer({**values, "sensor": gel}, sources, scorer, cache_dir) for gel in dict.fromkeys(gels)}
+    opened = {
+        gel: open_localizer({**values, "sensor": gel}, sources, scorer, cache_dir, max_poses)
+        for gel in dict.fromkeys(gels)
+    }
     made_of = metadata.get("geomtact:object")
     if made_of and values["object"] and Path(made_of).stem != Path(values["object"]).stem:
         tell(f"{images[0]}: was made of {made_of}, as its metadata says, and is localized on {values['object']}")

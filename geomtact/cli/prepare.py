@@ -18,6 +18,10 @@ Unit = Annotated[str | None, typer.Option("--unit", help="Unit of a mesh file wi
 ScorerName = Annotated[
     str | None, typer.Option("--scorer", help="How contacts are compared: a score by name, or weights (.safetensors).")
 ]
+MaxPoses = Annotated[
+    int | None,
+    typer.Option("--max-poses", min=1, help="About how many poses; 1.2 million by default.", show_default=False),
+]
 SensorName = Annotated[str | None, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
 
 
@@ -28,6 +32,7 @@ def prepare(
     unit: Unit = None,
     sensor: SensorName = None,
     scorer: ScorerName = None,
+    max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
 ) -> None:
     """Build the index of a part on a sensor and cache it, so that 'localize' starts at once."""
@@ -37,12 +42,17 @@ def prepare(
 
     values, sources = resolve({"object": object_name, "unit": unit, "sensor": sensor})
     began = time.perf_counter()
-    localizer = open_localizer(values, sources, scorer, cache_dir, given="OBJECT")
+    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, given="OBJECT")
     typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
 
 
 def open_localizer(
-    values: dict, sources: dict, scorer: str | None, cache_dir: Path | None, given: str | None = None
+    values: dict,
+    sources: dict,
+    scorer: str | None,
+    cache_dir: Path | None,
+    max_poses: int | None = None,
+    given: str | None = None,
 ) -> Localizer:
     """The localizer for resolved options, with a progress bar where its index has to be built first.
 
@@ -57,6 +67,7 @@ def open_localizer(
     for key, source in sources.items():
         tell(f"{key}: {values[key]} (from {source})")
 
+    from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.geometry.mesh import load_mesh
     from geomtact.inference.localizer import Localizer
     from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
@@ -72,4 +83,6 @@ def open_localizer(
             f"the sensor {gel.name!r}: if that is not its size, give its --unit"
         )
     with progress_bar("preparing") as progress:
-        return Localizer.prepare(mesh, sensor=gel, scorer=scorer, cache_dir=cache_dir, progress=progress)
+        return Localizer.prepare(
+            mesh, None, gel, scorer=scorer, max_poses=max_poses or MAX_POSES, cache_dir=cache_dir, progress=progress
+        )

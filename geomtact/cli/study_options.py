@@ -48,10 +48,6 @@ Only = Annotated[
 ]
 EffortLevel = Annotated[Effort, typer.Option("--effort", help="How much to compute.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
-MaxPoses = Annotated[
-    int | None,
-    typer.Option("--max-poses", min=1, help="About how many poses; 1.2 million by default.", show_default=False),
-]
 Out = Annotated[
     Path | None, typer.Option("--out", help="JSON file for all figures; a study that it holds in part is resumed.")
 ]

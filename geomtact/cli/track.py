@@ -12,7 +12,7 @@ import typer
 
 from geomtact.cli.library import CacheDir
 from geomtact.cli.localize import Effort, Kind, _check_name
-from geomtact.cli.prepare import ScorerName, SensorName, Unit, open_localizer
+from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit, open_localizer
 from geomtact.cli.shell import NO_CONTACT, tell
 from geomtact.errors import InputError, UsageError
 
@@ -57,6 +57,7 @@ def track(
     report: Annotated[Path | None, typer.Option(help="Write one HTML file that plays the sequence.")] = None,
     fps: Annotated[float, typer.Option(min=1e-6, help="Images a second, for the timestamps of a folder.")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
 ) -> None:
     """Follow a part through a sequence of images: print one line of JSON a frame, as soon as it is known.
@@ -82,7 +83,7 @@ def track(
     chosen = values["effort"] or Effort.balanced.value
     _check_name("effort", chosen, Effort, sources.get("effort"))
     frames = _frames(source, follow)
-    localizer = open_localizer(values, sources, scorer, cache_dir)
+    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses)
 
     from geomtact.inference.motion import UniformBall
     from geomtact.inference.sequence import track as posteriors
