@@ -61,6 +61,15 @@ def test_only_what_is_faster_and_surely_better_beats_the_default():
     assert beaten_by(better, summarise(better)) == ["moments"]
 
 
+def test_what_rules_truths_out_or_counts_from_another_uniform_beats_nothing():
+    bold = {**ANSWERS, "moments": told([-np.inf, 9.0, 9.0], 1.0), "within 30 degrees": told([9.0, 9.0, 9.0], 1.0)}
+    figures = summarise(bold)
+    assert beaten_by(bold, figures) == []
+    assert not {"moments", "within 30 degrees"} & set(front(figures))
+    assert front(figures, "mssd_mm_median", -1) == ["within 30 degrees"]
+    assert modelled({DEFAULT: told([-np.inf], 1.0), "exact": told([1.0], 1.0)}) == {}
+
+
 def test_a_truth_that_is_ruled_out_is_counted_apart():
     f = summarise({DEFAULT: told([1.0, -np.inf, 3.0], 1.0)})[DEFAULT]
     assert (f["gain_mean"], f["ruled_out"]) == (2.0, pytest.approx(1 / 3))

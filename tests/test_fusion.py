@@ -192,6 +192,17 @@ def test_refinement_learns_nothing_from_sensors_out_of_reach_wherever_they_stand
         np.testing.assert_allclose(one.T, other.T, atol=1e-6)
 
 
+@pytest.mark.parametrize("apart", [0.05, 0.3])
+def test_a_sensor_that_looks_away_says_nothing_of_what_lies_behind_it(plug, rng, apart):
+    touch = random_touches(plug, 1, 7)[0]
+    _, sensors = world([touch], rng)
+    away = sensors[0] @ se3.transform(np.eye(3), [0, 0, -apart]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    empty = np.zeros_like(touch.mask)
+    told = plug.localize([touch.mask, empty], "mask", None, np.stack([sensors[0], away]), effort="fast")
+    alone = single(plug, touch, sensors[0])
+    assert abs(told.densities - alone.densities).sum() < 1e-3 * alone.densities.sum()
+
+
 def test_no_contact_anywhere_leaves_what_touches_nothing(plug, rng):
     touches = random_touches(plug, 2, 8)
     T, sensors = world(touches, rng)

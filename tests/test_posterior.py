@@ -412,3 +412,25 @@ def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_
         anew = before.shared_anew(before.cells[row], likelihood, before=0.0)
         density = anew._log_density_of(row)
         np.testing.assert_allclose(density - density[0], likelihood - likelihood[0], atol=1e-4)
+
+
+def test_of_mass_shared_anew_the_images_count_by_a_power_and_a_prior_in_full(ball, a_touch):
+    before = replace(ball.localize(a_touch(ball)[1], effort="exact"), refined={}, runs=None)
+    cells, index = before.cells[np.argsort(-before.log_prob)[:40]], before.index
+    rng = np.random.default_rng(0)
+    likelihood, nats = rng.normal(size=40), rng.normal(size=len(index))
+    log_prior = index.log_weight + nats
+    known = replace(before, log_prob=before.log_prob + nats[before.cells])
+    plain = before.shared_anew(cells, likelihood, before=0.5).cell_log_density(cells)
+    told = known.shared_anew(cells, likelihood, before=0.5, log_prior=log_prior).cell_log_density(cells)
+    shift = told - plain - nats[cells]
+    np.testing.assert_allclose(shift, shift[0], atol=1e-3)
+
+
+def test_a_cell_without_likelihood_keeps_its_mass(ball, a_touch):
+    before = replace(ball.localize(a_touch(ball)[1], effort="exact"), refined={}, runs=None)
+    rows = np.argsort(-before.log_prob)[:3]
+    after = before.shared_anew(before.cells[rows], np.array([-np.inf, 0.0, 2.0]))
+    assert after.log_prob[rows[0]] == before.log_prob[rows[0]]
+    p, q = (np.exp(each.log_prob[rows[1:]].astype(float)).sum() for each in (before, after))
+    assert q == pytest.approx(p, rel=1e-5)

@@ -44,6 +44,16 @@ def test_the_first_level_of_what_may_be_wrong_is_the_localizers_own_world(here):
         assert [sweep.world is not None, sweep.rig is not None, sweep.slips].count(True) == 1
 
 
+def test_outside_the_contact_pose_space_the_error_is_that_of_the_pose_itself(plug, a_touch):
+    T, mask = a_touch(plug)
+    posterior = plug.localize(mask, "mask", effort="fast")
+    deeper = T.copy()
+    deeper[2, 3] -= 3 * MM
+    answer, at_home = judged(plug.mesh, deeper, posterior, T), judged(plug.mesh, T, posterior)
+    assert (answer.gain, answer.level) == (at_home.gain, at_home.level)
+    assert answer.mssd_mm == judged(plug.mesh, deeper, posterior).mssd_mm != at_home.mssd_mm
+
+
 def test_whatever_is_said_of_another_part_is_wrong(plug):
     sweep = SWEEPS["other_part"]
     told = list(stability.swept(plug, sweep, 1, 4, 3, "fast"))

@@ -133,7 +133,8 @@ class Carry:
         def work(part: NDArray[np.int64]) -> None:
             for draw in self._draws:
                 places, found, centre = self._placed(part, *draw)
-                own = self.there.touching[found] * (self._beside(found, centre) == 0).all(1)
+                own = (self.there.touching[found] * (self._beside(found, centre) == 0).all(1)).astype(np.float32)
+                own *= centre[2] > -self.there.mesh.reach  # not behind the sensor
                 out[places] += own * ndtr((top[found] - centre[2]) / self.std) / len(self._draws)
 
         self._in_parts(np.arange(len(self._within_reach[0])), work)

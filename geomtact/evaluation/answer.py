@@ -46,14 +46,18 @@ class Answer:
 REFUSED = Answer(-np.inf, 0.0, 1.0, np.inf, 0.0, True)  # an error took the answer's place
 
 
-def judged(mesh: Mesh, T: Array, posterior: Posterior) -> Answer:
-    """A posterior held against the truth ``T`` (4, 4); errors are modulo the symmetry of ``mesh``."""
+def judged(mesh: Mesh, T: Array, posterior: Posterior, nearest: Array | None = None) -> Answer:
+    """A posterior held against the truth ``T`` (4, 4); errors are modulo the symmetry of ``mesh``.
+
+    Where ``T`` lies outside the contact pose space, its density and level are those of ``nearest`` (4, 4), a pose inside.
+    """
+    inside = T if nearest is None else nearest
     modes = posterior.modes(1)
     poses = np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
     return Answer(
-        gain=float(posterior.log_density(T)),
+        gain=float(posterior.log_density(inside)),
         claimed=-float(posterior.entropy_nats),
-        level=float(posterior.credible_level(T)),
+        level=float(posterior.credible_level(inside)),
         mssd_mm=float(1e3 * mssd(T, poses, mesh).min(initial=np.inf)),
         probability=modes[0].probability if modes else 0.0,
         warned=bool(posterior.warnings),

@@ -198,10 +198,17 @@ def summarise(answers: Mapping[str, Sequence[Timed]]) -> dict[str, dict[str, Any
 
 
 def front(figures: Mapping[str, Mapping[str, Any]], what: str = "gain_mean", best: int = 1) -> list[str]:
-    """The ways that no other is as fast and as good as, the fastest first; ``best`` is 1 where more of ``what`` is better."""
+    """The ways that no other is as fast and as good as, the fastest first; ``best`` is 1 where more of ``what`` is better.
+
+    Ways that rule out more truths than the default does are left out, and of gains those that count from another uniform.
+    """
     out: list[str] = []
     leader = -np.inf
-    known = {name: f for name, f in figures.items() if f[what] is not None}
+    known = {
+        name: f
+        for name, f in figures.items()
+        if f[what] is not None and _comparable(figures, name, alike=what == "gain_mean")
+    }
     for name in sorted(known, key=lambda each: (known[each]["ms_quantiles"][1], -best * known[each][what])):
         if best * known[name][what] > leader:
             leader = best * known[name][what]
@@ -212,14 +219,21 @@ def front(figures: Mapping[str, Mapping[str, Any]], what: str = "gain_mean", bes
 def beaten_by(answers: Mapping[str, Sequence[Timed]], figures: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The ways that are faster than the default, and tell more even at the lower end of the paired 95 % interval."""
     own = figures[DEFAULT]["ms_quantiles"][1]
-    faster = [name for name, f in figures.items() if f["ms_quantiles"][1] < own]
+    faster = [name for name, f in figures.items() if f["ms_quantiles"][1] < own and _comparable(figures, name)]
     return [name for name in faster if adds(answers[DEFAULT], answers[name])[1] > 0]
+
+
+def _comparable(figures: Mapping[str, Mapping[str, Any]], name: str, alike: bool = True) -> bool:
+    """Whether a way rules out no more truths than the default, and if ``alike`` counts gains from the same uniform."""
+    same = WAYS[name].cone == WAYS[DEFAULT].cone or not alike
+    return same and bool(figures[name]["ruled_out"] <= figures[DEFAULT]["ruled_out"])
 
 
 def adds(without: Sequence[Answer], with_it: Sequence[Answer]) -> list[float]:
     """Mean of what is told more [nats], and its paired 95 % bootstrap interval, where neither rules the truth out."""
-    more = np.array([b.gain - a.gain for a, b in zip(without, with_it, strict=True)])
-    return mean_with_interval(more[np.isfinite(more)], np.random.default_rng(0))
+    pairs = [(a.gain, b.gain) for a, b in zip(without, with_it, strict=True)]
+    more = np.array([b - a for a, b in pairs if np.isfinite(a) and np.isfinite(b)])
+    return mean_with_interval(more, np.random.default_rng(0)) if len(more) else [0.0, -np.inf, np.inf]
 
 
 def modelled(answers: Mapping[str, Sequence[Timed]]) -> dict[str, dict[str, Any]]:
@@ -228,5 +242,7 @@ def modelled(answers: Mapping[str, Sequence[Timed]]) -> dict[str, dict[str, Any]
     for what, (without, with_it) in MODELLED.items():
         if without in answers and with_it in answers:
             ms = [float(np.median([a.ms for a in answers[name]])) for name in (without, with_it)]
-            out[what] = {"adds": adds(answers[without], answers[with_it]), "time_ratio": ms[1] / ms[0]}
+            more = adds(answers[without], answers[with_it])
+            if np.isfinite(more).all():
+                out[what] = {"adds": more, "time_ratio": ms[1] / ms[0]}
     return out

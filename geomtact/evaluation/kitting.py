@@ -24,6 +24,7 @@ from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.refine import TRUST, Refinery
 from geomtact.inference.refine_together import View
+from geomtact.planning.belief import draw_cells
 from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.next_touch import judge
 from geomtact.se3 import Array, apply, exp, inverse, transform
@@ -31,7 +32,6 @@ from geomtact.sensing.contact import Contact
 from geomtact.sensing.noise import MODERATE, Noise
 
 SURE = 0.95  # estimated probability of fitting from which the part is placed
-_MODES = 10  # of the posterior that are sampled with their covariances
 _DRAWS = 1000  # poses that are believed
 _ASKED = 60  # of these, by their weights, of which it is asked whether they fit
 _MISSED = 2.0  # a jaw that met nothing swept its way: that no contact is shown there counts twice
@@ -150,18 +150,10 @@ def touch_with_jaw(
 def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.random.Generator) -> Belief:
     """Poses drawn from ``posterior``, each weighed by how likely all that was ``felt`` is there.
 
-    They are drawn from the leading modes, spread by their covariances, and as many as no mode holds from all cells. The grid's
-    cells are wider than any clearance, so their masses say too little; the pixels, cast at the pose itself, say more.
+    They scatter about what registration found, and lie anywhere within cells that it did not look into. The grid's cells are
+    wider than any clearance, so their masses say too little; the pixels, cast at the pose itself, say more.
     """
-    modes = posterior.modes(_MODES)
-    p = np.exp(np.asarray(posterior.log_prob, float))
-    share = np.array([mode.probability for mode in modes])
-    *counts, rest = rng.multinomial(_DRAWS, [*share, max(0.0, 1 - share.sum())])
-    T = [posterior.poses_of(rng.choice(len(p), rest, p=p / p.sum()))]
-    for mode, count in zip(modes, counts, strict=True):
-        spread = rng.multivariate_normal(np.zeros(6), mode.covariance, count)
-        T += [mode.T[None], mode.T @ np.array([exp(xi) for xi in spread]).reshape(-1, 4, 4)]
-    poses = np.concatenate(T)
+    poses = draw_cells(posterior, _DRAWS, rng)[0]
     refinery, log_weight = Refinery(space), np.zeros(len(poses))
     for T_world_sensor, mask in zip(felt.T_world_sensor, felt.masks, strict=True):
         seen = View(refinery, Contact(mask) if mask.any() else None, inverse(T_world_sensor))

@@ -207,7 +207,7 @@ def swept(localizer: Localizer, sweep: Sweep, level: float, n: int, seed: int, e
         there = sweep.world(here, level)
         for T, mask in touches(there, n, seed):
             posterior = localizer.localize(mask, "mask", effort=effort, seed=seed)
-            answer = judged(localizer.mesh, _knowable(localizer.space, T), posterior)
+            answer = judged(localizer.mesh, T, posterior, _knowable(localizer.space, T))
             if there.mesh.name != localizer.mesh.name:  # wherever it is said to be, it is not
                 answer = replace(answer, gain=-np.inf, level=1.0, mssd_mm=np.inf)
             yield answer

@@ -165,7 +165,7 @@ def fused_posterior(
             for touch, refinery in zip(touches, refineries, strict=True)
         ]
         began = time.perf_counter()
-        posterior = refine_together(posterior, views, modes, first.seed)
+        posterior = refine_together(posterior, views, modes, first.seed, log_prior)
         timing["refine"] = 1e3 * (time.perf_counter() - began)
     return posterior
 

@@ -167,16 +167,25 @@ class Posterior:
         doubt: float = 0.0,
         elsewhere: float = 1.0,
         before: float = 1.0,
+        log_prior: NDArray[np.floating] | None = None,
     ) -> Posterior:
-        """The posterior in which what the runs that hold ``cells`` (n,) have together is shared out among them again, each by
-        its density to the power ``before`` times exp(``log_likelihood``) (n,), up to a constant; all but a share ``doubt``, which
-        stays. Of what all other runs have, a share ``elsewhere`` counts."""
+        """The posterior in which what the runs that hold ``cells`` (n,) have together is shared out among them again, all but a
+        share ``doubt``, which stays. Of what all other runs have, a share ``elsewhere`` counts.
+
+        Each gets by what the images made of it before, to the power ``before``, times exp(``log_likelihood``) (n,), up to a
+        constant; one without likelihood keeps what it has. ``log_prior`` (M,) is the log mass of every cell of the index before
+        the images, the uniform's by default.
+        """
         row, which = np.unique(self._rows_of(cells)[0], return_inverse=True)
         likeliest = np.full(len(row), -np.inf)
         np.maximum.at(likeliest, which, np.asarray(log_likelihood, float))
+        row, likeliest = row[likeliest > -np.inf], likeliest[likeliest > -np.inf]
         had = self.log_prob[row].astype(float)
+        told, at = self._log_density_of(row), self.cells[row]
         with np.errstate(invalid="ignore"):
-            gets = had + likeliest - (1 - before) * np.where(had > -np.inf, self._log_density_of(row), 0.0)
+            if log_prior is not None:
+                told = told - (log_prior[at] - self.index.log_weight[at])
+            gets = had + likeliest - (1 - before) * np.where(had > -np.inf, told, 0.0)
         if not np.isfinite(gets).any():
             return self
         held = np.logaddexp.reduce(had)

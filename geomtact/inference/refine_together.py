@@ -89,12 +89,19 @@ class View:
         return likely - 0.5 * (off / _NEAR) ** 2
 
 
-def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: int) -> Posterior:
+def refine_together(
+    posterior: Posterior,
+    views: Sequence[View],
+    k: int,
+    seed: int,
+    log_prior: NDArray[np.floating] | None = None,
+) -> Posterior:
     """``posterior``, on the first sensor's cells, with its leading modes refined against all ``views`` and weighed anew.
 
     As in ``Refinery.refine``, each cell keeps the pose at which what is seen is likeliest, and what the cells hold together
     is shared out anew by these likelihoods: but only as far as the likeliest pose explains what all sensors show, in the mean
-    nearly as well as other poses do what each of them shows. If none does, the right one was not looked into.
+    nearly as well as other poses do what each of them shows. If none does, the right one was not looked into. ``log_prior`` is as
+    of ``Posterior.shared_anew``.
     """
     looked_into = posterior.likeliest_cells(_CELLS)
     if not len(looked_into):
@@ -118,7 +125,7 @@ def refine_together(posterior: Posterior, views: Sequence[View], k: int, seed: i
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
     # in cells not looked into as good a pose may lie, but the more contacts there are to be explained, the more seldom
     doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, 1 / search.felt))
-    posterior = posterior.shared_anew(judged, _TRUST * likely, doubt, elsewhere, _BEFORE)
+    posterior = posterior.shared_anew(judged, _TRUST * likely, doubt, elsewhere, _BEFORE, log_prior)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: len(chosen)]
     return replace(posterior, refined=search.told(home[leading], poses[leading]))
