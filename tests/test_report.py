@@ -337,6 +337,8 @@ def test_pictures_open(touch):
 @pytest.mark.parametrize(
     ("study", "which", "picture"),
     [
+        ("choices", None, "speed-accuracy"),
+        ("choices", "modelled", "no-more-than-needed"),
         ("kitting", None, "kitting"),
         ("next_touch", None, "next_touch"),
         ("registration", None, "registration"),

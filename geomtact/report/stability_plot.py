@@ -36,8 +36,13 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
         pair = grid[2 * row, column], grid[2 * row + 1, column]
         _draw(pair, [(colours[p], part["sweeps"][name]) for p, part in parts.items() if name in part["sweeps"]])
     handles = [figure.axes[0].plot([], [], "o-", color=c, label=p)[0] for p, c in colours.items()]
-    styles = (("o-", "told; below, in the 90 % region"), ("--", "claimed"), (":", "wrong, and nothing says so"))
+    styles = (
+        ("o-", "above: told, below: truths in the 90 % region"),
+        ("--", "above: claimed"),
+        (":", "below: wrong, and nothing says so"),
+    )
     handles += [figure.axes[0].plot([], [], style, color="0.4", label=label)[0] for style, label in styles]
+    handles.append(figure.axes[0].fill_between([], [], color="0.94", label="promised to hold"))
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
     out = io.BytesIO()
     canvas.print_png(out)
@@ -70,6 +75,6 @@ def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -
     nats.tick_params(labelbottom=False)
     nats.axhline(0, color="0.7", lw=0.8)
     nats.set_ylabel("information [nats]")
-    shares.set_ylabel("share [%]")
+    shares.set_ylabel("of all touches [%]")
     shares.set_ylim(-3, 103)
     shares.set_xlabel(sweep["title"])

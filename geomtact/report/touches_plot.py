@@ -21,11 +21,14 @@ def draw_touches(content: Mapping[str, Any]) -> bytes:
         figures = part["figures"]
         sensors = [f["sensors"] for f in figures]
         left.plot(sensors, [f["gain_mean"] for f in figures], "o-", color=colour, label=name)
-        right.plot(sensors, [f["mssd_mm_median"] for f in figures], "o-", color=colour, label=f"{name}, first mode")
+        right.plot(
+            sensors, [f["mssd_mm_median"] for f in figures], "o-", color=colour, label=f"{name}, first mode (MSSD)"
+        )
         right.plot(sensors, [f["add10_mm_median"] for f in figures], "s:", color=colour, mfc="white")
     left.set_ylabel("information at the true pose [nats]")
     left.set_ylim(bottom=0)
     right.set_yscale("log")
+    right.yaxis.set_major_formatter("{x:g}")
     right.set_ylabel("median error [mm]")
     right.plot([], [], "s:", color="0.4", mfc="white", label="best of ten modes (mean point distance)")
     for axes in (left, right):
@@ -34,7 +37,7 @@ def draw_touches(content: Mapping[str, Any]) -> bytes:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3)
     left.set_title("How much is known")
-    right.set_title("How far off the first mode is (MSSD)")
+    right.set_title("How far off the first mode and the best of ten are")
     left.legend(frameon=False)
     right.legend(frameon=False, fontsize=8)
     out = io.BytesIO()
