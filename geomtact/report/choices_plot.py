@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
+from geomtact.report.canvas import COLOURS, png
 from geomtact.report.names import Named, write_names
-from geomtact.report.touches_plot import COLOURS
 
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X")
 _DEFAULT = "balanced"
@@ -58,7 +57,7 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
     figure.set_layout_engine("none")  # names are placed between the points as these now lie
     for axes, points_here in named:
         write_names(axes, points_here, 6.5)
-    return _png(canvas)
+    return png(canvas)
 
 
 def draw_modelled(content: Mapping[str, Any]) -> bytes:
@@ -96,13 +95,7 @@ def draw_modelled(content: Mapping[str, Any]) -> bytes:
     grid[0].set_yticks(range(len(names)), names)
     grid[0].invert_yaxis()
     grid[0].legend(frameon=False, fontsize=8)
-    return _png(canvas)
-
-
-def _png(canvas: Any) -> bytes:
-    out = io.BytesIO()
-    canvas.print_png(out)
-    return out.getvalue()
+    return png(canvas)
 
 
 def _points(part: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float | None]]]:

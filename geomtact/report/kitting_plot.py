@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from geomtact.report.touches_plot import COLOURS
+from geomtact.report.canvas import COLOURS, png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,9 +59,7 @@ def draw_kitting(content: Mapping[str, Any]) -> bytes:
     right.legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
-    out = io.BytesIO()
-    canvas.print_png(out, metadata={"Software": None})
-    return out.getvalue()
+    return png(canvas)
 
 
 def _bars(axes: Axes, start: float, figures: list[Mapping[str, Any]]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from geomtact.planning.actions import Touch
 from geomtact.planning.belief import draw_cells
 from geomtact.planning.next_touch import Action, ambiguity
+from geomtact.report.canvas import png
 from geomtact.report.figure import FIRST, SIMULATED
 from geomtact.se3 import Array, apply, inverse, transform
 from geomtact.sensing.sensor import Sensor
@@ -69,9 +69,7 @@ def draw_next_touch(posterior: Posterior, ranked: Sequence[Action], seed: int = 
         title = f"{posterior.mesh.name} on {posterior.sensor.name}, {posterior.frame} frame: where to touch next"
         title += " (the darker, the likelier the part is there)"
         figure.suptitle(title if note is None else f"{title}\n{note}", fontsize=11)
-        stream = io.BytesIO()
-        canvas.print_png(stream, metadata={"Software": None})
-    return stream.getvalue()
+        return png(canvas)
 
 
 def _region(

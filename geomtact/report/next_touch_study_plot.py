@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
+
+from geomtact.report.canvas import png
 
 _STYLES = {
     "best": ("#0072B2", "-", "touches chosen for the most expected information"),
@@ -33,6 +34,4 @@ def draw_touches_until_sure(content: Mapping[str, Any]) -> bytes:
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("runs in which one mode holds 95 % [%]")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
-    out = io.BytesIO()
-    canvas.print_png(out)
-    return out.getvalue()
+    return png(canvas)

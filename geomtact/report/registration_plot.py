@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+
+from geomtact.report.canvas import png
 
 _PANEL = (1.75, 1.6)  # inches
 
@@ -56,6 +57,4 @@ def draw_registration(content: Mapping[str, Any]) -> bytes:
             f"{settings['noise']['name']} noise",
             fontsize=9,
         )
-        stream = io.BytesIO()
-        canvas.print_png(stream, metadata={"Software": None})
-    return stream.getvalue()
+        return png(canvas)

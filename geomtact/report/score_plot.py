@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from geomtact.report.canvas import png
 from geomtact.report.names import Named, write_names
 
 if TYPE_CHECKING:
@@ -51,9 +51,7 @@ def draw_scores(content: Mapping[str, Any]) -> bytes:
         figure.set_layout_engine("none")  # labels are placed between the points as these now lie
         for (axes, _), here in zip(shown, points, strict=True):
             write_names(axes, here)
-        out = io.BytesIO()
-        canvas.print_png(out)
-    return out.getvalue()
+        return png(canvas)
 
 
 def _points(axes: Axes, title: str, entries: Mapping[str, Any], names: Sequence[str]) -> list[Named]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
-from geomtact.report.touches_plot import COLOURS
+from geomtact.report.canvas import COLOURS, png
 
 _ACROSS = 4
 
@@ -35,7 +34,7 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
         row, column = divmod(number, across)
         pair = grid[2 * row, column], grid[2 * row + 1, column]
         _draw(pair, [(colours[p], part["sweeps"][name]) for p, part in parts.items() if name in part["sweeps"]])
-    handles = [figure.axes[0].plot([], [], "o-", color=c, label=p)[0] for p, c in colours.items()]
+    handles: list[Any] = [figure.axes[0].plot([], [], "o-", color=c, label=p)[0] for p, c in colours.items()]
     styles = (
         ("o-", "above: told, below: truths in the 90 % region"),
         ("--", "above: claimed"),
@@ -44,9 +43,7 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
     handles += [figure.axes[0].plot([], [], style, color="0.4", label=label)[0] for style, label in styles]
     handles.append(figure.axes[0].fill_between([], [], color="0.94", label="promised to hold"))
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
-    out = io.BytesIO()
-    canvas.print_png(out)
-    return out.getvalue()
+    return png(canvas)
 
 
 def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -> None:

@@ -3,11 +3,12 @@ Figure 12)."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+
+from geomtact.report.canvas import png
 
 _ROWS = {"best": "best", "refined best": "refined\nbest", "best10": "best10", "refined best10": "refined\nbest10"}
 _COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#A6D854")
@@ -47,6 +48,4 @@ def draw_thesis(content: Mapping[str, Any]) -> bytes:
     lines = {"median": ("k", (0, (2, 1))), "a random guess": ("k", "-"), "the grid's neighbours": ("#CC0000", "-")}
     handles = [first.plot([], [], color=colour, ls=style, label=label)[0] for label, (colour, style) in lines.items()]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
-    out = io.BytesIO()
-    canvas.print_png(out)
-    return out.getvalue()
+    return png(canvas)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe and Ito
+from geomtact.report.canvas import COLOURS, png
 
 
 def draw_touches(content: Mapping[str, Any]) -> bytes:
@@ -40,6 +39,4 @@ def draw_touches(content: Mapping[str, Any]) -> bytes:
     right.set_title("How far off the first mode and the best of ten are")
     left.legend(frameon=False)
     right.legend(frameon=False, fontsize=8)
-    out = io.BytesIO()
-    canvas.print_png(out)
-    return out.getvalue()
+    return png(canvas)

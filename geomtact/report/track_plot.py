@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from geomtact.report.touches_plot import COLOURS
+from geomtact.report.canvas import COLOURS, png
 
 LABELS = {"filter": "the filter", "frames": "independent frames", "thesis": "the thesis's filter"}
 
@@ -46,9 +45,7 @@ def draw_track(content: Mapping[str, Any]) -> bytes:
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3, axis="y")
-    out = io.BytesIO()
-    canvas.print_png(out)
-    return out.getvalue()
+    return png(canvas)
 
 
 def _gain(outcome: Mapping[str, Any], method: str, least: float) -> np.ndarray:
