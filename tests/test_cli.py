@@ -116,6 +116,7 @@ def test_wrong_names_and_paths_are_told_before_any_work(geomtact, touched, tmp_p
     assert "'mask'" in geomtact("localize", image, "--kind", "maks", status=2).stderr
     assert "is a file; give a folder" in geomtact("localize", image, "--out", "part.stl", status=2).stderr
     assert "is a file; give a folder" in geomtact("simulate", "ball", "--out", "part.stl", status=2).stderr
+    assert "is a folder; give the images in it" in geomtact("localize", str(tmp_path), status=3).stderr
     assert "no.npz: no such file" in geomtact("localize", image, "--prior", "no.npz", status=3).stderr
     assert "no.toml: no such file" in geomtact("localize", image, "--sensor", "no.toml", status=3).stderr
     (tmp_path / "geomtact.toml").write_text('effort = "quick"')

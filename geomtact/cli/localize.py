@@ -89,6 +89,11 @@ def localize(
     check_folder(out)
     if prior is not None and not prior.is_file():
         raise InputError(f"--prior {prior}: no such file; give a posterior.npz")
+    for image in images:
+        if image.is_dir():
+            raise InputError(
+                f"{image}: is a folder; give the images in it, or follow them as a sequence with 'geomtact track'"
+            )
     placed = read_sensor_poses(sensor_poses, len(images)) if sensor_poses is not None else None
     if placed is None and len(images) > 1:
         raise UsageError(f"{len(images)} images need --sensor-poses FILE.json; or localize them one at a time")

@@ -27,7 +27,7 @@ def draw_touches_until_sure(content: Mapping[str, Any]) -> bytes:
         for policy, (colour, line, label) in _STYLES.items():
             share = part["figures"][policy]["sure_after"]
             axes.step(range(len(share)), [100 * s for s in share], line, where="post", color=colour, label=label)
-        axes.set_title("{} (touches: {:.2f} x)".format(name, part["figures"]["ratio"][0]), fontsize=10)
+        axes.set_title("{}: {:.2f} times the touches".format(name, part["figures"]["ratio"][0]), fontsize=10)
         axes.set_xlabel("touches after the first")
         axes.set_ylim(0, 102)
         axes.spines[["top", "right"]].set_visible(False)
