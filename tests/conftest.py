@@ -47,7 +47,7 @@ def make_localizer(cache_dir):
 
     def make(mesh, sensor, approach=None, max_poses=20_000, touches=120, **options):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(fitted, "_TOUCHES", touches)
+            patch.setattr(fitted, "TOUCHES", touches)
             options = {"cache_dir": cache_dir, **options}
             return Localizer.prepare(mesh, sensor=sensor, approach=approach, max_poses=max_poses, **options)
 

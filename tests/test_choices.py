@@ -91,7 +91,7 @@ def test_what_is_modelled_adds_the_paired_difference():
 def few_ways(monkeypatch):
     names = (DEFAULT, "no mode refined", "symmetry ignored", "calibrated on rigid gels", "this side alone")
     monkeypatch.setattr(choices, "WAYS", {name: replace(WAYS[name], max_poses=SMALL) for name in names})
-    monkeypatch.setattr(choices, "_CALIBRATED_ON", 60)
+    monkeypatch.setattr(choices, "TOUCHES", 60)
 
 
 def test_the_study_judges_every_way_on_the_same_touches_and_goes_on_where_it_was(few_ways, tmp_path, monkeypatch):

@@ -41,7 +41,7 @@ def evaluate(folder):
 
     def run(*words, status=0, touches=TOUCHES):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(fitted, "_TOUCHES", 40)
+            patch.setattr(fitted, "TOUCHES", 40)
             patch.setattr(study, "make_touches", touches_of)
             patch.setattr(study, "random_add", lambda *_: 5e-3)
             settings = ["--sensor", "gelsight-mini", "--touches", touches, "--max-poses", 3000, "--seed", 7]

@@ -45,10 +45,15 @@ def main() -> None:
     figures["machine"]["load_before"] = load
     show(figures)
     if given.out:
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        temporary = given.out.with_suffix(".part")
-        temporary.write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
-        temporary.replace(given.out)
+        write(figures, given.out)
+
+
+def write(figures: dict[str, Any], path: Path) -> None:
+    """The figures as a JSON file."""
+    from geomtact.files import write_whole
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, lambda temporary: temporary.write_text(json.dumps(figures, indent=1) + "\n", "utf-8"))
 
 
 def machine() -> dict[str, Any]:

@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from benchmark import machine
+from benchmark import machine, write
 from peerbench.retrieval import retrieval
 from peerbench.simulation import simulation
 
@@ -52,10 +52,7 @@ def main() -> None:
         figures[child] = [row for n in THREADS for row in in_process(child, n, settings)]
     show(figures)
     if given.out:
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        temporary = given.out.with_suffix(".part")
-        temporary.write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
-        temporary.replace(given.out)
+        write(figures, given.out)
 
 
 def absent() -> dict[str, str]:

@@ -64,19 +64,17 @@ def judge_choices(
         part = known | {"settings": settings}
         done = {kind: list(part["scenes"].get(kind, {}).get("answers", [])) for kind in choices.SCENES}
         if any(len(some) < touches for some in done.values()):
-            _judge(
-                mesh, gel, part, done, touches, seed, lambda part=part: study_file.keep(out, content, **_named(part))
-            )
+            _judge(mesh, gel, part, done, touches, seed, lambda part=part: _keep(out, content, part))
         _summarise(part)
-        study_file.keep(out, content, **_named(part))
+        _keep(out, content, part)
         _print(mesh.name, part)
         tell(f"{mesh.name}: done")
     study_file.plot(content, plot)
     study_file.plot(content, plot_modelled, "modelled")
 
 
-def _named(part: Mapping[str, Any]) -> dict[str, Any]:
-    return {"part": part["settings"]["object"], **part}
+def _keep(out: Path | None, content: dict[str, Any], part: Mapping[str, Any]) -> None:
+    study_file.keep(out, content, part["settings"]["object"], **part)
 
 
 def _judge(
@@ -118,9 +116,9 @@ def _summarise(part: dict[str, Any]) -> None:
     from geomtact.evaluation import choices
 
     for scene in part["scenes"].values():
-        names = scene["answers"][0] if scene["answers"] else ()
         answers = {
-            name: [choices.Timed(**study_file.numbers(told[name])) for told in scene["answers"]] for name in names
+            name: [choices.Timed(**study_file.numbers(told[name])) for told in scene["answers"]]
+            for name in scene["answers"][0]
         }
         figures = choices.summarise(answers)
         scene["figures"] = figures

@@ -181,8 +181,7 @@ def _judge(
     described = plain(study.describe(localizer))
     found = part["scores"].get(name)
     outcomes = study_file.earlier(found, described, scores.Scored)
-    prepared = found is not None and study_file.same(found, described)
-    known = {**(found["prepare_s"] if prepared else {}), "index": part["index_s"]}
+    known = {**(found["prepare_s"] if found else {}), "index": part["index_s"]}
     seconds = {step: known.get(step) if s is None else s for step, s in seconds.items()}
     part["index_s"] = seconds["index"]
     part["random_add_mm"] = part["random_add_mm"] or study.expected_random_add(localizer)

@@ -44,27 +44,21 @@ def begun(entry: dict[str, Any] | None, settings: dict[str, Any]) -> bool:
     InputError
         It was made with other settings: what it holds is not overwritten.
     """
-    from geomtact.errors import InputError
-
-    if entry is None or same(entry, settings):
-        return entry is not None
-    other = ", ".join(key for key in {**entry["settings"], **settings} if not same(entry, settings, key))
-    raise InputError(
-        f"--out holds a study of {settings.get('object', 'this part')} with other settings ({other}); give another file, "
-        "or the same settings to go on with it"
-    )
-
-
-def same(entry: dict[str, Any], settings: dict[str, Any], key: str | None = None) -> bool:
-    """Whether an entry was made with ``settings``, all or the one named."""
     import json
 
+    from geomtact.errors import InputError
     from geomtact.report.result import plain
 
-    wanted = json.loads(json.dumps(plain(settings)))
-    if key is None:
-        return bool(entry["settings"] == wanted)
-    return bool(entry["settings"].get(key) == wanted.get(key))
+    if entry is None:
+        return False
+    held, wanted = entry["settings"], json.loads(json.dumps(plain(settings)))
+    other = [key for key in {**held, **wanted} if held.get(key) != wanted.get(key)]
+    if other:
+        raise InputError(
+            f"--out holds a study of {settings.get('object', 'this part')} with other settings ({', '.join(other)}); give "
+            "another file, or the same settings to go on with it"
+        )
+    return True
 
 
 def outcomes(entry: dict[str, Any], kind: Callable[..., Any]) -> list:

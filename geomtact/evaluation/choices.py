@@ -31,6 +31,7 @@ from geomtact.inference.localizer import EFFORTS, Effort, Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import calibrate, simulate_touches
 from geomtact.scoring.catalogue import DEFAULT_SCORER
+from geomtact.scoring.fitted import SEED, TOUCHES
 from geomtact.se3 import Array
 from geomtact.sensing.noise import CLEAN, MODERATE, Noise
 from geomtact.sensing.sensor import Sensor
@@ -38,7 +39,6 @@ from geomtact.sensing.sensor import Sensor
 SCENES = ("one touch", "three sensors", "known side")
 DEFAULT = "balanced"
 _SENSORS = 3
-_CALIBRATED_ON = 500  # touches, as ``scoring.fitted`` does
 _BALANCED = EFFORTS["balanced"]
 _ONE, _ALL = SCENES[:1], SCENES[:2]
 
@@ -139,7 +139,7 @@ def prepare(
     localizer, seconds = scores.prepare(mesh, sensor, way.scorer, way.max_poses, cache_dir, progress, approach)
     if (way.noise, way.elastic) != (CALIBRATION_NOISE, None):
         fitted = localizer.scorer
-        touches = simulate_touches(localizer.index, _CALIBRATED_ON, 20_200_531, progress, way.elastic, way.noise)
+        touches = simulate_touches(localizer.index, TOUCHES, SEED, progress, way.elastic, way.noise)
         calibration = calibrate(fitted.scorer, localizer.index, touches)
         localizer = replace(localizer, scorer=replace(fitted, calibration=calibration, cascade=None))
     known = [s for s in seconds.values() if s is not None]

@@ -40,7 +40,7 @@ _LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than
 _USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual
 _ODD = 0.01  # share of touches whose evidence, or best pose, is called unlike the object
 _LEAST_GAIN = 0.05  # nats that a touch has to tell in the mean
-_TOUCHES = 500  # that scores are calibrated on
+TOUCHES, SEED = 500, 20_200_531  # that scores are calibrated on
 _LEARN = 0.6  # share of them that the moments are learned from; the rest tell what they are worth
 
 
@@ -119,7 +119,7 @@ def fitted_scorer(
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             return _from_json(name, json.loads(path.read_text("utf-8")), known, index)
-    touches = _simulated(index, None if folder is None else folder / f"touches-{FORMAT}-{_TOUCHES}.npz", progress)
+    touches = _simulated(index, None if folder is None else folder / f"touches-{FORMAT}-{TOUCHES}.npz", progress)
     if len(touches.ids) < 40:
         raise MeshError(
             f"{index.mesh.name}: hardly any pose makes a contact that the sensor {index.sensor.name!r} can resolve; "
@@ -141,7 +141,7 @@ def _simulated(index: Index, path: Path | None, progress: Progress | None) -> To
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return Touches.load(path)
-    touches = simulate_touches(index, _TOUCHES, seed=20_200_531, progress=progress)
+    touches = simulate_touches(index, TOUCHES, SEED, progress)
     if path is not None:
         with contextlib.suppress(OSError):
             write_whole(path, touches.save)
