@@ -188,10 +188,10 @@ class Filter:
             # the densest of every fiftieth tell about where to cut
             some = log_density[::50]
             n = min(most // 40 + 10, len(some))
-            bar = max(bar, np.partition(some, -n)[-n])
+            bar = max(bar, np.sort(some)[-n])  # sorts faster than it parts, for ties
         kept = np.flatnonzero(log_density >= bar)
         if most is not None and len(kept) > most:
-            kept = np.sort(kept[np.argpartition(log_density[kept], -most)[-most:]])
+            kept = kept[_largest(log_density[kept], most)]
         cells = self.spreading.index.possible[kept]
         density, weight = np.exp(log_density[kept]), self._weight[kept]
         rest = 0.0
@@ -214,6 +214,14 @@ class Filter:
         """The possible cells that have mass, by their log probability (n,)."""
         possible, held = self.spreading.index.possible, log_prob > -np.inf
         return (possible, log_prob) if held.all() else (possible[held], log_prob[held])
+
+
+def _largest(values: NDArray[np.floating], n: int) -> NDArray[np.bool_]:
+    """Which (m,) of ``values`` (m,) are the ``n`` largest, the first of those that tie."""
+    least = np.sort(values)[-n]
+    out = values > least
+    out[np.flatnonzero(values == least)[: n - int(out.sum())]] = True
+    return out
 
 
 def _gain(seen: Posterior) -> NDArray[np.float32]:

@@ -19,6 +19,7 @@ _TWISTS = 4096  # motions drawn, which stand for all
 _ROTATIONS = 1 << 17, 16, 128  # drawn to count how many leave their cell: in all, and of a cell at least and at most
 _CARRIED = 150_000, 2, 64  # points that are carried along with the sensor: in all, and of a cell at least and at most
 _LEAST_TAP = 1e-4
+_FEW = 0.5  # share of all rotations up to which only those that hold mass are shifted
 _MIXED = 0.1  # by how much the shares of the penetrations may differ, relative to their mean, when they count as mixed
 
 
@@ -59,17 +60,28 @@ class Spreading:
         """The distribution one frame later, over the sensor as it stands."""
         if not len(before.cells):
             return before
-        index, share, (along_y, along_x, deeper, turned) = self.index, self._share, self._stay
+        index, (M, depths, ny, nx) = self.index, self._share.shape
         level, place = np.divmod(before.cells, index.places)
-        _, depths, ny, nx = share.shape
-        at = self._slot[place] + level % depths * (ny * nx)
-        grid: NDArray[np.float32] = np.bincount(at, before.mass, share.size).astype(np.float32).reshape(share.shape)
-        grid = along_y * grid + share * (self._shifts(ny) @ grid)
-        grid = along_x * grid + share * (grid @ self._shifts(nx))
+        rotation = index.rotation[place]
+        live = np.flatnonzero(np.bincount(rotation, minlength=M))
+        # shifts stay within a rotation: the others are empty until the turn
+        some: slice | NDArray[np.int64] = live if len(live) < _FEW * M else slice(None)
+        kept = np.arange(M)[some]
+        row = np.zeros(M, np.int64)
+        row[kept] = np.arange(len(kept))
+        at = self._slot[place] + ((row[rotation] - rotation) * depths + level % depths) * (ny * nx)
+        shape = (len(kept), depths, ny, nx)
+        grid = np.bincount(at, before.mass, len(kept) * depths * ny * nx).astype(np.float32).reshape(shape)
+        share, (along_y, along_x, deeper, turned) = self._share[some], (stay[some] for stay in self._stay)
+        _step(grid, along_y, share, self._shifts(ny) @ grid)
+        _step(grid, along_x, share, grid @ self._shifts(nx))
         if depths > 1:
-            grid = deeper * grid + share * self._deeper(grid)
-        grid = turned * grid + share * (self._entering @ grid.reshape(len(grid), -1)).reshape(share.shape)
-        mass = grid.ravel()[self._slot + np.arange(depths)[:, None] * (ny * nx)]
+            _step(grid, deeper, share, self._deeper(grid))
+        leaving = self._leaving if len(kept) == M else self._leaving[some]
+        after = (leaving.T @ grid.reshape(len(kept), -1)).reshape(self._share.shape)
+        after *= self._share
+        after[some] += turned * grid
+        mass = after.ravel()[self._slot + np.arange(depths)[:, None] * (ny * nx)]
         mass = (mass * self._pressed if depths == 1 else mass).ravel()
         possible = index.possible
         return Mixture(possible, mass if len(possible) == len(mass) else mass[possible], before.uniform)
@@ -237,10 +249,6 @@ class Spreading:
         return out
 
     @cached_property
-    def _entering(self) -> csr_matrix:
-        return self._leaving.T.tocsr()
-
-    @cached_property
     def _drawn(self) -> Array:
         """Rotations (n, M, 3, 3) drawn within the cell of each rotation of the grid."""
         (total, least, most), M = _ROTATIONS, len(self._measure)
@@ -252,6 +260,15 @@ class Spreading:
         """The canonical images (n, 4, 4) of rotations ``R`` (n, 3, 3), and the rotation (n,) of the grid that holds each."""
         T, direction, turn = self.index.directions.lookup(transform(R, np.zeros(3)))
         return T, self.index.directions.first_turn[direction] + turn
+
+
+def _step(
+    grid: NDArray[np.float32], stays: NDArray[np.float32], share: NDArray[np.float32], comes: NDArray[np.float32]
+) -> None:
+    """``grid`` after a step, in place: what ``stays`` of it, and of what ``comes`` the ``share`` that a cell can hold."""
+    grid *= stays
+    comes *= share
+    grid += comes
 
 
 def _off_diagonal(matrix: NDArray[np.float32]) -> NDArray[np.float32]:
