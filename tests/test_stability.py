@@ -4,16 +4,19 @@ import json
 from dataclasses import asdict, replace
 
 import numpy as np
+import open3d as o3d
 import pytest
 from typer.testing import CliRunner
 
 from geomtact import load_mesh
 from geomtact.cli import app, evaluate_stability, study_file, study_options
+from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import stability
 from geomtact.evaluation.answer import REFUSED, Answer, judged
+from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.stability import SWEEPS, World, coarser, cut_off, larger, scanned
+from geomtact.evaluation.stability import SWEEPS, World, coarser, cut_off, knobbed, larger, scanned
 from geomtact.evaluation.touches import penetrations
 from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.report.stability_plot import draw_stability
@@ -32,7 +35,7 @@ def here(plug):
 
 
 def test_the_first_level_of_what_may_be_wrong_is_the_localizers_own_world(here):
-    for name in ("pitch", "size", "surface", "faces"):
+    for name in ("pitch", "size", "surface", "faces", "detail", "kind"):
         world = SWEEPS[name].world(here, SWEEPS[name].levels[0])
         assert np.array_equal(world.mesh.faces, here.mesh.faces)
         assert world.mesh.vertices == pytest.approx(here.mesh.vertices, abs=1e-12)
@@ -40,7 +43,7 @@ def test_the_first_level_of_what_may_be_wrong_is_the_localizers_own_world(here):
     for name in ("rig_shift", "rig_turn"):
         assert (SWEEPS[name].rig(SWEEPS[name].levels[0]) == 0).all()
     for sweep in SWEEPS.values():
-        assert set(sweep.inside) < set(sweep.levels)
+        assert set(sweep.inside) <= set(sweep.levels)
         assert [sweep.world is not None, sweep.rig is not None, sweep.slips].count(True) == 1
 
 
@@ -110,6 +113,26 @@ def test_touches_are_as_the_sweep_wants_them(here, name, level):
     for _, mask in found:
         assert world.area[0] <= mask.sum() * pixel <= world.area[1]
         assert world.border[0] <= cut_off(mask) <= world.border[1]
+
+
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_contacts_are_of_the_kind_that_the_sweep_wants(here, level):
+    world = replace(SWEEPS["kind"].world(here, level), threshold=0.0)
+    space = ContactSpace(world.mesh, world.sensor)
+    found = list(stability.touches(world, 3, 1))
+    assert [contact_class(space, T) for T, _ in found] == [CLASSES[level - 1]] * 3
+
+
+def test_knobs_stand_out_of_the_surface_and_leave_the_rest_as_it_was(here):
+    mesh = knobbed(here.mesh, 1 * MM)
+    assert np.array_equal(mesh.vertices[: len(here.mesh.vertices)], here.mesh.vertices)
+    assert np.array_equal(mesh.faces[: len(here.mesh.faces)], here.mesh.faces)
+    knobs = mesh.vertices[len(here.mesh.vertices) :].reshape(12, -1, 3)
+    centres = knobs.mean(1)
+    assert np.linalg.norm(knobs - centres[:, None], axis=2) == pytest.approx(1 * MM, rel=1e-6)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(here.mesh.vertices.astype(np.float32), here.mesh.faces.astype(np.uint32))
+    assert scene.compute_distance(centres.astype(np.float32)).numpy() == pytest.approx(0, abs=1e-7)
 
 
 def test_what_no_touch_fulfils_ends(here, monkeypatch):

@@ -16,7 +16,8 @@ from geomtact.cli.shell import print_table, tell
 
 SCHEMA = "geomtact/stability/1"
 _NAMES = (
-    "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, rig_shift, rig_turn, slips, other_part"
+    "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, kind, detail, rig_shift, rig_turn, slips, "
+    "other_part"
 )
 
 

@@ -17,6 +17,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.answer import REFUSED, Answer, judged
+from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.pose_error import coverage
 from geomtact.evaluation.sensors_study import make_scenes
 from geomtact.evaluation.touches import penetrations
@@ -28,6 +29,7 @@ from geomtact.sensing.noise import MODERATE, Noise
 from geomtact.sensing.sensor import Sensor
 
 _TRIED = 500  # touches, at most, for each one that a sweep takes
+_KNOBS = 12  # that a part has and its mesh lacks
 _BUMP = 3e-3  # m over which a scanned surface is off alike
 _SENSORS = 3  # that touch at once, where the rig is wrong
 _FRAMES, _STEP = 12, 2e-3  # of a sequence, and how far the part creeps from one to the next [m]
@@ -44,6 +46,7 @@ class World:
     threshold : a rigid gel feels what is so deep [m]; None for rigid and elastic gels in turn
     area : (least, largest) area of contact [m^2], without noise
     border : (least, largest) share of the contact's outline that the window's border cuts off
+    kind : one of ``contact_class.CLASSES`` that contacts are of; any, if None
     """
 
     mesh: Mesh
@@ -53,6 +56,7 @@ class World:
     threshold: float | None = None
     area: tuple[float, float] = (LEAST_CONTACT, np.inf)
     border: tuple[float, float] = (0.0, 1.0)
+    kind: str | None = None
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,21 @@ def coarser(mesh: Mesh, percent: float) -> Mesh:
     full = o3d.geometry.TriangleMesh(vertices, faces)
     some = full.simplify_quadric_decimation(max(4, int(len(mesh.faces) * percent / 100)))
     return replace(mesh, vertices=np.asarray(some.vertices), faces=np.asarray(some.triangles))
+
+
+def knobbed(mesh: Mesh, radius: float, seed: int = 0) -> Mesh:
+    """The mesh with ``_KNOBS`` balls of ``radius`` [m] sunk by half into its surface, at random."""
+    import trimesh
+
+    if radius == 0:
+        return mesh
+    points, _ = mesh.sample_surface(_KNOBS, seed=seed)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    vertices = [mesh.vertices, *(ball.vertices + point for point in points)]
+    first = len(mesh.vertices) + len(ball.vertices) * np.arange(_KNOBS)
+    return replace(
+        mesh, vertices=np.concatenate(vertices), faces=np.concatenate([mesh.faces, *(ball.faces + i for i in first)])
+    )
 
 
 def _other(mesh: Mesh, number: float) -> Mesh:
@@ -176,6 +195,18 @@ SWEEPS = {
         (0, 10, 25),
         lambda w, x: replace(w, border=(x / 100, 1.0) if x else (0.0, 0.0)),
     ),
+    "kind": Sweep(
+        "contact (0 any, " + ", ".join(f"{i} {kind}" for i, kind in enumerate(CLASSES, 1)) + ")",
+        tuple(range(len(CLASSES) + 1)),
+        tuple(range(len(CLASSES) + 1)),
+        lambda w, x: replace(w, kind=CLASSES[int(x) - 1] if x else None),
+    ),
+    "detail": Sweep(
+        "twelve knobs that the mesh lacks, radius [mm]",
+        (0, 0.25, 0.5, 1, 2, 4),
+        (0, 0.25),
+        lambda w, x: replace(w, mesh=knobbed(w.mesh, 1e-3 * x)),
+    ),
     "rig_shift": Sweep(
         "each of three sensors off by [mm rms]",
         (0, 0.5, 1, 2, 5, 10),
@@ -232,6 +263,8 @@ def touches(world: World, n: int, seed: int) -> Iterator[tuple[Array, NDArray[np
     found = 0
     for _ in range(_TRIED * n // 32):
         for T in space.sample(32, rng, world.pressed)[0]:
+            if world.kind and contact_class(space, T) != world.kind:
+                continue
             mask = _felt(space, T, world.threshold, found % 2 == 1)
             if not (world.area[0] <= mask.sum() * pixel <= world.area[1]):
                 continue
