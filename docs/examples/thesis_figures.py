@@ -18,8 +18,8 @@ from geomtact import Localizer, Sensor, load_mesh
 from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.known_approach import draw_sides
 from geomtact.evaluation.pose_error import random_add
-from geomtact.evaluation.scores import THESIS_PARTS
 from geomtact.evaluation.sensors_study import make_scenes
+from geomtact.evaluation.study import THESIS_PARTS
 from geomtact.evaluation.touches import each_touch
 from geomtact.geometry.distance import PoseDistance
 from geomtact.scoring.overlap import PixelL1, to_grid

@@ -50,9 +50,9 @@ def judge_registration(
     from geomtact.contact_space.space import ContactSpace
     from geomtact.evaluation import registration
     from geomtact.evaluation.peers import peers
-    from geomtact.evaluation.scores import FELT, THESIS_PARTS
     from geomtact.evaluation.shapes import SHAPES
-    from geomtact.evaluation.touches import random_touches
+    from geomtact.evaluation.study import THESIS_PARTS
+    from geomtact.evaluation.touches import FELT, random_touches
     from geomtact.geometry.rotations import Directions
     from geomtact.inference.refine import Refinery
     from geomtact.registration.observability import Spread

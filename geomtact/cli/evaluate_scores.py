@@ -25,7 +25,7 @@ SCHEMA = "geomtact/scores/2"
 
 @dataclass(frozen=True)
 class Options:
-    """What a study's figures depend on, beside the parts and the scores: ``felt`` is one of ``scores.FELT``, ``only`` a class
+    """What a study's figures depend on, beside the parts and the scores: ``felt`` is one of ``touches.FELT``, ``only`` a class
     of contact or None for all."""
 
     sensor: Sensor
@@ -61,7 +61,7 @@ def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], 
         No score of that name, or neither a score nor a part.
     """
     from geomtact.errors import UsageError, nearest_name
-    from geomtact.evaluation.scores import THESIS_PARTS
+    from geomtact.evaluation.study import THESIS_PARTS
     from geomtact.geometry.catalogue import catalogue
     from geomtact.inference.localizer import EFFORTS
     from geomtact.scoring.catalogue import DEFAULT_SCORER, SCORERS
@@ -170,6 +170,7 @@ def _judge(
 ) -> None:
     """Judge one score on one part, from where the file ends."""
     from geomtact.evaluation import scores, study
+    from geomtact.evaluation.touches import FELT
     from geomtact.inference.localizer import EFFORTS
     from geomtact.report.result import plain
     from geomtact.scoring.catalogue import DEFAULT_SCORER
@@ -197,7 +198,7 @@ def _judge(
         save()
 
     if len(outcomes) < options.touches and not touches:
-        elastic, strength = scores.FELT[options.felt], study_options.noise_named(options.noise)
+        elastic, strength = FELT[options.felt], study_options.noise_named(options.noise)
         touches += study.make_touches(
             localizer, options.touches, options.seed, strength, elastic=elastic, only=options.only
         )

@@ -47,7 +47,7 @@ def judge_thesis_table(
     Prints median errors, absolute and normalised, and writes them and every outcome to --out; with --ambiguity also what the
     first touches from each side leave open, whoever reads them.
     """
-    from geomtact.evaluation.scores import FELT
+    from geomtact.evaluation.touches import FELT
     from geomtact.sensing.sensor import Sensor
 
     content, gel, strength = study_file.load(out, SCHEMA), Sensor.load(sensor), study_options.noise_named(noise)

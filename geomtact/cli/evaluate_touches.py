@@ -38,7 +38,7 @@ def judge_touches(
     Prints gain, coverage and pose errors for each number of sensors, and writes them and every outcome to --out.
     """
     from geomtact.evaluation import sensors_study, study
-    from geomtact.evaluation.scores import FELT
+    from geomtact.evaluation.touches import FELT
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir):

@@ -201,7 +201,7 @@ class Carry:
         the other sensor's frame, at the middle penetration. Most lie beside its window, or far above it."""
         here, there, T = self.here, self.there, self.T_there_here.astype(np.float32)
         local = np.stack([*here.shift.T, here.height[len(here.height) // 2]])
-        centres = T[:3, :3] @ local + T[:3, 3:]
+        centres = np.einsum("ij,jn->in", T[:3, :3], local) + T[:3, 3:]  # threads of @ would wait for each other
         ny, nx = there.table.shape[1:]
         margin = 0.5 * here.resolution.step
         beside = np.abs(centres[:2]) - 0.5 * there.resolution.step * np.array([[nx], [ny]])

@@ -25,9 +25,6 @@ from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.sensor import Sensor
 
-THESIS_PARTS = ("pin", "damping_pin", "head", "elbow_pipe")
-FELT = {"elastic": True, "rigid": False, "both": None}  # as ``study.make_touches`` takes it
-
 
 @dataclass(frozen=True)
 class Scored(study.Outcome):

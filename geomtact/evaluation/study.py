@@ -20,6 +20,7 @@ from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 
+THESIS_PARTS = ("pin", "damping_pin", "head", "elbow_pipe")
 NOMINAL = (0.5, 0.8, 0.9, 0.95)
 MODES = 10  # the thesis's best10, of modes instead of poses
 WRONG_MM = 10.0  # MSSD beyond which a first mode is wrong

@@ -17,6 +17,7 @@ from geomtact.se3 import Array
 from geomtact.sensing.noise import MODERATE, Noise
 
 PENETRATION = (0.3e-3, 1.5e-3)
+FELT = {"elastic": True, "rigid": False, "both": None}  # gels, as ``each_touch`` takes them
 _TRIED = 2000  # touches, at most, for each one found of a class
 
 

@@ -226,8 +226,9 @@ def _shares(log_prior: Array, logs: Array, felt: NDArray[np.bool_]) -> Array:
     possible = joint > top - _NEGLIGIBLE
     logs = logs[:, possible]
     weight = np.exp(normalised(joint[possible]))
-    off = (logs - (logs @ weight)[:, None]) * np.sqrt(weight)
-    covariance = off @ off.T
+    # einsum, not @: over so many places a product of matrices waits for its threads longer than it computes
+    off = (logs - np.einsum("in,n->i", logs, weight)[:, None]) * np.sqrt(weight)
+    covariance = np.einsum("in,jn->ij", off, off)
     std = np.sqrt(np.maximum(covariance.diagonal(), 1e-12))
     correlation = np.clip(covariance / np.outer(std, std), _CORRELATION, 1)
     np.fill_diagonal(correlation, 1)
@@ -246,8 +247,8 @@ def _support(total: float, touched: Array, without: Array, uniform: Array) -> fl
     without : (n,) the product of all but this sensor's
     uniform : (n,) share of each place that touches it, or does not, as it shows
     """
-    expected = float(without @ uniform)
-    by_touch = np.log(expected / without.sum() / float(touched @ uniform))
+    expected = float(np.einsum("n,n->", without, uniform))
+    by_touch = np.log(expected / without.sum() / float(np.einsum("n,n->", touched, uniform)))
     return float(np.log(total / expected) + min(0.0, by_touch))
 
 

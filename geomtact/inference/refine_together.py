@@ -1,8 +1,8 @@
 """The leading modes of several sensors taken below the grid, by all contacts at once.
 
 A cell is wider than the contacts of several sensors leave the pose, so its own pose is far from where they agree. Poses
-drawn within the most probable cells are cast on every sensor, the likeliest are registered to all contacts together, and a
-last search around them follows. Directions that one contact leaves open another may tell.
+drawn within the most probable cells are cast on every sensor, the likeliest of each is registered to all contacts together, and
+a last search around the best of these follows. Directions that one contact leaves open another may tell.
 """
 
 from __future__ import annotations
@@ -28,12 +28,15 @@ from geomtact.sensing.contact import Contact
 from geomtact.sensing.moments import without_specks
 
 _SHAPE = (24, 32)  # of the casts that choose among many
-_CELLS, _DRAWS = 128, 16  # that are looked into, and poses drawn within each
-_PER_MODE = 5  # of these cells are searched for each mode that is asked for
+_CELLS, _PER_MODE = 200, 10  # that are looked into: so many, and more for each mode that is asked for
+_DRAWS = 8  # poses drawn within each
+_POINTS, _ROUGH = 60, 20  # of each outline, at most: to work out what is told, and to register all that is looked into
 _HOPEFUL = 4  # of the poses tried for a cell, that are asked for by more than two sensors
-_KEPT = 3  # poses of a cell that are registered
-_ROUNDS, _AROUND = 3, 12  # of the last search, each in half the width of the one before
-_CHECKED = 4  # of the poses tried for each cell, whether they touch
+_ROUNDS, _AROUND = (
+    3,
+    12,
+)  # of the last search, each in half the width of the one before, and for the better half of the cells
+_TOLD = 5  # for each mode that is asked for, cells of which it is worked out what the contacts tell
 # Of the joint likelihood at one pose, and share of their mass that the cells looked into keep, whatever is likely within them.
 # Chosen, as is 1 / N below, on scenes that the study does not judge (docs/several-sensors.md)
 _TRUST, _DOUBT = 0.3, 0.03
@@ -103,32 +106,43 @@ def refine_together(
     nearly as well as other poses do what each of them shows. If none does, the right one was not looked into. ``log_prior`` is as
     of ``Posterior.shared_anew``.
     """
-    looked_into = posterior.likeliest_cells(_CELLS)
+    looked_into = posterior.likeliest_cells(_CELLS + _PER_MODE * k)
     if not len(looked_into):
         return posterior
-    index, search = posterior.index, _Search(posterior.index, views, np.random.default_rng(seed))
-    drawn, merit = search.drawn(looked_into)
-    within = merit.max(1)  # so likely is what is seen somewhere in each cell
-    prior = posterior.cell_log_density(looked_into) + index.log_weight[looked_into]
-    chosen = np.argsort(-(prior + _TRUST * within), kind="stable")[: _PER_MODE * k]
-    tried, merit = search.around_the_best(*search.registered(drawn[chosen], merit[chosen]))
-    home, poses, merit = search.best_of_each_cell(tried.reshape(-1, 4, 4), merit.ravel(), _CHECKED * len(chosen))
+    search = _Search(posterior.index, views, np.random.default_rng(seed))
+    tried = search.around_the_best(search.registered(search.drawn(looked_into)))
+    home, poses, likely = search.best_of_each_cell(tried)
     held = posterior.cell_log_density(home) > -np.inf
-    home, poses, merit = home[held], poses[held], merit[held]
+    home, poses, likely = home[held], poses[held], likely[held]
 
-    # cells in which nothing likely was found count too, as unlikely
-    judged = np.union1d(looked_into, home)
-    likely = np.full(len(judged), -np.inf)
-    np.maximum.at(likely, np.searchsorted(judged, looked_into), within)
-    np.maximum.at(likely, np.searchsorted(judged, home), merit)
-    unexplained = (search.most.sum() - merit.max(initial=-np.inf)) / search.felt
+    unexplained = (search.most.sum() - likely.max(initial=-np.inf)) / search.felt
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
     # in cells not looked into as good a pose may lie, but the more contacts there are to be explained, the more seldom
     doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, 1 / search.felt))
-    posterior = posterior.shared_anew(judged, _TRUST * likely, doubt, elsewhere, _BEFORE, log_prior)
+    posterior = posterior.shared_anew(home, _TRUST * likely, doubt, elsewhere, _BEFORE, log_prior)
 
-    leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: len(chosen)]
-    return replace(posterior, refined=search.told(home[leading], poses[leading]))
+    leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: _TOLD * k]
+    return replace(posterior, refined=search.told(poses[leading]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """Poses tried around each of n cells.
+
+    Attributes
+    ----------
+    T : (n, d, 4, 4) in the first sensor's frame
+    depth : (n, d) how deep the object lies in that sensor [m]
+    merit : (n, d) log likelihood of what all sensors show; -inf where others of the d are likelier for two sensors already
+    """
+
+    T: Array
+    depth: Array
+    merit: Array
+
+    def best(self) -> tuple[Array, Array]:
+        """Of each cell, the pose (n, 4, 4) of the highest merit, and that merit (n,)."""
+        return self.T[np.arange(len(self.T)), self.merit.argmax(1)], self.merit.max(1)
 
 
 class _Search:
@@ -147,30 +161,37 @@ class _Search:
         touching = [(view, view.contact) for view in views if view.contact is not None]
         self.base, self.felt = self.views[0], len(touching)
         self.first = self.base.refinery
-        self.problem = Problem.joined(
-            [make_problem(view.mask, view.refinery.space.sensor, contact.height) for view, contact in touching],
-            np.stack([inverse(view.T_sensor_first) for view, _ in touching]),
+        T_first_sensor = np.stack([inverse(view.T_sensor_first) for view, _ in touching])
+        self.problem, self.rough = (
+            Problem.joined(
+                [make_problem(v.mask, v.refinery.space.sensor, c.height, max_points=points) for v, c in touching],
+                T_first_sensor,
+            )
+            for points in (_POINTS, _ROUGH)
         )
         self.spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
         self.filterreg = FilterReg(self.first.surface, self.spread)
         self.most = np.full(len(views), -np.inf)
 
-    def log_likelihood(self, T: Array, first: Array | None = None) -> Array:
-        """Log likelihood (n, d) of what all sensors show, with the object at ``T`` (n, d, 4, 4); -inf where others of the d are
-        likelier for two sensors already. ``first`` (n, d) is the first sensor's, where it is known."""
-        n, d = T.shape[:2]
-        out, hopeful = np.zeros((n, d)), np.ones((n, d), bool)
-        for i, view in enumerate(self.views):
-            if i == 2 and d > _HOPEFUL:
-                hopeful = out.argsort(1).argsort(1) >= d - _HOPEFUL
-            each = view.log_likelihood(T[hopeful]) if i or first is None else first.ravel()
-            self.most[i] = max(self.most[i], each.max())
-            out[hopeful] += each
-        return np.where(hopeful, out, -np.inf)
+    def tried(self, T: Array) -> _Tried:
+        """With the object at ``T`` (n, d, 4, 4)."""
+        depths = self.base.depths(T.reshape(-1, 4, 4))
+        return self._tried(T, depths.max((1, 2)).reshape(T.shape[:2]), self.base.likely(depths).reshape(T.shape[:2]))
 
-    def drawn(self, cells: NDArray[np.int64]) -> tuple[Array, Array]:
-        """The poses of ``cells`` (n,) and others within them (n, d, 4, 4), about as deep in the first sensor that has contact as
-        the cells say; and how likely each is (n, d)."""
+    def _tried(self, T: Array, depth: Array, merit: Array) -> _Tried:
+        """As :meth:`tried`, with how deep (n, d) the object is in the first sensor, and how likely (n, d) what that shows is."""
+        hopeful, d = np.ones(merit.shape, bool), merit.shape[1]
+        self.most[0] = max(self.most[0], merit.max())
+        for i, view in enumerate(self.views[1:], 1):
+            if i == 2 and d > _HOPEFUL:
+                hopeful = merit.argsort(1).argsort(1) >= d - _HOPEFUL
+            each = view.log_likelihood(T[hopeful])
+            self.most[i] = max(self.most[i], each.max())
+            merit[hopeful] += each
+        return _Tried(T, depth, np.where(hopeful, merit, -np.inf))
+
+    def drawn(self, cells: NDArray[np.int64]) -> _Tried:
+        """The poses of ``cells`` (n,) and others within them, about as deep in the first sensor as the cells say."""
         own, level = self.index.poses(cells), cells // self.index.places
         wanted = np.asarray(self.index.resolution.penetrations)[level]
         T, depth = self.index.draw(np.repeat(cells, _DRAWS), self.rng)
@@ -181,36 +202,45 @@ class _Search:
         rise[~np.isfinite(rise)] = 0
         T[..., 2, 3] += rise.reshape(depth.shape)
         known = self.base.likely(depths - rise[:, None, None].astype(np.float32)).reshape(depth.shape)
-        return T, self.log_likelihood(T, known)
+        return self._tried(T, depth, known)
 
-    def registered(self, T: Array, merit: Array) -> tuple[Array, Array]:
-        """``T`` (n, d, 4, 4) and ``merit`` (n, d), and what registration makes of the best of each row."""
-        best = np.argsort(-merit, axis=1)[:, :_KEPT]
-        start = np.take_along_axis(T, best[..., None, None], 1)
-        return self._with(T, merit, self.filterreg.refine(self.problem, start.reshape(-1, 4, 4)).T.reshape(start.shape))
+    def registered(self, tried: _Tried) -> list[_Tried]:
+        """What was tried, and what registration makes of the best for each cell."""
+        return [tried, self.tried(self.filterreg.refine(self.rough, tried.best()[0]).T[:, None])]
 
-    def around_the_best(self, T: Array, merit: Array) -> tuple[Array, Array]:
-        """``T`` (n, d, 4, 4) and ``merit`` (n, d), and others around the best of each row, nearer and nearer."""
+    def around_the_best(self, tried: list[_Tried]) -> list[_Tried]:
+        """What was tried, and others around the best in the better half of the cells, in the better half of those nearer, and
+        so on."""
+        both = [each.best() for each in tried]
+        top = np.stack([merit for _, merit in both])
+        best, top = np.stack([T for T, _ in both])[top.argmax(0), np.arange(top.shape[1])], top.max(0)
         width = 0.25 * self.spread.metres(self.problem.length)
         for _ in range(_ROUNDS):
-            best = T[np.arange(len(T)), merit.argmax(1)]
-            motion = self.rng.normal(size=(len(T), _AROUND, 6)) * width
-            T, merit = self._with(T, merit, moved(best[:, None], motion, self.problem))
+            better = np.argsort(-top, kind="stable")[: -(-len(top) // 2)]
+            best, top = best[better], top[better]
+            motion = self.rng.normal(size=(len(best), _AROUND, 6)) * width
+            around = self.tried(moved(best[:, None], motion, self.problem))
+            tried = [*tried, around]
+            nearest, most = around.best()
+            best = np.where((most > top)[:, None, None], nearest, best)
+            top = np.maximum(most, top)
             width = width / 2
-        return T, merit
+        return tried
 
-    def best_of_each_cell(self, T: Array, merit: Array, most: int) -> tuple[NDArray[np.int64], Array, Array]:
-        """The cells (m,) that hold the best of ``T`` (n, 4, 4), at ``most`` so many of them; and in each the pose (m, 4, 4) of
-        the highest ``merit``, and that merit (m,)."""
-        order = np.argsort(-merit, kind="stable")[:most]
-        depth = self.first.space.penetration(T[order])
-        touching = np.isfinite(depth)
-        order = order[touching]
-        home, row = np.unique(self.index.lookup(T[order], depth[touching]), return_index=True)
+    def best_of_each_cell(self, tried: Sequence[_Tried]) -> tuple[NDArray[np.int64], Array, Array]:
+        """The cells (m,) in which poses were tried; and in each the one (m, 4, 4) of the highest merit, and that merit (m,)."""
+        T = np.concatenate([each.T.reshape(-1, 4, 4) for each in tried])
+        depth, merit = (np.concatenate([getattr(each, name).ravel() for each in tried]) for name in ("depth", "merit"))
+        touching = np.flatnonzero((depth > 0) & (depth <= self.first.space.sensor.max_penetration))
+        order = touching[np.argsort(-merit[touching], kind="stable")]
+        home, row = np.unique(self.index.lookup(T[order], depth[order]), return_index=True)
         return home, T[order[row]], merit[order[row]]
 
-    def told(self, cells: NDArray[np.int64], T: Array) -> dict[int, Refined]:
-        """What all contacts tell at poses ``T`` (n, 4, 4), by the cell (n,) that each lies in."""
+    def told(self, T: Array) -> dict[int, Refined]:
+        """What all contacts tell at those of the poses ``T`` (n, 4, 4) that touch, by the cell that each lies in."""
+        depth = self.first.space.penetration(T)
+        T, depth = T[np.isfinite(depth)], depth[np.isfinite(depth)]
+        cells = self.index.lookup(T, depth)
         found = self.filterreg.refine(self.problem, T)
         out = {}
         for i, cell in enumerate(cells):
@@ -219,6 +249,3 @@ class _Search:
                 covariance, observable = found.covariance[i], found.observable[i]
             out[int(cell)] = Refined(T[i], covariance, observable, self.problem.length, True)
         return out
-
-    def _with(self, T: Array, merit: Array, more: Array) -> tuple[Array, Array]:
-        return np.concatenate([T, more], 1), np.concatenate([merit, self.log_likelihood(more)], 1)

@@ -166,10 +166,10 @@ class ContactFilter:
         surface = self.surface.at_scale(sigma)
         most = min(most, len(surface.points))
         if facing is None:
-            index = surface.tree.query(at.reshape(-1, 3), k=range(1, most + 1))[1]
+            index = surface.tree.query(at.reshape(-1, 3), k=range(1, most + 1), workers=-1)[1]
         else:
             both = np.concatenate([at, surface.turn * facing], -1)
-            index = surface.facing_tree.query(both.reshape(-1, 6), k=range(1, most + 1))[1]
+            index = surface.facing_tree.query(both.reshape(-1, 6), k=range(1, most + 1), workers=-1)[1]
         index = index.reshape(*at.shape[:-1], most)
         near = surface.points[index]
         return near, surface.normals[index], at[..., None, :] - near
