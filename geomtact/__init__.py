@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from geomtact.inference.prior import GaussianPrior
     from geomtact.planning.actions import Probe, Touch
     from geomtact.planning.next_touch import Action
+    from geomtact.sensing.calibrate import calibrate
     from geomtact.sensing.contact import Contact
+    from geomtact.sensing.height import contact_height
     from geomtact.sensing.local_shape import contact_mask
     from geomtact.sensing.sensor import Sensor
 
@@ -45,6 +47,8 @@ _MODULE_OF = {
     "RigStd": "geomtact.contact_space.carry",
     "Sensor": "geomtact.sensing.sensor",
     "Touch": "geomtact.planning.actions",
+    "calibrate": "geomtact.sensing.calibrate",
+    "contact_height": "geomtact.sensing.height",
     "contact_mask": "geomtact.sensing.local_shape",
     "load_mesh": "geomtact.geometry.mesh",
 }
@@ -70,6 +74,8 @@ __all__ = [
     "Touch",
     "UsageError",
     "__version__",
+    "calibrate",
+    "contact_height",
     "contact_mask",
     "load_mesh",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from geomtact.cli.calibrate import calibrate
 from geomtact.cli.evaluate import evaluate
 from geomtact.cli.library import cache, objects, sensors
 from geomtact.cli.localize import localize
@@ -20,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Localize a known part from the shape of one tactile contact: the whole distribution of its pose.",
 )
-for command in (localize, track, prepare, train, simulate, sensors, objects, cache):
+for command in (localize, track, prepare, train, simulate, calibrate, sensors, objects, cache):
     app.command()(one_line_errors(command))
 app.command("next-touch")(one_line_errors(next_touch))
 app.add_typer(evaluate, name="evaluate")

@@ -40,7 +40,7 @@ def contact_mask(image: Any, background: Any = None, sensor: Sensor | str | None
     """
     from scipy import ndimage
 
-    image = _as_unit_rgb(image, "image")
+    image = as_unit_rgb(image, "image")
     pitch = np.ones(2)
     if sensor is not None:
         sensor = Sensor.load(sensor)
@@ -50,7 +50,7 @@ def contact_mask(image: Any, background: Any = None, sensor: Sensor | str | None
                 f"image: expected {sensor.image_size_px[0]} x {sensor.image_size_px[1]} px for sensor {sensor.name}, "
                 f"got {image.shape[1]} x {image.shape[0]} px; name the sensor that took it"
             )
-    reference = None if background is None else _same_size(_as_unit_rgb(background, "background"), image)
+    reference = None if background is None else same_size(as_unit_rgb(background, "background"), image)
     # one smoothing scale from the resolution, 2 px at 320 x 240; a second look smooths more where noise asks for it
     sigma = min(image.shape[:2]) / 120
     change, felt, strong, noise = _change(image, reference, sigma)
@@ -66,7 +66,7 @@ def contact_mask(image: Any, background: Any = None, sensor: Sensor | str | None
         height = np.linalg.norm(change, axis=-1) * felt
         mask = ndimage.binary_fill_holes(height > 0.5 * np.quantile(height[felt], 0.95))
     else:
-        height = _indentation(_integrate(slope, pitch), felt)
+        height = _indentation(integrate(slope, pitch), felt)
         mask = _inside_rim(height, slope, felt, sigma)
     return _components(mask, height, strong, sigma)
 
@@ -86,7 +86,7 @@ def smooth_background(image: Array) -> Array:
     return fit.reshape(image.shape)
 
 
-def _as_unit_rgb(image: Any, name: str) -> Array:
+def as_unit_rgb(image: Any, name: str) -> Array:
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
         raise ImageError(f"{name}: expected an RGB image (H, W, 3), got an array of shape {image.shape}")
@@ -100,13 +100,19 @@ def _as_unit_rgb(image: Any, name: str) -> Array:
     return image
 
 
-def _same_size(background: Array, image: Array) -> Array:
+def same_size(background: Array, image: Array) -> Array:
     if background.shape != image.shape:
         raise ImageError(
             f"background: expected the size of the image, {image.shape[1]} x {image.shape[0]} px, "
             f"got {background.shape[1]} x {background.shape[0]} px; take it with the same sensor"
         )
     return background
+
+
+def colour_change(image: Array, background: Array) -> tuple[Array, Mask]:
+    """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it is felt."""
+    change, felt, _, _ = _change(image, background, min(image.shape[:2]) / 120)
+    return change, felt
 
 
 def _change(image: Array, background: Array | None, sigma: float) -> tuple[Array, Mask, Mask, float]:
@@ -183,7 +189,7 @@ def _slope_field(change: Array, felt: Mask, sigma: float, pitch: Array) -> Array
     return plane @ maps[:, 0].reshape(2, 2).T
 
 
-def _integrate(slope: Array, pitch: Array) -> Array:
+def integrate(slope: Array, pitch: Array) -> Array:
     """The height (H, W) whose gradient is nearest to ``slope``, mirrored at the border (Frankot, Chellappa 1988)."""
     from scipy import fft
 

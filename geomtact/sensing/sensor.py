@@ -12,12 +12,14 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from geomtact.errors import SensorError, nearest_name
 from geomtact.se3 import Array
+from geomtact.sensing.colour import ColourTable
 
 _KEYS = {
     "name": str,
@@ -28,7 +30,9 @@ _KEYS = {
     "membrane_radius_mm": float,
     "housing_depth_mm": float,
     "note": str,
+    "colour": dict,
 }
+_COLOUR_KEYS = ("weights", "slope_rms", "height_rms_mm", "contact_depth_mm")
 _REQUIRED = ("name", "image_size_px", "pixel_pitch_mm", "camera_distance_mm", "max_penetration_mm")
 
 
@@ -46,6 +50,7 @@ class Sensor:
     membrane_radius : 0 means flat; otherwise the gel bulges towards the object with this radius
     housing_depth : how far the object may reach below z = 0 outside the window; None rules nothing out
     note : where the figures come from
+    colour : how its colours tell the gel's slope; None where that is not calibrated
     """
 
     name: str
@@ -56,6 +61,7 @@ class Sensor:
     membrane_radius: float = 0.0
     housing_depth: float | None = None
     note: str = field(default="", compare=False)
+    colour: ColourTable | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         def need(ok: bool, what: str) -> None:
@@ -122,6 +128,8 @@ class Sensor:
             number = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
             if (wanted is float and not number) or (wanted is str and not isinstance(value, str)):
                 raise SensorError(f"{origin}: {key} must be a {wanted.__name__}, got {value!r}")
+            if wanted is dict and not isinstance(value, dict):
+                raise SensorError(f"{origin}: {key} must be a table, got {value!r}; write [{key}]")
             if wanted is list and not (
                 isinstance(value, list)
                 and len(value) == 2
@@ -143,6 +151,7 @@ class Sensor:
                 membrane_radius=data.get("membrane_radius_mm", 0.0) / 1e3,
                 housing_depth=None if housing is None else housing / 1e3,
                 note=data.get("note", ""),
+                colour=_colour(data["colour"]) if "colour" in data else None,
             )
         except SensorError as error:
             raise SensorError(f"{origin}: {error}") from None
@@ -165,11 +174,19 @@ class Sensor:
             lines.append(f"housing_depth_mm = {mm(self.housing_depth)}")
         if self.note:
             lines.append(f"note = {_toml_string(self.note)}")
+        if self.colour is not None:
+            lines += ["", "[colour]", f"slope_rms = {self.colour.slope_rms:.6g}"]
+            lines += [
+                f"height_rms_mm = {mm(self.colour.height_rms)}",
+                f"contact_depth_mm = {mm(self.colour.contact_depth)}",
+            ]
+            rows = ("  [" + ", ".join(f"{w:.9g}" for w in row) + "]," for row in self.colour.weights)
+            lines += ["weights = [", *rows, "]"]
         return "\n".join(lines) + "\n"
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the geometry (not of the note)."""
+        """Hash of the geometry (not of the note, nor of the colours)."""
         geometry = [getattr(self, f.name) for f in fields(self) if f.compare]
         return hashlib.sha256(repr(geometry).encode()).hexdigest()
 
@@ -241,6 +258,24 @@ def bundled_sensors() -> list[str]:
 
 def _folder():
     return resources.files("geomtact") / "sensing" / "sensors"
+
+
+def _colour(data: dict[str, Any]) -> ColourTable:
+    """The table of a sensor file's [colour]."""
+    for key in data:
+        if key not in _COLOUR_KEYS:
+            raise SensorError(f"unknown key {key!r} in [colour]{nearest_name(key, _COLOUR_KEYS)}")
+    for key in _COLOUR_KEYS:
+        if key not in data:
+            raise SensorError(f"the key {key!r} is missing in [colour]; calibrate the sensor again")
+    try:
+        x, y = (tuple(map(float, row)) for row in data["weights"])
+        slope, height, depth = (float(data[key]) for key in _COLOUR_KEYS[1:])
+    except (TypeError, ValueError):
+        raise SensorError(
+            "[colour] must hold numbers, and weights two lists of them; calibrate the sensor again"
+        ) from None
+    return ColourTable((x, y), slope, 1e-3 * height, 1e-3 * depth)
 
 
 def _toml_string(text: str) -> str:

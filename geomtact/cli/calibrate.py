@@ -1,0 +1,67 @@
+"""``geomtact calibrate``: presses of one ball become a sensor file whose colours tell heights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from geomtact.cli.prepare import SensorName
+from geomtact.cli.shell import tell
+from geomtact.errors import UsageError
+
+if TYPE_CHECKING:
+    from geomtact.sensing.calibrate import Calibrated
+
+
+def calibrate(
+    presses: Annotated[
+        list[Path], typer.Argument(metavar="PRESS...", help="Images of one ball, pressed in here and there.")
+    ],
+    ball_mm: Annotated[float, typer.Option("--ball-mm", help="Diameter of the ball.")],
+    background: Annotated[Path, typer.Option(help="The same sensor without contact.")],
+    pitch_mm: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--pitch-mm", help="Millimetres per pixel on the membrane, along x and along y."),
+    ] = None,
+    sensor: SensorName = None,
+    name: Annotated[str | None, typer.Option(help="Name of the new sensor.")] = None,
+    out: Annotated[Path, typer.Option(help="Sensor file to write.")] = Path("sensor.toml"),
+    plot: Annotated[Path | None, typer.Option(help="PNG to write: how well the presses fit.")] = None,
+) -> None:
+    """Calibrate a sensor's colours from presses of a ball of known diameter, so that its readings tell heights.
+
+    Give a pitch, or a sensor whose geometry is kept. A dozen presses all over the window take half a minute.
+    """
+    from geomtact.report.calibration_plot import draw_calibration
+    from geomtact.sensing.calibrate import calibrated
+
+    for path, suffix in ((out, ".toml"), (plot, ".png")):
+        if path is not None and path.suffix != suffix:
+            raise UsageError(f"{path}: expected a name that ends in {suffix}; give one")
+    pitch = None if pitch_mm is None else (1e-3 * pitch_mm[0], 1e-3 * pitch_mm[1])
+    found = calibrated(presses, 1e-3 * ball_mm, background, pitch, sensor, name or out.stem)
+    for left_out, why in found.left_out.items():
+        tell(f"warning: {left_out} is left out: {why}")
+    _print(found, ball_mm)
+    out.write_text(found.sensor.to_toml(), "utf-8")
+    typer.echo(f"wrote {out}: geomtact.contact_height(image, background, {str(out)!r}) tells heights")
+    if plot is not None:
+        plot.write_bytes(draw_calibration(found, 1e-3 * ball_mm))
+        typer.echo(f"wrote {plot}")
+
+
+def _print(found: Calibrated, ball_mm: float) -> None:
+    import numpy as np
+
+    colour, mm = found.sensor.colour, 1e3 * found.diameters
+    assert colour is not None
+    low, middle, high = np.quantile(mm, [0.25, 0.5, 0.75])
+    typer.echo(
+        f"{len(mm)} presses of {len(mm) + len(found.left_out)}; each measured by a table fitted to the others:\n"
+        f"  the ball's diameter   {middle:.2f} mm (half of the presses {low:.2f} to {high:.2f}), {ball_mm:g} was said\n"
+        f"  slopes                off by {colour.slope_rms:.3f} rms (1 is 45 degrees)\n"
+        f"  heights               off by {1e3 * colour.height_rms:.3f} mm rms where nothing touches\n"
+        f"  contact               shows where the gel is pressed in by {1e3 * colour.contact_depth:.2f} mm"
+    )

@@ -1,0 +1,296 @@
+"""A sensor of one's own: from presses of one ball to what its colours tell of the gel's slope.
+
+Under the ball the gel has the ball's shape, so the slope is known all over the contact once its centre is: that of the circle
+which the contact's outline is. The outline is that of the imprint, which is wider than the contact: only the inner part is used,
+and no depth need be known. The pixel pitch must be known: a ball of another size, seen by another pitch, looks the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
+
+from geomtact.errors import ImageError, InputError, UsageError
+from geomtact.se3 import Array
+from geomtact.sensing.colour import ColourTable, fit_weights, terms
+from geomtact.sensing.height import relief
+from geomtact.sensing.local_shape import as_unit_rgb, colour_change, contact_mask, same_size
+from geomtact.sensing.sensor import Sensor
+
+_FEWEST = 3  # presses
+_INNER, _MEASURED = (
+    0.6,
+    0.5,
+)  # share of the imprint's radius within which the gel surely lies on the ball; that is measured
+_OUTER = 2.2  # times the imprint's radius, beyond which the gel is flat
+_PIXELS, _FLAT_PIXELS = 3000, 1000  # of a press that are used, at most
+_ROUND = 0.05  # of the radius that half of an outline may stray from its circle
+_SEEN = 0.4  # share of the circle that has to be seen
+
+
+@dataclass(frozen=True, eq=False)
+class Press:
+    """One press of the ball.
+
+    Attributes
+    ----------
+    name : of its image
+    change, felt : (H, W, 3) of colour from the background, and (H, W) where it is felt
+    mask : (H, W) its imprint
+    centre : (column, row) of the imprint's circle [px]
+    radius : and its radius along x [px]
+    """
+
+    name: str
+    change: Array
+    felt: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
+    centre: Array
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """A calibrated sensor, and how well the presses agree with it.
+
+    Attributes
+    ----------
+    sensor : with its colours
+    presses : that were used
+    left_out : why others were not, by their names
+    diameters : (n,) of the ball [m], measured on each press by a table that was fitted to the others
+    """
+
+    sensor: Sensor
+    presses: list[Press]
+    left_out: dict[str, str]
+    diameters: Array
+
+
+def calibrate(
+    presses: Sequence[Any],
+    ball_diameter: float,
+    background: Any,
+    pixel_pitch: float | tuple[float, float] | None = None,
+    sensor: Sensor | str | None = None,
+    name: str | None = None,
+) -> Sensor:
+    """A sensor whose colours tell heights, from presses of one ball. :func:`calibrated` tells how well, too.
+
+    Parameters
+    ----------
+    presses : images (H, W, 3) RGB, or their paths, of one ball pressed in at several places, three at least; a dozen are better
+    ball_diameter : metres
+    background : the same sensor without contact
+    pixel_pitch : of the images [m], or along x and along y; that of ``sensor`` by default
+    sensor : whose geometry to keep, by name, file or itself; by default an orthographic, flat one of the images' size
+    name : of the new sensor
+
+    Raises
+    ------
+    UsageError
+        Neither a pitch nor a sensor was given: presses of unknown depth do not tell the pitch. The largest possible is named.
+    InputError
+        Fewer than three images show the whole round imprint of a ball that may be so large.
+    """
+    return calibrated(presses, ball_diameter, background, pixel_pitch, sensor, name).sensor
+
+
+def calibrated(
+    presses: Sequence[Any],
+    ball_diameter: float,
+    background: Any,
+    pixel_pitch: float | tuple[float, float] | None = None,
+    sensor: Sensor | str | None = None,
+    name: str | None = None,
+) -> Calibrated:
+    """As :func:`calibrate`, with what it rests on."""
+    if not (np.isfinite(ball_diameter) and 1e-4 < ball_diameter < 0.1):
+        raise UsageError(f"ball_diameter: expected metres, 0.0001 to 0.1, got {ball_diameter}; 6.31 mm is 0.00631")
+    reference = _image(background, "background")[1]
+    known = None if sensor is None else Sensor.load(sensor)
+    pitch = known.pixel_pitch if pixel_pitch is None and known is not None else pixel_pitch
+    found, left_out = _presses(presses, reference, None if pitch is None else _pair(pitch))
+    if pitch is None:
+        most = 0.5 * ball_diameter / max((press.radius for press in found), default=np.inf)
+        bound = f"; it is at most {1e3 * most:.4f} mm, the ball's radius over the largest imprint's" if found else ""
+        raise UsageError(
+            "pixel_pitch: none was given, and presses of unknown depth do not tell it: measure how many pixels a known "
+            f"length takes on the membrane{bound}"
+        )
+    pitch, radius = _pair(pitch), 0.5 * ball_diameter
+    for press in [p for p in found if p.radius * pitch[0] >= radius]:
+        left_out[press.name] = f"an imprint of {2e3 * press.radius * pitch[0]:.2f} mm is wider than the ball"
+        found.remove(press)
+    if len(found) < _FEWEST:
+        why = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
+        raise InputError(
+            f"calibrate: {_FEWEST} presses or more are needed, {len(found)} of {len(presses)} serve ({why})"
+        )
+    base = known or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
+    if base.image_size_px != reference.shape[1::-1]:
+        raise ImageError(
+            f"background: expected {base.image_size_px[0]} x {base.image_size_px[1]} px for sensor {base.name}, got "
+            f"{reference.shape[1]} x {reference.shape[0]} px; name the sensor that took it"
+        )
+    samples = [_samples(press, pitch, radius) for press in found]
+    base = replace(base, name=name or base.name, pixel_pitch=pitch)
+    diameters, off = _left_one_out(found, samples, pitch)
+    x, y = (tuple(map(float, row)) for row in _weights(samples))
+    colour = ColourTable((x, y), off, 0.0, 0.0)
+    noise, depth = _at_rest(found, colour, pitch)
+    colour = replace(colour, height_rms=noise, contact_depth=depth)
+    return Calibrated(replace(base, colour=colour), found, left_out, diameters)
+
+
+def _image(source: Any, role: str) -> tuple[str, Array]:
+    """The name of an image, and it (H, W, 3) as 0..1."""
+    if isinstance(source, str | Path):
+        from geomtact.sensing.image_file import read_image
+
+        image = read_image(source)
+        return str(source), as_unit_rgb(image[..., :3] if image.ndim == 3 else image, str(source))
+    return role, as_unit_rgb(source, role)
+
+
+def _pair(pitch: float | tuple[float, float]) -> tuple[float, float]:
+    x, y = np.broadcast_to(np.asarray(pitch, float), 2)
+    if not (min(x, y) > 1e-6 and max(x, y) < 1e-2):
+        raise UsageError(f"pixel_pitch: expected metres, 0.000001 to 0.01, got {pitch}; 0.0634 mm is 0.0000634")
+    return float(x), float(y)
+
+
+def _presses(
+    images: Sequence[Any], reference: Array, pitch: tuple[float, float] | None
+) -> tuple[list[Press], dict[str, str]]:
+    """Those of the images that show a ball, and why the others do not."""
+    found, left_out = [], {}
+    stretch = 1.0 if pitch is None else pitch[1] / pitch[0]
+    for number, source in enumerate(images, 1):
+        name, image = _image(source, f"press {number}")
+        change, felt = colour_change(image, same_size(reference, image))
+        mask = contact_mask(image, reference)
+        if not mask.any():
+            left_out[name] = "no contact was found"
+            continue
+        circle = _circle(mask, stretch)
+        if isinstance(circle, str):
+            left_out[name] = circle
+        else:
+            found.append(Press(name, change, felt, mask, *circle))
+    return found, left_out
+
+
+def _circle(mask: NDArray[np.bool_], stretch: float) -> tuple[Array, float] | str:
+    """Centre (column, row) and radius along x of the circle that the outline of a mask is, or what is wrong with it. Rows are
+    ``stretch`` times as far apart as columns."""
+    import cv2
+
+    h, w = mask.shape
+    contours = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    points = max(contours, key=len)[:, 0].astype(float)
+    # where the image's border cuts the contact there is no outline
+    points = points[(points > 1).all(1) & (points[:, 0] < w - 2) & (points[:, 1] < h - 2)]
+    if len(points) < 20:
+        return "hardly any of its outline lies within the image"
+    points[:, 1] *= stretch
+    weight = np.ones(len(points))
+    for _ in range(10):
+        A = np.column_stack([2 * points, np.ones(len(points))])
+        solved = np.linalg.lstsq(A * weight[:, None], (points**2).sum(1) * weight, rcond=None)[0]
+        radius = float(np.sqrt(max(solved[2] + solved[:2] @ solved[:2], 0.0)))
+        off = np.linalg.norm(points - solved[:2], axis=1) - radius
+        weight = 1 / (1 + (off / (0.02 * radius + 1e-9)) ** 2)
+    if np.median(np.abs(off)) > _ROUND * radius:
+        return "its outline is no circle"
+    if len(np.unique(np.arctan2(*(points - solved[:2]).T) // (np.pi / 18))) < _SEEN * 36:
+        return "less than half of its circle is seen"
+    return np.array([solved[0], solved[1] / stretch]), radius
+
+
+def _samples(press: Press, pitch: tuple[float, float], ball: float) -> tuple[Array, Array]:
+    """Terms (n, ``TERMS``) and slopes (n, 2) of pixels on a ball of radius ``ball`` [m], and of pixels far from it: flat."""
+    off, features = _inner(press, pitch, _INNER)
+    some = np.random.default_rng(0).permutation(len(off))[:_PIXELS]
+    v, u = np.nonzero(np.linalg.norm(_from_centre(press, pitch), axis=-1) > _OUTER * press.radius * pitch[0])
+    far = np.random.default_rng(0).permutation(len(v))[:_FLAT_PIXELS]
+    flat = terms(press.change[v[far], u[far]], u[far], v[far], press.mask.shape)
+    slopes = np.concatenate([_slopes_of_ball(off[some], ball), np.zeros((len(far), 2))])
+    return np.concatenate([features[some], flat]), slopes
+
+
+def _weights(samples: Sequence[tuple[Array, Array]]) -> Array:
+    return fit_weights(np.concatenate([f for f, _ in samples]), np.concatenate([s for _, s in samples]))
+
+
+def _left_one_out(
+    presses: Sequence[Press], samples: Sequence[tuple[Array, Array]], pitch: tuple[float, float]
+) -> tuple[Array, float]:
+    """The ball's diameter (n,) [m] by each press, and how far off its slopes are (rms), by what the others tell."""
+    diameters, squares = np.zeros(len(presses)), []
+    for i, press in enumerate(presses):
+        weights = _weights([s for k, s in enumerate(samples) if k != i])
+        told, true = samples[i][0] @ weights.T, samples[i][1]
+        squares.append(((told - true) ** 2).mean())
+        off, features = _inner(press, pitch, _MEASURED)
+        diameters[i] = diameter_of(off, features @ weights.T)
+    return diameters, float(np.sqrt(np.mean(squares)))
+
+
+def ball_slopes(
+    press: Press, colour: ColourTable, pitch: tuple[float, float], ball_diameter: float
+) -> tuple[Array, Array]:
+    """Slopes (n, 2) that the colours tell on the inner part of a press, and those of the ball."""
+    off, features = _inner(press, pitch, _INNER)
+    return features @ np.asarray(colour.weights).T, _slopes_of_ball(off, 0.5 * ball_diameter)
+
+
+def _slopes_of_ball(off: Array, radius: float) -> Array:
+    """Slope (n, 2) of the depth at ``off`` (n, 2) [m] from a ball's centre: deepest there."""
+    return -off / np.sqrt(radius**2 - (off**2).sum(-1, keepdims=True))
+
+
+def _inner(press: Press, pitch: tuple[float, float], share: float) -> tuple[Array, Array]:
+    """Where the pixels lie that are within ``share`` of the imprint's radius from its centre (n, 2) [m], and their terms (n,
+    ``TERMS``)."""
+    off = _from_centre(press, pitch)
+    v, u = np.nonzero(np.linalg.norm(off, axis=-1) < share * press.radius * pitch[0])
+    return off[v, u], terms(press.change[v, u], u, v, press.mask.shape)
+
+
+def _from_centre(press: Press, pitch: tuple[float, float]) -> Array:
+    """Where each pixel (H, W, 2) lies from the imprint's centre [m]."""
+    row, column = np.mgrid[: press.mask.shape[0], : press.mask.shape[1]]
+    return np.asarray(np.stack([column - press.centre[0], row - press.centre[1]], -1) * np.asarray(pitch))
+
+
+def measured_diameter(press: Press, sensor: Sensor) -> float:
+    """Diameter [m] of the ball of a press, as the colours of a calibrated sensor tell it."""
+    assert sensor.colour is not None
+    off, features = _inner(press, sensor.pixel_pitch, _MEASURED)
+    return diameter_of(off, features @ np.asarray(sensor.colour.weights).T)
+
+
+def diameter_of(xy: Array, slope: Array) -> float:
+    """Diameter [m] of the sphere that has depths of such ``slope`` (n, 2) at ``xy`` (n, 2) [m]."""
+    sine = slope / np.sqrt(1 + (slope**2).sum(1))[:, None]  # -(xy - centre) / radius
+    xy, sine = xy - xy.mean(0), sine - sine.mean(0)
+    return float(-2 * (xy**2).sum() / (xy * sine).sum())
+
+
+def _at_rest(presses: Sequence[Press], colour: ColourTable, pitch: tuple[float, float]) -> tuple[float, float]:
+    """How far (rms) from 0 the depth is where nothing is felt, and how deep it is at the border of the contact [m]: medians."""
+    noise, depth = [], []
+    for press in presses:
+        below = relief(press.change, press.felt, colour, pitch)
+        border = press.mask & ~binary_erosion(press.mask, border_value=1)
+        depth.append(float(np.median(below[border])))
+        if not press.felt.all():
+            noise.append(float(np.sqrt((below[~press.felt] ** 2).mean())))
+    return float(np.median(noise)) if noise else 0.0, max(0.0, float(np.median(depth)))

@@ -1,0 +1,68 @@
+"""How a gel's colour tells its slope: photometric stereo, learned from presses of a ball.
+
+The change of colour from the background is a polynomial of second degree in the slope's stead: each component of the slope is a
+linear combination of the changes of the three channels and their products, whose weights vary over the image as a polynomial of
+second degree too, because lamps are near. Where the colour has not changed the gel is flat.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.errors import SensorError
+from geomtact.se3 import Array
+
+TERMS = 54  # 9 of colour, each times 6 of the place
+_RIDGE = 1e-4  # of the mean square of each term
+
+
+@dataclass(frozen=True)
+class ColourTable:
+    """The slope of the gel by its change of colour.
+
+    Attributes
+    ----------
+    weights : 2 x ``TERMS``, of the slope along x and along y
+    slope_rms : by how much slopes, which have no unit, were off on presses that the table was not fitted to
+    height_rms : by how much heights are off where nothing touches [m]
+    contact_depth : how deep the gel is pressed in at the border of what counts as contact [m]
+    """
+
+    weights: tuple[tuple[float, ...], tuple[float, ...]]
+    slope_rms: float
+    height_rms: float
+    contact_depth: float
+
+    def __post_init__(self) -> None:
+        if [len(w) for w in self.weights] != [TERMS, TERMS] or not np.isfinite(self.weights).all():
+            raise SensorError(f"colour.weights must be 2 x {TERMS} finite numbers; calibrate the sensor again")
+        if not all(np.isfinite(v) and v >= 0 for v in (self.slope_rms, self.height_rms, self.contact_depth)):
+            raise SensorError("colour.slope_rms, height_rms_mm and contact_depth_mm must be numbers >= 0")
+
+    def slopes(self, change: Array) -> Array:
+        """The slope (H, W, 2) of the indentation's depth along x and y, of a change of colour (H, W, 3)."""
+        h, w = change.shape[:2]
+        v, u = np.mgrid[:h, :w]
+        features = terms(change.reshape(-1, 3), u.ravel(), v.ravel(), (h, w))
+        return np.asarray((features @ np.asarray(self.weights).T).reshape(h, w, 2))
+
+
+def terms(change: Array, u: NDArray, v: NDArray, shape: tuple[int, int]) -> Array:
+    """The table's terms (n, ``TERMS``) of changes of colour (n, 3) at columns ``u`` (n,) and rows ``v`` (n,) of an image
+    ``shape`` = (H, W)."""
+    i, j = np.triu_indices(3)
+    colour = np.concatenate([change, change[:, i] * change[:, j]], 1)
+    x, y = (u + 0.5) / shape[1] * 2 - 1, (v + 0.5) / shape[0] * 2 - 1
+    place = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
+    return np.asarray((colour[:, :, None] * place[:, None, :]).reshape(len(change), -1))
+
+
+def fit_weights(features: Array, slopes: Array) -> Array:
+    """Weights (2, ``TERMS``) that lead from terms (n, ``TERMS``) to ``slopes`` (n, 2): least squares, the large ones damped."""
+    scale = np.sqrt((features**2).mean(0)) + 1e-12
+    A = features / scale
+    normal = np.einsum("ni,nj->ij", A, A) / len(A) + _RIDGE * np.eye(A.shape[1])
+    return np.asarray((np.linalg.solve(normal, np.einsum("ni,nk->ik", A, slopes) / len(A)) / scale[:, None]).T)

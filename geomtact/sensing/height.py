@@ -1,0 +1,54 @@
+"""How deep the gel is pressed in at each pixel of an RGB reading, for a sensor whose colours are calibrated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.errors import SensorError
+from geomtact.se3 import Array
+from geomtact.sensing.colour import ColourTable
+from geomtact.sensing.local_shape import as_unit_rgb, colour_change, integrate, same_size
+from geomtact.sensing.sensor import Sensor
+
+_SOME = 0.02  # share of the image in which the gel must rest, to tell where it rests
+
+
+def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray[np.float32]:
+    """Depth of the gel's indentation in an RGB reading, by photometric stereo.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8 or float 0..1, RGB
+    background : (H, W, 3) the same sensor without contact, under the same light
+    sensor : calibrated by :func:`geomtact.calibrate`, as its file or as it comes from there
+
+    Returns
+    -------
+    (H, W) metres, >= 0; 0 where nothing is felt
+
+    Raises
+    ------
+    SensorError
+        The sensor's colours are not calibrated.
+    ImageError
+        Images of other sizes, or not of the kinds above.
+    """
+    sensor = Sensor.load(sensor)
+    if sensor.colour is None:
+        raise SensorError(
+            f"sensor {sensor.name}: its colours are not calibrated, so a reading has no heights; press a ball of known "
+            "diameter and run 'geomtact calibrate', or use contact_mask"
+        )
+    image = as_unit_rgb(image, "image")
+    change, felt = colour_change(image, same_size(as_unit_rgb(background, "background"), image))
+    return (np.maximum(relief(change, felt, sensor.colour, sensor.pixel_pitch), 0) * felt).astype(np.float32)
+
+
+def relief(change: Array, felt: NDArray[np.bool_], colour: ColourTable, pitch: tuple[float, float]) -> Array:
+    """Depth (H, W) [m] of the gel below where it rests, of a change of colour (H, W, 3) that is ``felt`` where it is (H, W)."""
+    depth = integrate(colour.slopes(change), np.asarray(pitch))
+    rest = np.median(depth[~felt]) if (~felt).mean() > _SOME else depth.min()
+    return np.asarray(depth - rest)

@@ -1,0 +1,182 @@
+"""A sensor of one's own: presses of a ball of known diameter make colours tell slopes, heights and other balls."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import geomtact
+from geomtact import ImageError, InputError, Sensor, SensorError, UsageError, contact_height
+from geomtact.cli import app
+from geomtact.sensing.calibrate import calibrate, calibrated, diameter_of, measured_diameter
+from geomtact.sensing.colour import TERMS, ColourTable, fit_weights, terms
+from geomtact.sensing.image_file import read_image, write_image
+
+MM = 1e-3
+SHAPE, PITCH = (120, 160), 0.1 * MM
+SUNK = 0.15 * MM  # that the gel hangs below its rest at the contact's border
+PLACES = [(40, 40), (80, 60), (120, 80), (60, 85), (105, 38), (45, 75)]
+PLACES += [(25, 90), (100, 100), (130, 60), (75, 30), (60, 60), (95, 75)]
+
+
+def pressed(diameter, centre, contact=1.6 * MM):
+    """Depth (H, W) [m] of a gel under a ball, and its slope (H, W, 2): the ball's shape, then an exponential rise."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    off = (np.stack([u, v], -1) - centre) * PITCH
+    far, ball = np.linalg.norm(off, axis=-1), diameter / 2
+    steep = contact / np.sqrt(ball**2 - contact**2)
+    sphere = np.sqrt(np.maximum(ball**2 - far**2, 0)) - np.sqrt(ball**2 - contact**2) + SUNK
+    fall = SUNK * np.exp(-(far - contact) * steep / SUNK)
+    inside = far < contact
+    down = np.where(
+        inside, -1 / np.sqrt(np.maximum(ball**2 - far**2, 1e-9)), -fall * steep / SUNK / np.maximum(far, 1e-9)
+    )
+    return np.where(inside, sphere, fall), off * down[..., None]
+
+
+def lit(slope, rng):
+    """A reading (H, W, 3) of slopes (H, W, 2) under three lamps, the nearer the brighter, over its background (H, W, 3)."""
+    x, y = np.meshgrid(np.linspace(-1, 1, SHAPE[1]), np.linspace(-1, 1, SHAPE[0]))
+    lamps = np.array([[0.35, 0.02], [-0.17, 0.3], [-0.16, -0.29]])
+    near = np.stack([1 + 0.2 * x, 1 - 0.1 * x + 0.15 * y, 1 - 0.1 * x - 0.15 * y], -1)
+    background = np.stack([0.45 + 0.05 * x, 0.4 - 0.03 * y, 0.5 + 0.02 * x * y], -1)
+    change = near * (slope @ lamps.T)
+    both = (np.clip(image + 0.002 * rng.normal(size=image.shape), 0, 1) for image in (background + change, background))
+    return tuple(np.rint(255 * image).astype(np.uint8) for image in both)
+
+
+def presses(diameter, places=PLACES, seed=0):
+    rng = np.random.default_rng(seed)
+    made = [lit(pressed(diameter, place)[1], rng) for place in places]
+    return [image for image, _ in made], made[0][1]
+
+
+@pytest.fixture(scope="module")
+def found():
+    images, background = presses(8 * MM)
+    return calibrated(images, 8 * MM, background, PITCH, name="made")
+
+
+def test_slopes_are_those_of_the_ball(found):
+    assert len(found.presses) == len(PLACES) and not found.left_out
+    for press, place in zip(found.presses, PLACES, strict=True):
+        assert press.centre == pytest.approx(place, abs=1.0)
+    assert np.median(found.diameters) == pytest.approx(8 * MM, rel=0.03)
+    assert found.sensor.colour.slope_rms < 0.03
+
+
+@pytest.mark.parametrize("diameter", [6 * MM, 12 * MM])
+def test_heights_of_a_ball_it_was_not_calibrated_with(found, diameter):
+    (image,), background = presses(diameter, [(90, 65)], seed=7)
+    true, _ = pressed(diameter, (90, 65))
+    told = contact_height(image, background, found.sensor)
+    on = np.hypot(*(np.indices(SHAPE)[::-1] - np.array([90, 65])[:, None, None])) * PITCH < 1.2 * MM
+    assert told.dtype == np.float32 and (told >= 0).all()
+    assert told[on] == pytest.approx(true[on], abs=0.08 * true.max())
+    assert contact_height(background, background, found.sensor).max() == 0
+
+
+def test_the_diameter_of_exact_slopes_is_exact():
+    depth, slope = pressed(8 * MM, (80, 60))
+    v, u = np.nonzero(depth > 0.6 * depth.max())
+    assert diameter_of(np.stack([u, v], 1) * PITCH, slope[v, u]) == pytest.approx(8 * MM, rel=1e-9)
+
+
+def test_weights_that_made_the_slopes_are_found_again(rng):
+    change, u, v = rng.normal(size=(4000, 3)), rng.uniform(0, 159, 4000), rng.uniform(0, 119, 4000)
+    features, weights = terms(change, u, v, SHAPE), rng.normal(size=(2, TERMS))
+    assert features.shape == (4000, TERMS)
+    assert fit_weights(features, features @ weights.T) == pytest.approx(weights, abs=5e-3)
+    assert (terms(np.zeros((5, 3)), u[:5], v[:5], SHAPE) == 0).all()  # without a change of colour the gel is flat
+
+
+def test_presses_of_unknown_depth_do_not_tell_the_pitch_but_bound_it():
+    images, background = presses(8 * MM)
+    with pytest.raises(UsageError, match=r"presses of unknown depth.*at most 0\.(\d+) mm") as error:
+        calibrate(images, 8 * MM, background)
+    bound = float(str(error.value).split("at most ")[1].split(" mm")[0]) * MM
+    assert PITCH < bound < 4 * PITCH
+    with pytest.raises(InputError, match="wider than the ball"):
+        calibrate(images, 8 * MM, background, 1.05 * bound)
+
+
+def test_what_is_no_ball_is_left_out_and_named(rng):
+    images, background = presses(8 * MM)
+    bar = np.zeros((*SHAPE, 2))
+    bar[30:40, 20:140, 1], bar[80:90, 20:140, 1] = 0.5, -0.5
+    images = [background, lit(bar, rng)[0], *images[:3]]
+    found = calibrated(images, 8 * MM, background, PITCH)
+    assert set(found.left_out) == {"press 1", "press 2"} and "no contact" in found.left_out["press 1"]
+    with pytest.raises(InputError, match=r"3 presses or more are needed, 2 of 4 serve \(press 1: no contact"):
+        calibrate(images[:4], 8 * MM, background, PITCH)
+
+
+def test_a_sensor_file_keeps_the_colours_and_its_indexes(found, tmp_path):
+    sensor = found.sensor
+    again = Sensor.from_toml(sensor.to_toml())
+    assert again == sensor and again.colour.weights == pytest.approx(np.array(sensor.colour.weights), rel=1e-8)
+    assert again.to_toml() == sensor.to_toml()
+    # colours change nothing that an index is made of
+    assert sensor.sha256 == replace(sensor, colour=None).sha256
+    text = sensor.to_toml()
+    for wrong, what in (
+        (text.replace("slope_rms", "slope_rmz"), "unknown key 'slope_rmz'.*slope_rms"),
+        (text.replace("height_rms_mm = ", "# "), "'height_rms_mm' is missing"),
+        (text[: text.index("weights")] + "weights = [[1, 2], [3, 4]]\n", f"2 x {TERMS}"),
+        (text[: text.index("weights")] + 'weights = "many"\n', "must hold numbers"),
+        (text.replace("slope_rms = ", "slope_rms = -"), ">= 0"),
+    ):
+        with pytest.raises(SensorError, match=what):
+            Sensor.from_toml(wrong, "made.toml")
+
+
+def test_what_is_missing_or_wrong_is_said(found):
+    images, background = presses(8 * MM)
+    with pytest.raises(SensorError, match="not calibrated.*geomtact calibrate"):
+        contact_height(images[0], background, replace(found.sensor, colour=None))
+    with pytest.raises(ImageError, match="expected the size of the image"):
+        contact_height(images[0], background[:-1], found.sensor)
+    with pytest.raises(UsageError, match=r"expected metres.*6\.31 mm is 0\.00631"):
+        calibrate(images, 8, background, PITCH)
+    with pytest.raises(UsageError, match="pixel_pitch: expected metres"):
+        calibrate(images, 8 * MM, background, 0.1)
+    with pytest.raises(ImageError, match="expected 320 x 240 px for sensor gelsight-mini, got 160 x 120"):
+        calibrate(images, 8 * MM, background, sensor="gelsight-mini")
+    with pytest.raises(SensorError, match="weights"):
+        ColourTable(((0.0,) * 3, (0.0,) * TERMS), 0, 0, 0)
+
+
+def test_the_command_writes_a_sensor_and_a_picture(tmp_path):
+    images, background = presses(8 * MM)
+    names = [tmp_path / f"{k}.png" for k in range(len(images))]
+    for name, image in zip([*names, tmp_path / "background.png"], [*images, background], strict=True):
+        write_image(name, image)
+
+    def run(*words):
+        given = ["--background", tmp_path / "background.png", "--ball-mm", 8, "--out", tmp_path / "mine.toml"]
+        return CliRunner().invoke(app, [str(w) for w in ("calibrate", *names, *given, *words)])
+
+    result = run("--pitch-mm", 0.1, 0.1, "--plot", tmp_path / "fit.png")
+    assert result.exit_code == 0, result.output
+    assert "12 presses of 12" in result.output and "8 was said" in result.output
+    sensor = Sensor.load(tmp_path / "mine.toml")
+    assert sensor.name == "mine" and sensor.pixel_pitch == pytest.approx((PITCH, PITCH))
+    assert read_image(tmp_path / "fit.png").ndim == 3
+    told = geomtact.contact_height(images[0], background, tmp_path / "mine.toml")
+    assert told.max() == pytest.approx(pressed(8 * MM, PLACES[0])[0].max(), rel=0.1)
+    assert "at most" in run().output and run().exit_code == 2
+    assert "ends in .toml" in run("--out", tmp_path / "mine.txt").output
+
+
+@pytest.mark.parametrize(("used", "judged"), [(6.310, 9.500), (9.500, 6.310)])
+def test_real_presses_of_one_ball_measure_the_other(data_folder, used, judged):
+    folder = data_folder / "gelslam_gsmini_balls"
+    own, other = (sorted((folder / f"{d:.3f}mm").glob("*.png")) for d in (used, judged))
+    background = folder / "background.png"
+    table = calibrated(own, used * MM, background, sensor="gelsight-mini")
+    assert np.median(table.diameters) == pytest.approx(used * MM, rel=0.05)
+    assert len(table.presses) >= 0.8 * len(own)
+    found = calibrated(other, judged * MM, background, sensor="gelsight-mini").presses
+    told = [measured_diameter(press, table.sensor) for press in found]
+    assert np.median(told) == pytest.approx(judged * MM, rel=0.05)
