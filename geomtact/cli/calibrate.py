@@ -25,6 +25,12 @@ def calibrate(
         tuple[float, float] | None,
         typer.Option("--pitch-mm", help="Millimetres per pixel on the membrane, along x and along y."),
     ] = None,
+    pins: Annotated[
+        Path | None, typer.Option(help="In place of --pitch-mm: image of a square board of pins, pressed in.")
+    ] = None,
+    pin_spacing_mm: Annotated[
+        float | None, typer.Option("--pin-spacing-mm", help="From pin to pin of that board.")
+    ] = None,
     sensor: SensorName = None,
     name: Annotated[str | None, typer.Option(help="Name of the new sensor.")] = None,
     out: Annotated[Path, typer.Option(help="Sensor file to write.")] = Path("sensor.toml"),
@@ -32,7 +38,8 @@ def calibrate(
 ) -> None:
     """Calibrate a sensor's colours from presses of a ball of known diameter, so that its readings tell heights.
 
-    Give a pitch, or a sensor whose geometry is kept. A dozen presses all over the window take half a minute.
+    Give a pitch, an image of a pin board, or a sensor whose geometry is kept. A dozen presses all over the window take
+    half a minute.
     """
     from geomtact.report.calibration_plot import draw_calibration
     from geomtact.sensing.calibrate import calibrated
@@ -41,6 +48,12 @@ def calibrate(
         if path is not None and path.suffix != suffix:
             raise UsageError(f"{path}: expected a name that ends in {suffix}; give one")
     pitch = None if pitch_mm is None else (1e-3 * pitch_mm[0], 1e-3 * pitch_mm[1])
+    if pins is not None or pin_spacing_mm is not None:
+        if pins is None or pin_spacing_mm is None or pitch is not None:
+            raise UsageError(
+                "--pins and --pin-spacing-mm belong together, and stand in place of --pitch-mm; give these two"
+            )
+        pitch = _pitch_of(pins, background, 1e-3 * pin_spacing_mm)
     found = calibrated(presses, 1e-3 * ball_mm, background, pitch, sensor, name or out.stem)
     for left_out, why in found.left_out.items():
         tell(f"warning: {left_out} is left out: {why}")
@@ -50,6 +63,20 @@ def calibrate(
     if plot is not None:
         plot.write_bytes(draw_calibration(found, 1e-3 * ball_mm))
         typer.echo(f"wrote {plot}")
+
+
+def _pitch_of(pins: Path, background: Path, spacing: float) -> tuple[float, float]:
+    """The pitch [m] that an image of a pin board tells, which is printed."""
+    from geomtact.sensing.image_file import read_image
+    from geomtact.sensing.pins import pixel_pitch_of_pins
+
+    board = pixel_pitch_of_pins(read_image(pins), read_image(background), spacing)
+    x, y = 1e3 * board.pixel_pitch[0], 1e3 * board.pixel_pitch[1]
+    typer.echo(
+        f"{len(board.pins)} pins: {x:.4f} x {y:.4f} mm a pixel in the middle, give or take {100 * max(board.std):.1f} %; "
+        f"at the outermost pins {100 * board.stretch:.0f} % less"
+    )
+    return board.pixel_pitch
 
 
 def _print(found: Calibrated, ball_mm: float) -> None:
