@@ -34,6 +34,7 @@ _ANEW = 0.5  # share of the uniform distribution after a slip, or after contact 
 _SLIP = -2.0  # nats by which what was known may make a frame less likely than chance does
 _WIDENED = 4  # frames without contact, at most, for which the object is taken to have moved on
 _TAIL = 1e-3  # density relative to the uniform distribution below which cells are not told apart
+_AT_HAND = 1 << 15
 _BELIEVED = 2_000  # cells of a posterior that stand for it when the next frame is held against it
 
 Counts = tuple[float, float | None]
@@ -141,17 +142,21 @@ class Filter:
             if surprise < _SLIP and self.fresh > 0:
                 expected = expected.mixed(_ANEW)
         before = self._log_density(expected)
-        log_density, log_prob = self._normalised(np.float32(now) * gain + before)
+        log_density = np.float32(now) * gain
+        log_density += before
+        log_prob = self._normalise(log_density)
         self.believed = self._kept(log_density, _BELIEVED)
         if (past, kept) != (now, 1.0):
-            log_density, _ = self._normalised(np.float32(past) * gain + np.float32(kept) * before)
+            log_density = np.multiply(gain, np.float32(past), out=gain)
+            log_density += np.multiply(before, np.float32(kept), out=before)
+            self._normalise(log_density)
         self.memory = self._kept(log_density, self.most)
         return self._known(log_prob), surprise
 
     def _passed_over(self, T_frame_sensor: Array) -> Known:
         """What is known after a frame that tells nothing."""
         self.predict(T_frame_sensor)
-        return self._known(self._normalised(self._log_density(self.memory))[1])
+        return self._known(self._normalise(self._log_density(self.memory)))
 
     def _weights(self, seen: Posterior) -> tuple[float, float]:
         """Powers that a frame's likelihood and what was known before have in what is remembered."""
@@ -173,13 +178,17 @@ class Filter:
         rows = self._row(expected.cells)
         density[rows] += expected.mass / self._weight[rows]
         with np.errstate(divide="ignore"):
-            return np.log(density)
+            return np.log(density, out=density)
 
-    def _normalised(self, log_density: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The log density (n,), normalised, and the log probability (n,) of all possible cells."""
+    def _normalise(self, log_density: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The log probability (n,) of all possible cells, of a log density (n,), which is normalised in place."""
         log_prob = log_density + self.spreading.index.log_possible_weight
-        log_total = np.log(np.exp(log_prob).sum())
-        return log_density - log_total, log_prob - log_total
+        # so many at a time as a processor keeps at hand
+        total = sum(float(np.exp(log_prob[i : i + _AT_HAND]).sum()) for i in range(0, len(log_prob), _AT_HAND))
+        log_total = np.float32(np.log(total))
+        log_density -= log_total
+        log_prob -= log_total
+        return log_prob
 
     def _kept(self, log_density: NDArray[np.float32], most: int | None) -> Mixture:
         """The ``most`` densest of the possible cells, of ``log_density`` (n,); the rest, and the negligible, made uniform."""
