@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import ImageError, UsageError, nearest_name
+from geomtact.sensing.checks import faults
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
-from geomtact.sensing.local_shape import contact_mask
+from geomtact.sensing.local_shape import as_unit_rgb, contact_mask
 from geomtact.sensing.sensor import Sensor
 
 __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observation", "write_image"]
@@ -209,7 +210,10 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
         label, reference = _load(background, "background", warnings)
         _check_size(reference, sensor, label)
         reference = _rgb(reference, label)
-    return contact_mask(_rgb(array, name), reference, sensor)
+    seen = _rgb(array, name)
+    found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))
+    warnings.extend(f"{name}: {fault}" for fault in found)
+    return contact_mask(seen, reference, sensor)
 
 
 def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:
