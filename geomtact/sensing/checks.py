@@ -10,8 +10,8 @@ from geomtact.se3 import Array
 _COARSE = 48  # pixels along the shorter side
 _DARK, _DARK_SHARE = 0.02, 0.5  # all channels below this, in more than this share of the pixels
 _BRIGHT, _BRIGHT_SHARE = 0.995, 0.4  # any channel above this
-# of colour (0..1), by which half of the pixels are off at most, but for a gain and one offset a channel: of 103 real readings with
-# their own backgrounds 0.062, with those of other sensors 0.109 or more
+# of colour (0..1), by which half of the pixels are off at most, but for a gain and one offset a channel: of 103 real readings
+# with their own backgrounds 0.062, with those of other sensors 0.109 or more
 _UNLIKE = 0.085
 _BETTER = 0.5  # of what a reading is off as it is, that it is off otherwise, where it was meant to be so
 _LEAST = 0.02  # off by less, it says nothing
