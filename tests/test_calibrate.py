@@ -20,8 +20,9 @@ PLACES = [(40, 40), (80, 60), (120, 80), (60, 85), (105, 38), (45, 75)]
 PLACES += [(25, 90), (100, 100), (130, 60), (75, 30), (60, 60), (95, 75)]
 
 
-def pressed(diameter, centre, contact=1.6 * MM):
-    """Depth (H, W) [m] of a gel under a ball, and its slope (H, W, 2): the ball's shape, then an exponential rise."""
+def pressed(diameter, centre, contact=1.6 * MM, bend=0.0):
+    """Depth (H, W) [m] of a gel under a ball, and its slope (H, W, 2): the ball's shape, then an exponential rise. A membrane
+    that bulges with radius ``bend`` has been that much nearer to the ball around its middle."""
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     off = (np.stack([u, v], -1) - centre) * PITCH
     far, ball = np.linalg.norm(off, axis=-1), diameter / 2
@@ -32,7 +33,11 @@ def pressed(diameter, centre, contact=1.6 * MM):
     down = np.where(
         inside, -1 / np.sqrt(np.maximum(ball**2 - far**2, 1e-9)), -fall * steep / SUNK / np.maximum(far, 1e-9)
     )
-    return np.where(inside, sphere, fall), off * down[..., None]
+    slope = off * down[..., None]
+    if bend:
+        xy = (np.stack([u, v], -1) + 0.5 - np.array(SHAPE[::-1]) / 2) * PITCH
+        slope = slope - np.where(inside, 1.0, 0.0)[..., None] * xy / np.sqrt(bend**2 - (xy**2).sum(-1, keepdims=True))
+    return np.where(inside, sphere, fall), slope
 
 
 def lit(slope, rng):
@@ -46,9 +51,9 @@ def lit(slope, rng):
     return tuple(np.rint(255 * image).astype(np.uint8) for image in both)
 
 
-def presses(diameter, places=PLACES, seed=0):
+def presses(diameter, places=PLACES, seed=0, bend=0.0):
     rng = np.random.default_rng(seed)
-    made = [lit(pressed(diameter, place)[1], rng) for place in places]
+    made = [lit(pressed(diameter, place, bend=bend)[1], rng) for place in places]
     return [image for image, _ in made], made[0][1]
 
 
@@ -75,6 +80,36 @@ def test_heights_of_a_ball_it_was_not_calibrated_with(found, diameter):
     assert told.dtype == np.float32 and (told >= 0).all()
     assert told[on] == pytest.approx(true[on], abs=0.08 * true.max())
     assert contact_height(background, background, found.sensor).max() == 0
+
+
+def test_a_bulging_membrane_takes_its_own_slope_off_the_balls():
+    images, background = presses(8 * MM, bend=35 * MM)
+    curved = Sensor("curved", SHAPE[::-1], (PITCH, PITCH), 0.0, 2 * MM, membrane_radius=35 * MM)
+    found = calibrated(images, 8 * MM, background, sensor=curved)
+    assert np.median(found.diameters) == pytest.approx(8 * MM, rel=0.03)
+    # taken for flat, its bulge passes for a tenth of the ball's curvature
+    flat = calibrated(images, 8 * MM, background, PITCH)
+    press = found.presses[0]
+    told = [measured_diameter(press, sensor) for sensor in (found.sensor, flat.sensor)]
+    assert told[0] == pytest.approx(8 * MM, rel=0.05)
+    assert np.linalg.norm(np.subtract(found.sensor.colour.weights, flat.sensor.colour.weights)) > 0.05
+
+
+def test_presses_all_in_one_place_or_few_are_doubted():
+    images, background = presses(8 * MM, [(70, 55), (73, 60), (76, 58)])
+    (said,) = calibrated(images, 8 * MM, background, PITCH).warnings
+    assert "presses lie within 4 % of the window's width and 4 % of its height" in said
+    images, background = presses(8 * MM, PLACES[:3])
+    assert any("is measured" in warning for warning in calibrated(images, 8 * MM, background, PITCH).warnings)
+    found = calibrated([*images, images[0]], 8 * MM, background, PITCH)
+    assert found.left_out == {"press 4": "it is the same image as one before"}
+
+
+def test_large_images_take_no_more_memory_at_a_time(found):
+    change = np.random.default_rng(0).normal(size=(150, 40, 3))
+    v, u = np.mgrid[:150, :40]
+    whole = terms(change.reshape(-1, 3), u.ravel(), v.ravel(), (150, 40)) @ np.array(found.sensor.colour.weights).T
+    assert found.sensor.colour.slopes(change) == pytest.approx(whole.reshape(150, 40, 2), rel=1e-9, abs=1e-9)
 
 
 def test_the_diameter_of_exact_slopes_is_exact():
@@ -126,6 +161,9 @@ def test_a_sensor_file_keeps_the_colours_and_its_indexes(found, tmp_path):
         (text[: text.index("weights")] + "weights = [[1, 2], [3, 4]]\n", f"2 x {TERMS}"),
         (text[: text.index("weights")] + 'weights = "many"\n', "must hold numbers"),
         (text.replace("slope_rms = ", "slope_rms = -"), ">= 0"),
+        (text.replace("slope_rms = ", "slope_rms = true #"), "must hold numbers"),
+        (text.replace("slope_rms = ", "slope_rms = 1" + 400 * "0" + " # "), "must hold numbers"),
+        (text[: text.index("weights")] + "weights = " + 5000 * "[" + 5000 * "]", "lists within lists|not valid TOML"),
     ):
         with pytest.raises(SensorError, match=what):
             Sensor.from_toml(wrong, "made.toml")
@@ -137,6 +175,12 @@ def test_what_is_missing_or_wrong_is_said(found):
         contact_height(images[0], background, replace(found.sensor, colour=None))
     with pytest.raises(ImageError, match="expected the size of the image"):
         contact_height(images[0], background[:-1], found.sensor)
+    with pytest.raises(ImageError, match="expected 160 x 120 px for sensor made, got 80 x 60"):
+        contact_height(images[0][::2, ::2], background[::2, ::2], found.sensor)
+    with pytest.raises(ImageError, match="press 2: expected the background's size, 160 x 120 px, got 160 x 119"):
+        calibrate([images[0], images[1][:-1], images[2]], 8 * MM, background, PITCH)
+    with pytest.raises(UsageError, match="expected a list of 3 images or more, got one path"):
+        calibrate("press.png", 8 * MM, background, PITCH)
     with pytest.raises(UsageError, match=r"expected metres.*6\.31 mm is 0\.00631"):
         calibrate(images, 8, background, PITCH)
     with pytest.raises(UsageError, match="pixel_pitch: expected metres"):
@@ -166,6 +210,8 @@ def test_the_command_writes_a_sensor_and_a_picture(tmp_path):
     told = geomtact.contact_height(images[0], background, tmp_path / "mine.toml")
     assert told.max() == pytest.approx(pressed(8 * MM, PLACES[0])[0].max(), rel=0.1)
     assert "at most" in run().output and run().exit_code == 2
+    assert "expected millimetres" in run("--pitch-mm", 1e-4, 1e-4).output
+    assert "there is no folder" in run("--out", tmp_path / "no" / "mine.toml").output
     assert "ends in .toml" in run("--out", tmp_path / "mine.txt").output
 
 

@@ -138,6 +138,19 @@ def test_each_more_sensor_tells_more_of_the_true_pose(plug):
     assert gains[:, 1].mean() > gains[:, 0].mean() + 0.2 and gains[:, 2].mean() > gains[:, 0].mean() + 0.5
 
 
+def test_what_is_found_lies_in_the_cell_that_holds_its_mass(plug):
+    touches = random_touches(plug, 6, 11)
+    T_world_sensor = [se3.inverse(touch.T_sensor_object) for touch in touches]
+    for k in (0, 3):
+        some = slice(k, k + 3)
+        posterior = plug.localize([touch.mask for touch in touches[some]], "mask", T_world_sensor=T_world_sensor[some])
+        T = np.stack([refined.T for refined in posterior.refined.values()])
+        depth = plug.space.penetration(T)
+        assert np.isfinite(depth).all()
+        assert list(posterior.refined) == plug.index.lookup(T, depth).tolist()
+        assert (posterior.cell_log_density(list(posterior.refined)) > -np.inf).all()
+
+
 def test_the_order_of_the_others_changes_nothing_and_the_world_is_anywhere(plug):
     touches = random_touches(plug, 3, 5)
     _, sensors = world(touches, np.random.default_rng(0))

@@ -47,6 +47,13 @@ def calibrate(
     for path, suffix in ((out, ".toml"), (plot, ".png")):
         if path is not None and path.suffix != suffix:
             raise UsageError(f"{path}: expected a name that ends in {suffix}; give one")
+        if path is not None and not path.parent.is_dir():
+            raise UsageError(f"{path}: there is no folder {path.parent}; make it, or give another")
+    for option, least, value in (("--ball-mm", 0.1, ball_mm), ("--pitch-mm", 0.001, min(pitch_mm or (0.1,)))):
+        if not least < value < 1000 * least:
+            raise UsageError(
+                f"{option} {value:g}: expected millimetres, {least:g} to {1000 * least:g}; metres are 1000 times that"
+            )
     pitch = None if pitch_mm is None else (1e-3 * pitch_mm[0], 1e-3 * pitch_mm[1])
     if pins is not None or pin_spacing_mm is not None:
         if pins is None or pin_spacing_mm is None or pitch is not None:
@@ -57,6 +64,8 @@ def calibrate(
     found = calibrated(presses, 1e-3 * ball_mm, background, pitch, sensor, name or out.stem)
     for left_out, why in found.left_out.items():
         tell(f"warning: {left_out} is left out: {why}")
+    for warning in found.warnings:
+        tell(f"warning: {warning}")
     _print(found, ball_mm)
     out.write_text(found.sensor.to_toml(), "utf-8")
     typer.echo(f"wrote {out}: geomtact.contact_height(image, background, {str(out)!r}) tells heights")

@@ -122,7 +122,7 @@ def refine_together(
     posterior = posterior.shared_anew(home, _TRUST * likely, doubt, elsewhere, _BEFORE, log_prior)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: _TOLD * k]
-    return replace(posterior, refined=search.told(poses[leading]))
+    return replace(posterior, refined=search.told(home[leading], poses[leading]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,13 +132,15 @@ class _Tried:
     Attributes
     ----------
     T : (n, d, 4, 4) in the first sensor's frame
-    depth : (n, d) how deep the object lies in that sensor [m]
+    depth : (n, d) how deep the object lies in that sensor [m], about
     merit : (n, d) log likelihood of what all sensors show; -inf where others of the d are likelier for two sensors already
+    hidden : (n,) how much deeper than a coarse cast shows the object is in that cell: what lies between its rays [m]
     """
 
     T: Array
     depth: Array
     merit: Array
+    hidden: Array
 
     def best(self) -> tuple[Array, Array]:
         """Of each cell, the pose (n, 4, 4) of the highest merit, and that merit (n,)."""
@@ -173,40 +175,35 @@ class _Search:
         self.filterreg = FilterReg(self.first.surface, self.spread)
         self.most = np.full(len(views), -np.inf)
 
-    def tried(self, T: Array) -> _Tried:
-        """With the object at ``T`` (n, d, 4, 4)."""
+    def tried(self, T: Array, hidden: Array) -> _Tried:
+        """With the object at ``T`` (n, d, 4, 4); ``hidden`` (n,) as in :class:`_Tried`."""
         depths = self.base.depths(T.reshape(-1, 4, 4))
-        return self._tried(T, depths.max((1, 2)).reshape(T.shape[:2]), self.base.likely(depths).reshape(T.shape[:2]))
-
-    def _tried(self, T: Array, depth: Array, merit: Array) -> _Tried:
-        """As :meth:`tried`, with how deep (n, d) the object is in the first sensor, and how likely (n, d) what that shows is."""
-        hopeful, d = np.ones(merit.shape, bool), merit.shape[1]
+        depth = depths.max((1, 2)).reshape(T.shape[:2]) + hidden[:, None]
+        merit: Array = self.base.likely(depths).reshape(T.shape[:2])
         self.most[0] = max(self.most[0], merit.max())
+        hopeful, d = np.ones(merit.shape, bool), T.shape[1]
         for i, view in enumerate(self.views[1:], 1):
             if i == 2 and d > _HOPEFUL:
                 hopeful = merit.argsort(1).argsort(1) >= d - _HOPEFUL
             each = view.log_likelihood(T[hopeful])
             self.most[i] = max(self.most[i], each.max())
             merit[hopeful] += each
-        return _Tried(T, depth, np.where(hopeful, merit, -np.inf))
+        return _Tried(T, depth, np.where(hopeful, merit, -np.inf), hidden)
 
     def drawn(self, cells: NDArray[np.int64]) -> _Tried:
         """The poses of ``cells`` (n,) and others within them, about as deep in the first sensor as the cells say."""
         own, level = self.index.poses(cells), cells // self.index.places
         wanted = np.asarray(self.index.resolution.penetrations)[level]
+        hidden = wanted - self.base.depths(own).max((1, 2))
+        hidden[~np.isfinite(hidden)] = 0
         T, depth = self.index.draw(np.repeat(cells, _DRAWS), self.rng)
-        T = np.concatenate([own[:, None], T.reshape(len(cells), _DRAWS, 4, 4)], 1)
-        depth = np.concatenate([wanted[:, None], depth.reshape(len(cells), _DRAWS)], 1)
-        depths = self.base.depths(T.reshape(-1, 4, 4))
-        rise = depths.max((1, 2)) - depth.ravel()
-        rise[~np.isfinite(rise)] = 0
-        T[..., 2, 3] += rise.reshape(depth.shape)
-        known = self.base.likely(depths - rise[:, None, None].astype(np.float32)).reshape(depth.shape)
-        return self._tried(T, depth, known)
+        rise = self.base.depths(T).max((1, 2)) + np.repeat(hidden, _DRAWS) - depth
+        T[:, 2, 3] += np.where(np.isfinite(rise), rise, 0)
+        return self.tried(np.concatenate([own[:, None], T.reshape(len(cells), _DRAWS, 4, 4)], 1), hidden)
 
     def registered(self, tried: _Tried) -> list[_Tried]:
         """What was tried, and what registration makes of the best for each cell."""
-        return [tried, self.tried(self.filterreg.refine(self.rough, tried.best()[0]).T[:, None])]
+        return [tried, self.tried(self.filterreg.refine(self.rough, tried.best()[0]).T[:, None], tried.hidden)]
 
     def around_the_best(self, tried: list[_Tried]) -> list[_Tried]:
         """What was tried, and others around the best in the better half of the cells, in the better half of those nearer, and
@@ -214,12 +211,12 @@ class _Search:
         both = [each.best() for each in tried]
         top = np.stack([merit for _, merit in both])
         best, top = np.stack([T for T, _ in both])[top.argmax(0), np.arange(top.shape[1])], top.max(0)
-        width = 0.25 * self.spread.metres(self.problem.length)
+        width, hidden = 0.25 * self.spread.metres(self.problem.length), tried[0].hidden
         for _ in range(_ROUNDS):
             better = np.argsort(-top, kind="stable")[: -(-len(top) // 2)]
-            best, top = best[better], top[better]
+            best, top, hidden = best[better], top[better], hidden[better]
             motion = self.rng.normal(size=(len(best), _AROUND, 6)) * width
-            around = self.tried(moved(best[:, None], motion, self.problem))
+            around = self.tried(moved(best[:, None], motion, self.problem), hidden)
             tried = [*tried, around]
             nearest, most = around.best()
             best = np.where((most > top)[:, None, None], nearest, best)
@@ -228,19 +225,26 @@ class _Search:
         return tried
 
     def best_of_each_cell(self, tried: Sequence[_Tried]) -> tuple[NDArray[np.int64], Array, Array]:
-        """The cells (m,) in which poses were tried; and in each the one (m, 4, 4) of the highest merit, and that merit (m,)."""
+        """The cells (m,) in which poses were tried that touch; and in each the one (m, 4, 4) of the highest merit, and that merit
+        (m,)."""
         T = np.concatenate([each.T.reshape(-1, 4, 4) for each in tried])
         depth, merit = (np.concatenate([getattr(each, name).ravel() for each in tried]) for name in ("depth", "merit"))
-        touching = np.flatnonzero((depth > 0) & (depth <= self.first.space.sensor.max_penetration))
-        order = touching[np.argsort(-merit[touching], kind="stable")]
+        some = np.flatnonzero((depth > 0) & (depth <= self.first.space.sensor.max_penetration) & (merit > -np.inf))
+        T, merit = self._best(T[some], depth[some], merit[some])[1:]
+        # how deep the best of all those are is worked out exactly, which takes longer
+        depth = self.first.space.penetration(T)
+        touching = np.isfinite(depth)
+        return self._best(T[touching], depth[touching], merit[touching])
+
+    def _best(self, T: Array, depth: Array, merit: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """The cells (m,) that hold poses ``T`` (n, 4, 4) so deep (n,); in each the pose (m, 4, 4) of the highest ``merit``, and
+        that merit (m,)."""
+        order = np.argsort(-merit, kind="stable")
         home, row = np.unique(self.index.lookup(T[order], depth[order]), return_index=True)
         return home, T[order[row]], merit[order[row]]
 
-    def told(self, T: Array) -> dict[int, Refined]:
-        """What all contacts tell at those of the poses ``T`` (n, 4, 4) that touch, by the cell that each lies in."""
-        depth = self.first.space.penetration(T)
-        T, depth = T[np.isfinite(depth)], depth[np.isfinite(depth)]
-        cells = self.index.lookup(T, depth)
+    def told(self, cells: NDArray[np.int64], T: Array) -> dict[int, Refined]:
+        """What all contacts tell at poses ``T`` (n, 4, 4), by the cell (n,) that each lies in."""
         found = self.filterreg.refine(self.problem, T)
         out = {}
         for i, cell in enumerate(cells):

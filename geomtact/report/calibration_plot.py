@@ -62,7 +62,7 @@ def draw_calibration(found: Calibrated, ball_diameter: float) -> bytes:
     grid[0, 0].set_ylabel("row [px]")
     grid[1, 0].set_ylabel("depth [mm]")
     grid[1, 0].legend(frameon=False, fontsize=8)
-    told, true = zip(*(ball_slopes(press, colour, pitch, ball_diameter) for press in found.presses), strict=True)
+    told, true = zip(*(ball_slopes(press, found.sensor, ball_diameter) for press in found.presses), strict=True)
     for k, name in enumerate("xy"):
         axes = last[k]
         axes.hexbin(
@@ -73,5 +73,5 @@ def draw_calibration(found: Calibrated, ball_diameter: float) -> bytes:
     last[2].hist(1e3 * found.diameters, bins=15, color=COLOURS[0])
     last[2].axvline(1e3 * ball_diameter, color=COLOURS[1], ls="--", label="said")
     last[2].set(xlabel="ball's diameter by each press [mm]", ylabel="presses")
-    last[2].legend(frameon=False, fontsize=8)
+    last[2].legend(fontsize=8)
     return png(canvas)

@@ -20,7 +20,7 @@ from geomtact.errors import ImageError, InputError, UsageError
 from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable, fit_weights, terms
 from geomtact.sensing.height import relief
-from geomtact.sensing.local_shape import as_unit_rgb, colour_change, contact_mask, same_size
+from geomtact.sensing.local_shape import as_unit_rgb, colour_change, contact_mask
 from geomtact.sensing.sensor import Sensor
 
 _FEWEST = 3  # presses
@@ -32,6 +32,8 @@ _OUTER = 2.2  # times the imprint's radius, beyond which the gel is flat
 _PIXELS, _FLAT_PIXELS = 3000, 1000  # of a press that are used, at most
 _ROUND = 0.05  # of the radius that half of an outline may stray from its circle
 _SEEN = 0.4  # share of the circle that has to be seen
+_SPAN = 0.5  # of the window along each side, over which presses should be spread
+_AGREES = 0.1  # by which presses may measure the ball wrongly, in the median
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +67,14 @@ class Calibrated:
     presses : that were used
     left_out : why others were not, by their names
     diameters : (n,) of the ball [m], measured on each press by a table that was fitted to the others
+    warnings : what speaks against it, one line each
     """
 
     sensor: Sensor
     presses: list[Press]
     left_out: dict[str, str]
     diameters: Array
+    warnings: list[str]
 
 
 def calibrate(
@@ -111,6 +115,11 @@ def calibrated(
     name: str | None = None,
 ) -> Calibrated:
     """As :func:`calibrate`, with what it rests on."""
+    if isinstance(presses, str | Path) or len(presses) < _FEWEST:
+        given = "one path" if isinstance(presses, str | Path) else f"{len(presses)}"
+        raise UsageError(
+            f"presses: expected a list of {_FEWEST} images or more, got {given}; press the ball in at a dozen places"
+        )
     if not (np.isfinite(ball_diameter) and 1e-4 < ball_diameter < 0.1):
         raise UsageError(f"ball_diameter: expected metres, 0.0001 to 0.1, got {ball_diameter}; 6.31 mm is 0.00631")
     reference = _image(background, "background")[1]
@@ -139,14 +148,34 @@ def calibrated(
             f"background: expected {base.image_size_px[0]} x {base.image_size_px[1]} px for sensor {base.name}, got "
             f"{reference.shape[1]} x {reference.shape[0]} px; name the sensor that took it"
         )
-    samples = [_samples(press, pitch, radius) for press in found]
     base = replace(base, name=name or base.name, pixel_pitch=pitch)
-    diameters, off = _left_one_out(found, samples, pitch)
+    samples = [_samples(press, base, radius) for press in found]
+    diameters, off = _left_one_out(found, samples, base)
     x, y = (tuple(map(float, row)) for row in _weights(samples))
     colour = ColourTable((x, y), off, 0.0, 0.0)
     noise, depth = _at_rest(found, colour, pitch)
     colour = replace(colour, height_rms=noise, contact_depth=depth)
-    return Calibrated(replace(base, colour=colour), found, left_out, diameters)
+    warnings = _doubts(found, diameters, ball_diameter)
+    return Calibrated(replace(base, colour=colour), found, left_out, diameters, warnings)
+
+
+def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) -> list[str]:
+    """What speaks against a calibration by these presses."""
+    out = []
+    window = np.array(presses[0].mask.shape[::-1])
+    spans = np.ptp([press.centre for press in presses], axis=0) / window
+    if spans.min() < _SPAN:
+        out.append(
+            f"the presses lie within {100 * spans[0]:.0f} % of the window's width and {100 * spans[1]:.0f} % of its height: "
+            "elsewhere heights may be far off; press the ball in all over"
+        )
+    off = float(np.median(diameters)) / ball_diameter - 1
+    if abs(off) > _AGREES:
+        out.append(
+            f"a press left out is measured {100 * abs(off):.0f} % too {'large' if off > 0 else 'small'} by the others: too few "
+            "presses, another ball, or a wrong pitch; a dozen all over the window are better"
+        )
+    return out
 
 
 def _image(source: Any, role: str) -> tuple[str, Array]:
@@ -154,8 +183,7 @@ def _image(source: Any, role: str) -> tuple[str, Array]:
     if isinstance(source, str | Path):
         from geomtact.sensing.image_file import read_image
 
-        image = read_image(source)
-        return str(source), as_unit_rgb(image[..., :3] if image.ndim == 3 else image, str(source))
+        return str(source), as_unit_rgb(read_image(source), str(source))
     return role, as_unit_rgb(source, role)
 
 
@@ -171,10 +199,20 @@ def _presses(
 ) -> tuple[list[Press], dict[str, str]]:
     """Those of the images that show a ball, and why the others do not."""
     found, left_out = [], {}
+    seen: list[Array] = []
     stretch = 1.0 if pitch is None else pitch[1] / pitch[0]
     for number, source in enumerate(images, 1):
         name, image = _image(source, f"press {number}")
-        change, felt = colour_change(image, same_size(reference, image))
+        if image.shape != reference.shape:
+            raise ImageError(
+                f"{name}: expected the background's size, {reference.shape[1]} x {reference.shape[0]} px, got "
+                f"{image.shape[1]} x {image.shape[0]} px; give images of one sensor"
+            )
+        if any(np.array_equal(image, other) for other in seen):
+            left_out[name] = "it is the same image as one before"
+            continue
+        seen.append(image)
+        change, felt = colour_change(image, reference)
         mask = contact_mask(image, reference)
         if not mask.any():
             left_out[name] = "no contact was found"
@@ -210,19 +248,20 @@ def _circle(mask: NDArray[np.bool_], stretch: float) -> tuple[Array, float] | st
     if np.median(np.abs(off)) > _ROUND * radius:
         return "its outline is no circle"
     if len(np.unique(np.arctan2(*(points - solved[:2]).T) // (np.pi / 18))) < _SEEN * 36:
-        return "less than half of its circle is seen"
+        return "less than two fifths of its circle are seen"
     return np.array([solved[0], solved[1] / stretch]), radius
 
 
-def _samples(press: Press, pitch: tuple[float, float], ball: float) -> tuple[Array, Array]:
-    """Terms (n, ``TERMS``) and slopes (n, 2) of pixels on a ball of radius ``ball`` [m], and of pixels far from it: flat."""
-    off, features = _inner(press, pitch, _INNER)
-    some = np.random.default_rng(0).permutation(len(off))[:_PIXELS]
-    v, u = np.nonzero(np.linalg.norm(_from_centre(press, pitch), axis=-1) > _OUTER * press.radius * pitch[0])
+def _samples(press: Press, sensor: Sensor, ball: float) -> tuple[Array, Array]:
+    """Terms (n, ``TERMS``) and slopes (n, 2) of pixels on a ball of radius ``ball`` [m], and of pixels far from it: at rest."""
+    inner = _inner(press, sensor, _INNER)
+    some = np.random.default_rng(0).permutation(len(inner.off))[:_PIXELS]
+    apart = np.linalg.norm(_from_centre(press, sensor), axis=-1)
+    v, u = np.nonzero(apart > _OUTER * press.radius * sensor.pixel_pitch[0])
     far = np.random.default_rng(0).permutation(len(v))[:_FLAT_PIXELS]
     flat = terms(press.change[v[far], u[far]], u[far], v[far], press.mask.shape)
-    slopes = np.concatenate([_slopes_of_ball(off[some], ball), np.zeros((len(far), 2))])
-    return np.concatenate([features[some], flat]), slopes
+    slopes = np.concatenate([inner.slopes(ball)[some], np.zeros((len(far), 2))])
+    return np.concatenate([inner.features[some], flat]), slopes
 
 
 def _weights(samples: Sequence[tuple[Array, Array]]) -> Array:
@@ -230,51 +269,65 @@ def _weights(samples: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def _left_one_out(
-    presses: Sequence[Press], samples: Sequence[tuple[Array, Array]], pitch: tuple[float, float]
+    presses: Sequence[Press], samples: Sequence[tuple[Array, Array]], sensor: Sensor
 ) -> tuple[Array, float]:
-    """The ball's diameter (n,) [m] by each press, and how far off its slopes are (rms), by what the others tell."""
+    """The ball's diameter (n,) [m] by each press, and how far off slopes on it are (rms), by what the others tell."""
     diameters, squares = np.zeros(len(presses)), []
     for i, press in enumerate(presses):
         weights = _weights([s for k, s in enumerate(samples) if k != i])
-        told, true = samples[i][0] @ weights.T, samples[i][1]
-        squares.append(((told - true) ** 2).mean())
-        off, features = _inner(press, pitch, _MEASURED)
-        diameters[i] = diameter_of(off, features @ weights.T)
+        features, true = samples[i]
+        on = true.any(1)
+        squares.append(((features[on] @ weights.T - true[on]) ** 2).mean())
+        diameters[i] = _diameter(_inner(press, sensor, _MEASURED), weights)
     return diameters, float(np.sqrt(np.mean(squares)))
 
 
-def ball_slopes(
-    press: Press, colour: ColourTable, pitch: tuple[float, float], ball_diameter: float
-) -> tuple[Array, Array]:
-    """Slopes (n, 2) that the colours tell on the inner part of a press, and those of the ball."""
-    off, features = _inner(press, pitch, _INNER)
-    return features @ np.asarray(colour.weights).T, _slopes_of_ball(off, 0.5 * ball_diameter)
+def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Array, Array]:
+    """Slopes (n, 2) that the colours of a calibrated sensor tell on the inner part of a press, and those of the ball."""
+    assert sensor.colour is not None
+    inner = _inner(press, sensor, _INNER)
+    return inner.features @ np.asarray(sensor.colour.weights).T, inner.slopes(0.5 * ball_diameter)
 
 
-def _slopes_of_ball(off: Array, radius: float) -> Array:
-    """Slope (n, 2) of the depth at ``off`` (n, 2) [m] from a ball's centre: deepest there."""
-    return -off / np.sqrt(radius**2 - (off**2).sum(-1, keepdims=True))
+@dataclass(frozen=True, eq=False)
+class _Inner:
+    """Pixels on the inner part of a press: where they lie from the imprint's centre (n, 2) [m], their terms (n, ``TERMS``), and
+    the slope (n, 2) of the membrane at rest."""
+
+    off: Array
+    features: Array
+    rest: Array
+
+    def slopes(self, radius: float) -> Array:
+        """Slope (n, 2) of the depth below the membrane under a ball: deepest at its centre."""
+        return -self.off / np.sqrt(radius**2 - (self.off**2).sum(-1, keepdims=True)) - self.rest
 
 
-def _inner(press: Press, pitch: tuple[float, float], share: float) -> tuple[Array, Array]:
-    """Where the pixels lie that are within ``share`` of the imprint's radius from its centre (n, 2) [m], and their terms (n,
-    ``TERMS``)."""
-    off = _from_centre(press, pitch)
-    v, u = np.nonzero(np.linalg.norm(off, axis=-1) < share * press.radius * pitch[0])
-    return off[v, u], terms(press.change[v, u], u, v, press.mask.shape)
+def _inner(press: Press, sensor: Sensor, share: float) -> _Inner:
+    """Of the pixels that are within ``share`` of the imprint's radius from its centre."""
+    off = _from_centre(press, sensor)
+    v, u = np.nonzero(np.linalg.norm(off, axis=-1) < share * press.radius * sensor.pixel_pitch[0])
+    rest, bend = np.zeros((len(v), 2)), sensor.membrane_radius
+    if bend:
+        xy = sensor.from_pixels(np.stack([u, v], 1))
+        rest = xy / np.sqrt(bend**2 - (xy**2).sum(1, keepdims=True))
+    return _Inner(off[v, u], terms(press.change[v, u], u, v, press.mask.shape), rest)
 
 
-def _from_centre(press: Press, pitch: tuple[float, float]) -> Array:
+def _from_centre(press: Press, sensor: Sensor) -> Array:
     """Where each pixel (H, W, 2) lies from the imprint's centre [m]."""
     row, column = np.mgrid[: press.mask.shape[0], : press.mask.shape[1]]
-    return np.asarray(np.stack([column - press.centre[0], row - press.centre[1]], -1) * np.asarray(pitch))
+    return np.asarray(np.stack([column - press.centre[0], row - press.centre[1]], -1) * np.asarray(sensor.pixel_pitch))
 
 
 def measured_diameter(press: Press, sensor: Sensor) -> float:
     """Diameter [m] of the ball of a press, as the colours of a calibrated sensor tell it."""
     assert sensor.colour is not None
-    off, features = _inner(press, sensor.pixel_pitch, _MEASURED)
-    return diameter_of(off, features @ np.asarray(sensor.colour.weights).T)
+    return _diameter(_inner(press, sensor, _MEASURED), np.asarray(sensor.colour.weights))
+
+
+def _diameter(inner: _Inner, weights: Array) -> float:
+    return diameter_of(inner.off, inner.features @ weights.T + inner.rest)
 
 
 def diameter_of(xy: Array, slope: Array) -> float:

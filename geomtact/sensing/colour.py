@@ -17,6 +17,7 @@ from geomtact.se3 import Array
 
 TERMS = 54  # 9 of colour, each times 6 of the place
 _RIDGE = 1e-4  # of the mean square of each term
+_ROWS = 64  # of an image that are worked out at a time
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,8 @@ class ColourTable:
     Attributes
     ----------
     weights : 2 x ``TERMS``, of the slope along x and along y
-    slope_rms : by how much slopes, which have no unit, were off on presses that the table was not fitted to
-    height_rms : by how much heights are off where nothing touches [m]
+    slope_rms : by how much slopes, which have no unit, were off under balls that the table was not fitted to
+    height_rms : by how much heights are off where nothing touches, before they are set to 0 there [m]
     contact_depth : how deep the gel is pressed in at the border of what counts as contact [m]
     """
 
@@ -45,9 +46,12 @@ class ColourTable:
     def slopes(self, change: Array) -> Array:
         """The slope (H, W, 2) of the indentation's depth along x and y, of a change of colour (H, W, 3)."""
         h, w = change.shape[:2]
-        v, u = np.mgrid[:h, :w]
-        features = terms(change.reshape(-1, 3), u.ravel(), v.ravel(), (h, w))
-        return np.asarray((features @ np.asarray(self.weights).T).reshape(h, w, 2))
+        out = np.empty((h, w, 2))
+        for first in range(0, h, _ROWS):
+            v, u = np.mgrid[first : min(first + _ROWS, h), :w]
+            features = terms(change[first : first + _ROWS].reshape(-1, 3), u.ravel(), v.ravel(), (h, w))
+            out[first : first + _ROWS] = (features @ np.asarray(self.weights).T).reshape(*u.shape, 2)
+        return out
 
 
 def terms(change: Array, u: NDArray, v: NDArray, shape: tuple[int, int]) -> Array:

@@ -113,6 +113,10 @@ class Sensor:
         """Parse the TOML text of one sensor; ``origin`` names it in errors."""
         try:
             data = tomllib.loads(text)
+        except RecursionError:
+            raise SensorError(
+                f"{origin}: lists within lists within lists; write plain ones, see 'geomtact sensors'"
+            ) from None
         except tomllib.TOMLDecodeError as error:
             raise SensorError(
                 f"{origin}: not valid TOML ({error}); write lines such as name = \"mine\", see 'geomtact sensors'"
@@ -125,16 +129,12 @@ class Sensor:
                 raise SensorError(f"{origin}: the key {key!r} is missing")
         for key, value in data.items():
             wanted = _KEYS[key]
-            number = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+            number = _number(value)
             if (wanted is float and not number) or (wanted is str and not isinstance(value, str)):
                 raise SensorError(f"{origin}: {key} must be a {wanted.__name__}, got {value!r}")
             if wanted is dict and not isinstance(value, dict):
                 raise SensorError(f"{origin}: {key} must be a table, got {value!r}; write [{key}]")
-            if wanted is list and not (
-                isinstance(value, list)
-                and len(value) == 2
-                and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
-            ):
+            if wanted is list and not (isinstance(value, list) and len(value) == 2 and all(_number(v) for v in value)):
                 raise SensorError(f"{origin}: {key} must be two numbers (along x, along y), got {value!r}")
         if any(v != int(v) for v in data["image_size_px"]):
             raise SensorError(f"{origin}: image_size_px must be whole numbers, got {data['image_size_px']}")
@@ -260,6 +260,13 @@ def _folder():
     return resources.files("geomtact") / "sensing" / "sensors"
 
 
+def _number(value: Any) -> bool:
+    """Whether it is a number that a float can hold."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return bool(abs(value) < 1e300)
+
+
 def _colour(data: dict[str, Any]) -> ColourTable:
     """The table of a sensor file's [colour]."""
     for key in data:
@@ -268,13 +275,13 @@ def _colour(data: dict[str, Any]) -> ColourTable:
     for key in _COLOUR_KEYS:
         if key not in data:
             raise SensorError(f"the key {key!r} is missing in [colour]; calibrate the sensor again")
-    try:
-        x, y = (tuple(map(float, row)) for row in data["weights"])
-        slope, height, depth = (float(data[key]) for key in _COLOUR_KEYS[1:])
-    except (TypeError, ValueError):
-        raise SensorError(
-            "[colour] must hold numbers, and weights two lists of them; calibrate the sensor again"
-        ) from None
+    numbers = [data[key] for key in _COLOUR_KEYS[1:]]
+    rows = data["weights"] if isinstance(data["weights"], list) else []
+    lists = len(rows) == 2 and all(isinstance(row, list) for row in rows)
+    if not lists or not all(_number(v) for v in (*numbers, *rows[0], *rows[1])):
+        raise SensorError("[colour] must hold numbers, and weights two lists of them; calibrate the sensor again")
+    x, y = (tuple(map(float, row)) for row in rows)
+    slope, height, depth = map(float, numbers)
     return ColourTable((x, y), slope, 1e-3 * height, 1e-3 * depth)
 
 
