@@ -20,7 +20,7 @@ from geomtact.errors import ImageError, InputError, UsageError
 from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable, fit_weights, terms
 from geomtact.sensing.height import relief
-from geomtact.sensing.local_shape import as_unit_rgb, colour_change, contact_mask
+from geomtact.sensing.local_shape import as_unit_rgb, check_size, colour_change, contact_mask
 from geomtact.sensing.sensor import Sensor
 
 _FEWEST = 3  # presses
@@ -143,11 +143,7 @@ def calibrated(
             f"calibrate: {_FEWEST} presses or more are needed, {len(found)} of {len(presses)} serve ({why})"
         )
     base = known or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
-    if base.image_size_px != reference.shape[1::-1]:
-        raise ImageError(
-            f"background: expected {base.image_size_px[0]} x {base.image_size_px[1]} px for sensor {base.name}, got "
-            f"{reference.shape[1]} x {reference.shape[0]} px; name the sensor that took it"
-        )
+    check_size(reference, base, "background")
     base = replace(base, name=name or base.name, pixel_pitch=pitch)
     samples = [_samples(press, base, radius) for press in found]
     diameters, off = _left_one_out(found, samples, base)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.errors import ImageError, SensorError
+from geomtact.errors import SensorError
 from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable
-from geomtact.sensing.local_shape import as_unit_rgb, colour_change, integrate, same_size
+from geomtact.sensing.local_shape import as_unit_rgb, check_size, colour_change, integrate, same_size
 from geomtact.sensing.sensor import Sensor
 
 _SOME = 0.02  # share of the image in which the gel must rest, to tell where it rests
@@ -43,11 +43,7 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
             "diameter and run 'geomtact calibrate', or use contact_mask"
         )
     image = as_unit_rgb(image, "image")
-    if image.shape[:2] != sensor.image_size_px[::-1]:
-        raise ImageError(
-            f"image: expected {sensor.image_size_px[0]} x {sensor.image_size_px[1]} px for sensor {sensor.name}, got "
-            f"{image.shape[1]} x {image.shape[0]} px; name the sensor that took it"
-        )
+    check_size(image, sensor, "image")
     change, felt = colour_change(image, same_size(as_unit_rgb(background, "background"), image))
     return (np.maximum(relief(change, felt, sensor.colour, sensor.pixel_pitch), 0) * felt).astype(np.float32)
 

@@ -45,11 +45,7 @@ def contact_mask(image: Any, background: Any = None, sensor: Sensor | str | None
     if sensor is not None:
         sensor = Sensor.load(sensor)
         pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
-        if image.shape[:2] != sensor.image_size_px[::-1]:
-            raise ImageError(
-                f"image: expected {sensor.image_size_px[0]} x {sensor.image_size_px[1]} px for sensor {sensor.name}, "
-                f"got {image.shape[1]} x {image.shape[0]} px; name the sensor that took it"
-            )
+        check_size(image, sensor, "image")
     reference = None if background is None else same_size(as_unit_rgb(background, "background"), image)
     # one smoothing scale from the resolution, 2 px at 320 x 240; a second look smooths more where noise asks for it
     sigma = min(image.shape[:2]) / 120
@@ -98,6 +94,15 @@ def as_unit_rgb(image: Any, name: str) -> Array:
     if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
         raise ImageError(f"{name}: expected finite values from 0 to 1, got NaN or others; divide by the white value")
     return image
+
+
+def check_size(image: Array, sensor: Sensor, name: str) -> None:
+    """Refuse an image (H, W, 3) that is not of the sensor's size."""
+    if image.shape[:2] != sensor.image_size_px[::-1]:
+        raise ImageError(
+            f"{name}: expected {sensor.image_size_px[0]} x {sensor.image_size_px[1]} px for sensor {sensor.name}, "
+            f"got {image.shape[1]} x {image.shape[0]} px; name the sensor that took it"
+        )
 
 
 def same_size(background: Array, image: Array) -> Array:
