@@ -73,6 +73,17 @@ def test_a_motion_keeps_the_uniform_distribution_and_all_mass(index, motion, rng
     assert (weights(index)[after.cells] > 0).all()
 
 
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda m: str(m))
+def test_parts_of_a_distribution_spread_each_for_itself(index, motion, rng):
+    """Whatever few cells hold: those of few rotations are spread by another way than those of all."""
+    spread, possible = Spreading(index, motion), index.possible
+    mass = weights(index)[possible] * rng.random(len(possible))
+    few = np.isin(index.rotation[possible % index.places], rng.choice(index.rotation, 2))
+    whole = dense(index, spread(Mixture(possible, mass, 0.0)))
+    parts = [dense(index, spread(Mixture(possible[some], mass[some], 0.0))) for some in (few, ~few)]
+    np.testing.assert_allclose(sum(parts), whole, rtol=1e-4, atol=1e-10)
+
+
 def test_what_does_not_move_stays(index, rng):
     cells = np.sort(rng.choice(index.possible, 20, replace=False))
     before = Mixture(cells, rng.dirichlet(np.ones(20)), 0.0)
