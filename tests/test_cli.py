@@ -60,6 +60,7 @@ def test_help_and_lists(geomtact):
         "cache",
         "next-touch",
         "track",
+        "calibrate",
     }
     assert {c.name or c.callback.__name__ for c in app.registered_commands} == commands
     assert all(name in geomtact("--help").stdout for name in {*commands, "evaluate"})
