@@ -169,7 +169,7 @@ def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) ->
     if abs(off) > _AGREES:
         out.append(
             f"a press left out is measured {100 * abs(off):.0f} % too {'large' if off > 0 else 'small'} by the others: too few "
-            "presses, another ball, or a wrong pitch; a dozen all over the window are better"
+            "presses, or not all of one ball; a dozen all over the window are better"
         )
     return out
 
