@@ -7,6 +7,7 @@ the object, and membrane outside the contact that lies in it, pulls the surface 
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +20,7 @@ from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.registration.rim import FLAT
 from geomtact.se3 import Array, apply, check_transforms, inverse, unit
 
+_A_THREAD = 2000  # points whose nearest surface is worth a thread of its own
 _FEWER = 2  # around points that are only inside or outside
 _OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
 _STEPS_AT_END = 8  # with the narrowest filter, at most
@@ -165,11 +167,12 @@ class ContactFilter:
         at = apply(inverse(T), points)
         surface = self.surface.at_scale(sigma)
         most = min(most, len(surface.points))
-        if facing is None:
-            index = surface.tree.query(at.reshape(-1, 3), k=range(1, most + 1), workers=-1)[1]
-        else:
-            both = np.concatenate([at, surface.turn * facing], -1)
-            index = surface.facing_tree.query(both.reshape(-1, 6), k=range(1, most + 1), workers=-1)[1]
+        tree, asked = surface.tree, at
+        if facing is not None:
+            tree, asked = surface.facing_tree, np.concatenate([at, surface.turn * facing], -1)
+        asked = asked.reshape(-1, asked.shape[-1])
+        workers = max(1, min(os.cpu_count() or 1, len(asked) // _A_THREAD))  # one touch has too few points for threads
+        index = tree.query(asked, k=range(1, most + 1), workers=workers)[1]
         index = index.reshape(*at.shape[:-1], most)
         near = surface.points[index]
         return near, surface.normals[index], at[..., None, :] - near

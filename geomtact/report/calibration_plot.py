@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geomtact.report.canvas import COLOURS, png
-from geomtact.sensing.calibrate import ball_slopes
+from geomtact.sensing.calibrate import INNER, ball_slopes
 from geomtact.sensing.height import relief
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def draw_calibration(found: Calibrated, ball_diameter: float) -> bytes:
         shown = np.clip(0.5 + 1.5 * press.change, 0, 1)
         image.imshow(shown)
         u, v = press.centre
-        for share, style in ((1.0, "-"), (0.6, ":")):
+        for share, style in ((1.0, "-"), (INNER, ":")):
             radius = share * press.radius
             image.plot(
                 u + radius * np.cos(across), v + radius * np.sin(across) * pitch[0] / pitch[1], style, color="black"
@@ -52,7 +52,7 @@ def draw_calibration(found: Calibrated, ball_diameter: float) -> bytes:
         x = (np.arange(len(depth)) - u) * pitch[0]
         profile.plot(1e3 * x, 1e3 * depth, color=COLOURS[0], label="from colours")
         ball = 0.5 * ball_diameter
-        on = np.abs(x) < 0.6 * press.radius * pitch[0]
+        on = np.abs(x) < INNER * press.radius * pitch[0]
         sphere = np.sqrt(ball**2 - x[on] ** 2)
         profile.plot(
             1e3 * x[on], 1e3 * (sphere + np.median(depth[on] - sphere)), "--", color=COLOURS[1], label="the ball"

@@ -24,10 +24,8 @@ from geomtact.sensing.local_shape import as_unit_rgb, check_size, colour_change,
 from geomtact.sensing.sensor import Sensor
 
 _FEWEST = 3  # presses
-_INNER, _MEASURED = (
-    0.6,
-    0.5,
-)  # share of the imprint's radius within which the gel surely lies on the ball; that is measured
+INNER = 0.6  # share of the imprint's radius within which the gel surely lies on the ball
+_MEASURED = 0.5  # share of it within which the ball is measured
 _OUTER = 2.2  # times the imprint's radius, beyond which the gel is flat
 _PIXELS, _FLAT_PIXELS = 3000, 1000  # of a press that are used, at most
 _ROUND = 0.05  # of the radius that half of an outline may stray from its circle
@@ -250,7 +248,7 @@ def _circle(mask: NDArray[np.bool_], stretch: float) -> tuple[Array, float] | st
 
 def _samples(press: Press, sensor: Sensor, ball: float) -> tuple[Array, Array]:
     """Terms (n, ``TERMS``) and slopes (n, 2) of pixels on a ball of radius ``ball`` [m], and of pixels far from it: at rest."""
-    inner = _inner(press, sensor, _INNER)
+    inner = _inner(press, sensor, INNER)
     some = np.random.default_rng(0).permutation(len(inner.off))[:_PIXELS]
     apart = np.linalg.norm(_from_centre(press, sensor), axis=-1)
     v, u = np.nonzero(apart > _OUTER * press.radius * sensor.pixel_pitch[0])
@@ -281,7 +279,7 @@ def _left_one_out(
 def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Array, Array]:
     """Slopes (n, 2) that the colours of a calibrated sensor tell on the inner part of a press, and those of the ball."""
     assert sensor.colour is not None
-    inner = _inner(press, sensor, _INNER)
+    inner = _inner(press, sensor, INNER)
     return inner.features @ np.asarray(sensor.colour.weights).T, inner.slopes(0.5 * ball_diameter)
 
 

@@ -83,6 +83,7 @@ def smooth_background(image: Array) -> Array:
 
 
 def as_unit_rgb(image: Any, name: str) -> Array:
+    """An image (H, W, 3), uint8 or float 0..1, as 0..1; what is none is refused under its ``name``."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
         raise ImageError(f"{name}: expected an RGB image (H, W, 3), got an array of shape {image.shape}")
@@ -106,6 +107,7 @@ def check_size(image: Array, sensor: Sensor, name: str) -> None:
 
 
 def same_size(background: Array, image: Array) -> Array:
+    """The background (H, W, 3); one of another size than the image is refused."""
     if background.shape != image.shape:
         raise ImageError(
             f"background: expected the size of the image, {image.shape[1]} x {image.shape[0]} px, "
