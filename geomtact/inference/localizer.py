@@ -25,6 +25,7 @@ from geomtact.inference.fusion import fused_posterior
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
+from geomtact.inference.refine_together import View, refine_together
 from geomtact.planning.next_touch import Action, next_touch
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import Calibration, posterior_log_prob
@@ -165,6 +166,8 @@ class Localizer:
                 return touch
             with _timed(touch.timing_ms, "refine"):
                 contact = touch.observation.contact
+                if contact.height is not None and how.modes:
+                    return refine_together(touch, [View(self.refinery, contact, np.eye(4))], how.modes, seed)
                 return self.refinery.refine(touch, contact, how.modes, how.thorough)
         localizers = (self, *self.others) if self.others else (self,) * len(images)
         if len(localizers) != len(images):

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,7 @@ from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.observability import Spread, moved
 from geomtact.registration.protocol import Problem
 from geomtact.registration.rim import make_problem
-from geomtact.scoring.likelihood import cast_log_likelihood
+from geomtact.scoring.likelihood import cast_log_likelihood, height_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact
@@ -37,9 +38,9 @@ _ROUNDS, _AROUND = (
     12,
 )  # of the last search, each in half the width of the one before, and for the better half of the cells
 _TOLD = 5  # for each mode that is asked for, cells of which it is worked out what the contacts tell
-# Of the joint likelihood at one pose, and share of their mass that the cells looked into keep, whatever is likely within them.
-# Chosen, as is 1 / N below, on scenes that the study does not judge (docs/several-sensors.md)
-_TRUST, _DOUBT = 0.3, 0.03
+# Of the joint likelihood at one pose; and shares of their mass that the cells looked into keep, whatever is likely within them,
+# and that all others do. Chosen on scenes that the study does not judge (docs/several-sensors.md)
+_TRUST, _DOUBT, _ELSEWHERE = 0.3, 0.03, 0.2
 _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
 # nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 _ALIKE, _UNLIKE = 3.0, 8.0
@@ -89,7 +90,16 @@ class View:
             return np.where(deepest > 0, _UNFELT, 0.0)
         off = np.clip(np.maximum(-deepest, deepest - sensor.max_penetration), 0, _FAR)
         likely = cast_log_likelihood(depths, to_grid(self.mask, shape), sensor.pixel_area(shape))
-        return likely - 0.5 * (off / _NEAR) ** 2
+        return likely + self.heights(depths) - 0.5 * (off / _NEAR) ** 2
+
+    def heights(self, depths: NDArray[np.float32]) -> Array:
+        """Log likelihood (n,) of the heights shown, from :meth:`depths`; 0 where there are none."""
+        sensor, shape = self.refinery.space.sensor, depths.shape[1:]
+        if self.contact is None or self.contact.height is None:
+            return np.zeros(len(depths))
+        height = np.asarray(cv2.resize(self.contact.height, shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
+        touched = to_grid(self.contact.deep, shape)
+        return np.asarray(height_log_likelihood(depths, height, touched, sensor.pixel_area(shape)), float)
 
 
 def refine_together(
@@ -117,8 +127,12 @@ def refine_together(
 
     unexplained = (search.most.sum() - likely.max(initial=-np.inf)) / search.felt
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
-    # in cells not looked into as good a pose may lie, but the more contacts there are to be explained, the more seldom
-    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, 1 / search.felt))
+    # in cells not looked into as good a pose may lie, but seldom one that explains several contacts
+    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, _ELSEWHERE if search.felt > 1 else 1.0))
+    if any(view.contact is not None and view.contact.height is not None for view in views):
+        mass = posterior.cell_log_density(home) + posterior.index.log_weight[home]
+        told = float(np.logaddexp.reduce(mass + search.heights(poses), initial=-np.inf))
+        posterior = replace(posterior, log_evidence=posterior.log_evidence + told)
     posterior = posterior.shared_anew(home, _TRUST * likely, doubt, elsewhere, _BEFORE, log_prior)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: _TOLD * k]
@@ -200,6 +214,10 @@ class _Search:
         rise = self.base.depths(T).max((1, 2)) + np.repeat(hidden, _DRAWS) - depth
         T[:, 2, 3] += np.where(np.isfinite(rise), rise, 0)
         return self.tried(np.concatenate([own[:, None], T.reshape(len(cells), _DRAWS, 4, 4)], 1), hidden)
+
+    def heights(self, T: Array) -> Array:
+        """Log likelihood (n,) of all heights that are shown, with the object at ``T`` (n, 4, 4)."""
+        return np.sum([view.heights(view.depths(T)) for view in self.views], axis=0)
 
     def registered(self, tried: _Tried) -> list[_Tried]:
         """What was tried, and what registration makes of the best for each cell."""

@@ -22,6 +22,8 @@ from geomtact.sensing.moments import without_specks
 THRESHOLDS = (0.0, 0.25, 0.5)  # of the penetration
 SOFTNESS = (0.1e-3, 0.4e-3)  # m
 _CORRELATED = 4e-6  # m^2 that are felt or not felt together
+_SCALE = 0.05  # by which all heights of a touch may be too large or too small
+_FAR = 0.05  # m above the membrane that are as good as infinitely many
 _ODD = 0.02  # share of pixels that say nothing: dust, glare, what no model foresees
 
 
@@ -70,6 +72,33 @@ def cast_log_likelihood(depths: NDArray[np.floating], seen: NDArray[np.bool_], a
     for t, s in product(THRESHOLDS, SOFTNESS):
         each.append(weight * np.log(_felt(sign * (depths - t * deepest), s)).sum((1, 2)))
     return np.asarray(_log_mean_exp(np.stack(each, 1)), float)
+
+
+def height_log_likelihood(
+    depths: NDArray[np.floating],
+    height: NDArray[np.floating],
+    touched: NDArray[np.bool_],
+    area: float,
+    noise: float = 0.1e-3,
+) -> NDArray[np.floating]:
+    """Log likelihood (n,) of the gel's indentation, given how far the object lies below the membrane, up to a constant that no
+    pose or object changes.
+
+    Where it is touched the gel lies on the object; elsewhere the object is not in the gel. Some pixels say nothing.
+
+    Parameters
+    ----------
+    depths : (n, h, w) how far the object lies below the undeformed membrane [m], -inf where it is not
+    height : (h, w) how deep the gel is pressed in [m]; NaN tells nothing
+    touched : (h, w) where the object touches
+    area : of a pixel [m^2]
+    noise : standard deviation of heights [m], beside a share of them
+    """
+    known = np.isfinite(height)
+    beside = height[known] - np.maximum(depths[:, known], -_FAR)  # of the gel's surface from the object's
+    beside = np.where(touched[known], beside, np.minimum(beside, 0))
+    off2 = beside**2 / (noise**2 + (_SCALE * height[known]) ** 2)
+    return _independent(area) * np.log((1 - _ODD) * np.exp(-0.5 * off2) + _ODD).sum(1)
 
 
 def _felt(below: NDArray[np.floating], softness: float) -> NDArray[np.floating]:

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+# Share of the deepest to which a gel is pressed in at the border of a contact: between a ball's half on a thick gel (Hertz) and
+# a flat punch's whole
+HALF = 0.5
+_FADING = 0.35  # slope at the border of what is pressed in, in shares of the steepest, under which it fades away there
+_BORDER = 2  # px
 
 
 @dataclass(frozen=True)
@@ -20,3 +27,25 @@ class Contact:
 
     mask: NDArray[np.bool_]
     height: NDArray[np.float32] | None = None
+
+    @classmethod
+    def of_height(cls, height: NDArray[np.float32]) -> Contact:
+        """Of a map (H, W) of how deep the gel is pressed in [m].
+
+        A rigid gel is pressed in where it is touched. An elastic one sinks beside the object too, and that fades away: then the
+        contact is taken to be where it is more than half as deep as at the deepest.
+        """
+        pressed = height > 0
+        if not pressed.any():
+            return cls(pressed, height)
+        slope = np.hypot(*np.gradient(height))
+        within = cv2.erode(pressed.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=_BORDER, borderValue=1)
+        border = slope[pressed & (within == 0)]
+        fades = not border.size or np.median(border) < _FADING * np.quantile(slope[pressed], 0.95)
+        return cls(cls(pressed, height).deep if fades else pressed, height)
+
+    @property
+    def deep(self) -> NDArray[np.bool_]:
+        """Where (H, W) the gel surely lies on the object: pressed in more than half as deep as at the deepest."""
+        assert self.height is not None
+        return self.mask & (self.height > HALF * self.height.max(where=self.mask, initial=0))

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.sensing.checks import faults
 from geomtact.sensing.contact import Contact
+from geomtact.sensing.height import contact_height
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 from geomtact.sensing.local_shape import as_unit_rgb, contact_mask
 from geomtact.sensing.sensor import Sensor
@@ -74,9 +75,13 @@ def read_observation(
         contact = Contact(_mask(array, name, warnings))
     elif kind == "height":
         height = _height(array, name, sensor, warnings)
-        contact = Contact(height > 0, height)
+        contact = Contact.of_height(height)
+        if not np.array_equal(contact.mask, height > 0):
+            warnings.append(
+                f"{name}: the heights fade away, as beside a contact; what is over half as deep counts as contact"
+            )
     else:
-        contact = Contact(_reading(array, name, sensor, background, warnings))
+        contact = _reading(array, name, sensor, background, warnings)
     if contact.mask.all():
         warnings.append(f"{name}: every pixel is in contact: the contact fills the image, so its outline is not seen")
     return Observation(contact, kind, warnings, array)
@@ -202,7 +207,7 @@ def _height(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str])
     return np.maximum(height, 0).astype(np.float32)
 
 
-def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, warnings: list[str]) -> NDArray[np.bool_]:
+def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, warnings: list[str]) -> Contact:
     reference = None
     if background is None:
         warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself")
@@ -213,7 +218,10 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
     seen = _rgb(array, name)
     found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))
     warnings.extend(f"{name}: {fault}" for fault in found)
-    return contact_mask(seen, reference, sensor)
+    mask = contact_mask(seen, reference, sensor)
+    if sensor.colour is None or reference is None:
+        return Contact(mask)
+    return Contact(mask, contact_height(seen, reference, sensor))
 
 
 def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:
