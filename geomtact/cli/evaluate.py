@@ -17,6 +17,7 @@ from geomtact.cli.evaluate_choices import judge_choices
 from geomtact.cli.evaluate_kitting import judge_kitting
 from geomtact.cli.evaluate_next_touch import judge_next_touch
 from geomtact.cli.evaluate_plot import plot_study
+from geomtact.cli.evaluate_readings import judge_readings
 from geomtact.cli.evaluate_registration import judge_registration
 from geomtact.cli.evaluate_scores import judge_scores
 from geomtact.cli.evaluate_stability import judge_stability
@@ -169,6 +170,7 @@ evaluate.command("scores")(one_line_errors(judge_scores))
 evaluate.command("registration")(one_line_errors(judge_registration))
 evaluate.command("thesis")(one_line_errors(judge_thesis_table))
 evaluate.command("touches")(one_line_errors(judge_touches))
+evaluate.command("readings")(one_line_errors(judge_readings))
 evaluate.command("triplets")(one_line_errors(judge_triplets))
 evaluate.command("track")(one_line_errors(judge_track))
 evaluate.command("next-touch")(one_line_errors(judge_next_touch))

@@ -46,11 +46,15 @@ def simulate(
         bool, typer.Option("--elastic/--geometric", help="Pressure of an elastic gel, or a threshold on the depth.")
     ] = False,
     noise: Annotated[NoiseName, typer.Option(help="How strongly the mask is spoilt.")] = NoiseName.none,
+    reading: Annotated[
+        bool,
+        typer.Option("--reading", help="What the camera behind an elastic gel shows, and background.png, not masks."),
+    ] = False,
     pose: Annotated[
         Path | None, typer.Option(help='JSON with "T_sensor_object" (4x4, metres): one touch there.')
     ] = None,
 ) -> None:
-    """Simulate touches: write OBJECT_1.png (contact mask) and OBJECT_1.json (true pose) and so on.
+    """Simulate touches: write OBJECT_1.png (contact mask, or reading) and OBJECT_1.json (true pose) and so on.
 
     The images carry part and sensor in their metadata, so 'geomtact localize OBJECT_1.png' needs no options.
     """
@@ -68,6 +72,7 @@ def simulate(
     pressed = Sensor.load(sensor_named)
     mesh = load_mesh(named, values["unit"], sensor=pressed)
     scene = _Scene(ContactSpace(mesh, pressed))
+    elastic = elastic or reading
     strength = {NoiseName.none: noises.CLEAN, NoiseName.moderate: noises.MODERATE, NoiseName.heavy: noises.HEAVY}[noise]
 
     if pose is not None:
@@ -79,6 +84,20 @@ def simulate(
     # files are named in full, so that the image is understood from any folder
     metadata = {key: str(Path(v).resolve()) if Path(v).is_file() else v for key, v in values.items() if v is not None}
     out.mkdir(parents=True, exist_ok=True)
+    if reading:
+        import numpy as np
+
+        from geomtact.contact_space.touch import felt_height
+        from geomtact.sensing.image_file import write_image
+        from geomtact.sensing.render import SPOILT, example_reading
+
+        heights = [
+            np.zeros(pressed.image_size_px[::-1]),
+            *(felt_height(scene.space, t.T_sensor_object) for t in touches),
+        ]
+        rng = np.random.default_rng([seed, 2])
+        background, *shown = (example_reading(h, pressed.pixel_pitch, SPOILT[noise.value], rng) for h in heights)
+        write_image(out / "background.png", background)
     for k, touch in enumerate(touches, 1):
         stem = f"{mesh.name}_{k}"
         truth = {
@@ -90,8 +109,10 @@ def simulate(
             "noise": noise.value,
             "seed": seed,
         }
-        _write(out / stem, touch.mask, truth, metadata)
+        _write(out / stem, shown[k - 1] if reading else touch.mask, truth, metadata)
         typer.echo(f"{out / stem}.png: {100 * touch.mask.mean():.1f} % of the window in contact")
+    if reading:
+        typer.echo(f"{out / 'background.png'}: without contact, for --background")
 
 
 def read_pose(path: Path) -> Array:

@@ -1,4 +1,4 @@
-"""``geomtact train``: the shared encoder from nothing, or fine-tuned for one part."""
+"""``geomtact train``: the shared encoder from nothing, or fine-tuned for one part; and what finds contacts in readings."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import progress_bar, tell
 from geomtact.errors import InputError, UsageError
 
+MASK = "mask"  # a name for --architecture, beside those of encoders
 _TUNING_RATE = 3e-4  # a step of fine-tuning must not undo what many parts taught
 
 
@@ -30,7 +31,10 @@ def train(
         Path | None, typer.Option(help="Weights to start from; for one part those that geomtact brings along.")
     ] = None,
     architecture: Annotated[
-        str, typer.Option(help="encoder, or resnet50: the thesis's network, for one part alone.")
+        str,
+        typer.Option(
+            help="encoder; mask: what finds the contact in a reading; or resnet50: the thesis's network, for one part."
+        ),
     ] = "encoder",
     pairs: Annotated[int, typer.Option(min=32, help="Pairs of contacts that a resnet50 learns from.")] = 100_000,
     side: Annotated[int, typer.Option(min=32, help="Pixels along the side of a resnet50's images.")] = 224,
@@ -49,9 +53,16 @@ def train(
         raise UsageError(f"--out {out}: expected a name that ends in .safetensors")
     from geomtact.scoring.encoder import ARCHITECTURE, THESIS, WEIGHTS
 
-    if architecture not in (ARCHITECTURE, THESIS):
-        raise UsageError(f"--architecture {architecture}: expected {ARCHITECTURE} or {THESIS}")
+    if architecture not in (ARCHITECTURE, MASK, THESIS):
+        raise UsageError(f"--architecture {architecture}: expected {ARCHITECTURE}, {MASK} or {THESIS}")
     work = work or out.with_name(f"{out.stem}.training")
+    if architecture == MASK:
+        if object_name is not None or start is not None:
+            raise UsageError(
+                f"--architecture {MASK}: it learns from nothing, for all parts; leave out --object and --start"
+            )
+        _train_mask(out, work, scenes or 600, steps or 6000, rate, seed)
+        return
     if architecture == THESIS:
         if object_name is None:
             raise UsageError(f"--architecture {THESIS}: the thesis's network is trained for one part; give --object")
@@ -109,6 +120,24 @@ def _sha256(path: Path | None) -> str | None:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError:
         raise InputError(f"--start {path}: no such file; give a file that 'geomtact train' wrote") from None
+
+
+def _train_mask(out: Path, work: Path, parts: int, steps: int, rate: float | None, seed: int) -> None:
+    """The network that finds the contact in a reading."""
+    from geomtact.training.presses import make_presses
+    from geomtact.training.state import claim
+    from geomtact.training.train_mask import Settings, train_mask, write_mask_network
+
+    settings = Settings(steps=steps, seed=seed)
+    if rate is not None:
+        settings = replace(settings, rate=rate)
+    claim(work, {"architecture": MASK, "seed": seed})
+    with progress_bar("training") as progress:
+        made = make_presses(work / "presses", parts, seed, progress)
+        network, curve = train_mask(made, settings, work, progress)
+    write_mask_network(out, network, curve, settings, sum(len(p.change) for p in made))
+    tell(f"overlaps the contact by {curve['validation'][-1]:.2f} on parts that it never saw")
+    typer.echo(f"written: {out} and {out.with_suffix('.json').name}")
 
 
 def _train_thesis(

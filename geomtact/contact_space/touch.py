@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
-from geomtact.sensing.elastic import elastic_mask
+from geomtact.sensing.elastic import elastic_contact, elastic_mask
 from geomtact.sensing.noise import Noise, perturb
 
 CALIBRATION_NOISE = Noise(outline_rms=0.5e-3, correlation=(0.5e-3, 4e-3), specks=5, missing_probability=0.2)
@@ -30,6 +30,23 @@ def felt_mask(
     h, w = shape or sensor.image_size_px[::-1]
     if not elastic:
         return space.caster.contact(sensor, T, (h, w)).mask
+    depth, pitch, margin = _around(space, T, (h, w))
+    return elastic_in_window(depth, pitch, margin, sensor.max_penetration)
+
+
+def felt_height(space: ContactSpace, T: ArrayLike) -> NDArray[np.float32]:
+    """How deep an elastic gel is pressed in [m] by the object at ``T`` (4, 4): (H, W) at the sensor's own resolution."""
+    depth, pitch, margin = _around(space, T, space.sensor.image_size_px[::-1])
+    gel, window = _where_gel(depth, margin, space.sensor.max_penetration)
+    return elastic_contact(gel, pitch)[1][window]
+
+
+def _around(
+    space: ContactSpace, T: ArrayLike, shape: tuple[int, int]
+) -> tuple[NDArray[np.float32], tuple[float, float], tuple[int, int]]:
+    """Depth [m] of the object at ``T`` (4, 4) below the membrane, on a grid that goes beyond the window of ``shape`` (h, w); its
+    pitch [m]; and by how many (rows, columns) it does, each side."""
+    sensor, (h, w) = space.sensor, shape
     # the membrane is solved as flat: its bulge is shallow over the width of a contact
     my, mx = round(MARGIN * h), round(MARGIN * w)
     size = (w + 2 * mx, h + 2 * my)
@@ -38,7 +55,7 @@ def felt_mask(
     x, y = wide.pixel_centres()
     rays = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     depth = space.caster.ray_depths(sensor, np.asarray(T, float)[None], rays)[0].reshape(len(y), len(x))
-    return elastic_in_window(depth, pitch, (my, mx), sensor.max_penetration)
+    return depth, pitch, (my, mx)
 
 
 def draw_noise(noise: Noise, rng: np.random.Generator) -> Noise:
@@ -56,12 +73,19 @@ def spoilt(mask: NDArray[np.bool_], space: ContactSpace, noise: Noise, rng: np.r
 def elastic_in_window(
     depth: NDArray, pitch: tuple[float, float], margin: tuple[int, int], deepest: float
 ) -> NDArray[np.bool_]:
-    """The elastic contact in a window, of a depth field [m] that reaches ``margin`` (rows, columns) beyond it each side.
+    """The elastic contact in a window, of a depth field [m] that reaches ``margin`` (rows, columns) beyond it each side, where
+    nothing is felt that is deeper than ``deepest`` [m]."""
+    gel, window = _where_gel(depth, margin, deepest)
+    return elastic_mask(gel, pitch)[window]
+
+
+def _where_gel(depth: NDArray, margin: tuple[int, int], deepest: float) -> tuple[NDArray, tuple[slice, ...]]:
+    """``depth`` where there is gel, -inf elsewhere, and the window in it.
 
     Beside the window an object may reach far below the membrane, into the housing: where it is deeper than ``deepest``
-    [m] there, the gel has ended.
+    there, the gel has ended.
     """
     window = tuple(slice(m, n - m) for m, n in zip(margin, depth.shape, strict=True))
     outside = np.ones(depth.shape, bool)
     outside[window] = False
-    return elastic_mask(np.where(outside & (depth > deepest), -np.inf, depth), pitch)[window]
+    return np.where(outside & (depth > deepest), -np.inf, depth), window

@@ -197,7 +197,10 @@ class Localizer:
         settings = self._settings(effort, seed)
         with _timed(timing, "read"):
             observation = read_observation(image, self.sensor, kind, background)
-        mask, warnings = observation.contact.mask, list(observation.warnings)
+        mask, above, warnings = observation.contact.mask, 0.0, list(observation.warnings)
+        if observation.contact.height is not None and mask.any():
+            # what lies half as deep as the deepest is contact on any gel, and the object reaches below it by as much
+            mask, above = observation.contact.deep, observation.contact.half
         common: dict[str, Any] = {
             "frame": frame,
             "T_frame_sensor": T_frame_sensor,
@@ -212,11 +215,12 @@ class Localizer:
             return replace(nothing, elsewhere=elsewhere, warnings=warnings)
         log_prior = None
         with _timed(timing, "score"):
-            if prior is None:
+            if prior is not None:
+                log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame, self.cache_dir)
+            if prior is None and not above:
                 rows = self.scorer.rows(self.index, mask, resolved)
             else:
-                log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame, self.cache_dir)
-                rows = self.scorer.cells(self.index, mask, log_prior, resolved == "all")
+                rows = self.scorer.cells(self.index, mask, log_prior, resolved == "all", above)
         with _timed(timing, "posterior"):
             common["settings"] |= _worth(rows.by, rows.calibration)
             log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)

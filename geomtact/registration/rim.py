@@ -34,7 +34,7 @@ def make_problem(
     *,
     max_points: int = 60,
     outline_noise: float = 0.2e-3,
-    height_noise: float = 0.1e-3,
+    height_noise: float | None = None,
     correlation: float = 2e-3,
     sink: float = SINK,
     sink_std: float = SINK_STD,
@@ -49,7 +49,7 @@ def make_problem(
         to be where it is more than half of the deepest, and ``sink`` is not used
     max_points : of the outline, of the heights, and of what lies inside and outside, at most
     outline_noise : how far the outline of a real mask strays, standard deviation along its normal [m]
-    height_noise : standard deviation of heights [m]
+    height_noise : standard deviation of heights [m]; the sensor's by default
     correlation : over what length both stray the same way [m]: to 1/e in a Gaussian field, as ``Noise.correlation``
     sink : how far below the membrane the object's surface lies at the outline [m]: 0 for a rigid gel, about 0.55 of the deepest
         for an elastic one
@@ -60,7 +60,7 @@ def make_problem(
     pitch = float(np.sqrt(pitch_xy.prod()))
     outline_noise, height_noise = (
         float(np.hypot(outline_noise, 0.3 * pitch)),
-        float(np.hypot(height_noise, 0.1 * pitch)),
+        float(np.hypot(height_noise or sensor.height_noise, 0.1 * pitch)),
     )
 
     def lifted(uv: Array, depth: ArrayLike = 0.0) -> Array:
@@ -76,7 +76,8 @@ def make_problem(
         sink_std = 0.0
         depth, known, clear = _depths(height)
         half = 0.5 * float(depth.max(where=contact, initial=0.0))
-        deep = contact & (depth > half)
+        # an object that fills the window leaves the gel nowhere to hang free
+        deep = contact if contact.all() else contact & (depth > half)
         uv, outward, spacing = _outline(deep, pitch_xy, max_points)
         # of an elastic gel, what is not pressed in half as deep as the deepest may hang free of the object, far beside it
         # even: only where the gel drops off steeply a wall is near

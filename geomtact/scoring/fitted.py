@@ -77,10 +77,18 @@ class FittedScorer:
             return self.cascade.expanded(index, mask)
         return self.cells(index, mask, None, resolved == "all")
 
-    def cells(self, index: Index, mask: NDArray[np.bool_], log_prior: NDArray[np.floating] | None, exact: bool) -> Rows:
+    def cells(
+        self,
+        index: Index,
+        mask: NDArray[np.bool_],
+        log_prior: NDArray[np.floating] | None,
+        exact: bool,
+        above: float = 0.0,
+    ) -> Rows:
         """Scores of every single cell that has mass.
 
         ``log_prior`` (N,) is the log mass of all cells, the uniform's where it is None; ``exact`` scores count the pixels too.
+        ``mask`` is what the object would touch if it were drawn back by ``above`` [m], a contour line of the gel's heights.
         """
         scorer, calibration = self.scorer, self.calibration
         if exact and self.exact_scorer is not None and self.exact_calibration is not None:
@@ -89,8 +97,18 @@ class FittedScorer:
         if log_prior is not None:
             cells = np.flatnonzero(np.isfinite(log_prior))
             prior = log_prior[cells]
-        score = scorer.score(index, mask).reshape(-1)[cells]
+        score = _deeper(scorer.score(index, mask), index, above).reshape(-1)[cells]
         return Rows(cells, None, score, prior, calibration, scorer.name)
+
+
+def _deeper(score: NDArray[np.float32], index: Index, by: float) -> NDArray[np.float32]:
+    """Scores (P, n) of poses ``by`` [m] deeper than those scored; those that are not as deep get the lowest there is."""
+    bins = round(by * len(score) / index.sensor.max_penetration)
+    if not bins:
+        return score
+    out = np.full_like(score, score[np.isfinite(score)].min())
+    out[bins:] = score[:-bins]
+    return out
 
 
 def fitted_scorer(

@@ -79,7 +79,7 @@ def height_log_likelihood(
     height: NDArray[np.floating],
     touched: NDArray[np.bool_],
     area: float,
-    noise: float = 0.1e-3,
+    noise: float,
 ) -> NDArray[np.floating]:
     """Log likelihood (n,) of the gel's indentation, given how far the object lies below the membrane, up to a constant that no
     pose or object changes.

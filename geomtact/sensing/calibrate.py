@@ -144,13 +144,13 @@ def calibrated(
     check_size(reference, base, "background")
     base = replace(base, name=name or base.name, pixel_pitch=pitch)
     samples = [_samples(press, base, radius) for press in found]
-    diameters, off = _left_one_out(found, samples, base)
+    diameters, off, beside = _left_one_out(found, samples, base, radius)
     x, y = (tuple(map(float, row)) for row in _weights(samples))
     colour = ColourTable((x, y), off, 0.0, 0.0)
     noise, depth = _at_rest(found, colour, pitch)
     colour = replace(colour, height_rms=noise, contact_depth=depth)
     warnings = _doubts(found, diameters, ball_diameter)
-    return Calibrated(replace(base, colour=colour), found, left_out, diameters, warnings)
+    return Calibrated(replace(base, colour=colour, height_noise=beside), found, left_out, diameters, warnings)
 
 
 def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) -> list[str]:
@@ -263,17 +263,24 @@ def _weights(samples: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def _left_one_out(
-    presses: Sequence[Press], samples: Sequence[tuple[Array, Array]], sensor: Sensor
-) -> tuple[Array, float]:
-    """The ball's diameter (n,) [m] by each press, and how far off slopes on it are (rms), by what the others tell."""
-    diameters, squares = np.zeros(len(presses)), []
+    presses: Sequence[Press], samples: Sequence[tuple[Array, Array]], sensor: Sensor, ball: float
+) -> tuple[Array, float, float]:
+    """By what the others tell: the ball's diameter (n,) [m] on each press, and how far off slopes (rms) and heights [m] (median
+    of the presses' rms, their offset aside) are on a ball of radius ``ball`` [m]."""
+    diameters, squares, beside = np.zeros(len(presses)), [], []
     for i, press in enumerate(presses):
         weights = _weights([s for k, s in enumerate(samples) if k != i])
+        x, y = (tuple(map(float, row)) for row in weights)
+        inner = _inner(press, sensor, INNER)
+        off = relief(press.change, press.felt, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)[
+            inner.at
+        ] - inner.height(ball)
+        beside.append(float(off.std()))
         features, true = samples[i]
         on = true.any(1)
         squares.append(((features[on] @ weights.T - true[on]) ** 2).mean())
         diameters[i] = _diameter(_inner(press, sensor, _MEASURED), weights)
-    return diameters, float(np.sqrt(np.mean(squares)))
+    return diameters, float(np.sqrt(np.mean(squares))), float(np.median(beside))
 
 
 def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Array, Array]:
@@ -285,12 +292,18 @@ def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Arr
 
 @dataclass(frozen=True, eq=False)
 class _Inner:
-    """Pixels on the inner part of a press: where they lie from the imprint's centre (n, 2) [m], their terms (n, ``TERMS``), and
-    the slope (n, 2) of the membrane at rest."""
+    """Pixels ``at`` (rows, columns) on the inner part of a press: where they lie from the imprint's centre (n, 2) [m], their
+    terms (n, ``TERMS``), and the height (n,) [m] and slope (n, 2) of the membrane at rest."""
 
+    at: tuple[NDArray[np.int64], NDArray[np.int64]]
     off: Array
     features: Array
+    height_at_rest: Array
     rest: Array
+
+    def height(self, radius: float) -> Array:
+        """Depth (n,) below the membrane under a ball, up to a constant."""
+        return np.asarray(np.sqrt(radius**2 - (self.off**2).sum(-1)) - self.height_at_rest)
 
     def slopes(self, radius: float) -> Array:
         """Slope (n, 2) of the depth below the membrane under a ball: deepest at its centre."""
@@ -301,11 +314,12 @@ def _inner(press: Press, sensor: Sensor, share: float) -> _Inner:
     """Of the pixels that are within ``share`` of the imprint's radius from its centre."""
     off = _from_centre(press, sensor)
     v, u = np.nonzero(np.linalg.norm(off, axis=-1) < share * press.radius * sensor.pixel_pitch[0])
-    rest, bend = np.zeros((len(v), 2)), sensor.membrane_radius
+    height, rest, bend = np.zeros(len(v)), np.zeros((len(v), 2)), sensor.membrane_radius
     if bend:
         xy = sensor.from_pixels(np.stack([u, v], 1))
-        rest = xy / np.sqrt(bend**2 - (xy**2).sum(1, keepdims=True))
-    return _Inner(off[v, u], terms(press.change[v, u], u, v, press.mask.shape), rest)
+        down = np.sqrt(bend**2 - (xy**2).sum(1))
+        height, rest = -down, xy / down[:, None]
+    return _Inner((v, u), off[v, u], terms(press.change[v, u], u, v, press.mask.shape), height, rest)
 
 
 def _from_centre(press: Press, sensor: Sensor) -> Array:

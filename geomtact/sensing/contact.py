@@ -41,11 +41,20 @@ class Contact:
         slope = np.hypot(*np.gradient(height))
         within = cv2.erode(pressed.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=_BORDER, borderValue=1)
         border = slope[pressed & (within == 0)]
-        fades = not border.size or np.median(border) < _FADING * np.quantile(slope[pressed], 0.95)
+        if border.size:
+            fades = np.median(border) < _FADING * np.quantile(slope[pressed], 0.95)
+        else:  # all of the gel is pressed in: by what fills the window, or less and less towards its border
+            fades = np.median(np.r_[height[0], height[-1], height[:, 0], height[:, -1]]) < HALF * height.max()
         return cls(cls(pressed, height).deep if fades else pressed, height)
+
+    @property
+    def half(self) -> float:
+        """Half as deep as the gel is pressed in at the deepest [m]."""
+        assert self.height is not None
+        return HALF * float(self.height.max(where=self.mask, initial=0))
 
     @property
     def deep(self) -> NDArray[np.bool_]:
         """Where (H, W) the gel surely lies on the object: pressed in more than half as deep as at the deepest."""
         assert self.height is not None
-        return self.mask & (self.height > HALF * self.height.max(where=self.mask, initial=0))
+        return self.mask & (self.height > self.half)

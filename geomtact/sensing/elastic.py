@@ -44,14 +44,19 @@ def elastic_mask(depth: ArrayLike, pitch: tuple[float, float]) -> NDArray[np.boo
     return mask
 
 
-def elastic_contact(depth: ArrayLike, pitch: tuple[float, float]) -> tuple[NDArray[np.bool_], Array32]:
-    """As :func:`elastic_mask`, and the surface displacement (H, W) [m], >= 0 and equal to ``depth`` in contact."""
+def elastic_contact(
+    depth: ArrayLike, pitch: tuple[float, float], thickness: float = np.inf
+) -> tuple[NDArray[np.bool_], Array32]:
+    """As :func:`elastic_mask`, and the surface displacement (H, W) [m], >= 0 and equal to ``depth`` in contact.
+
+    Of a gel of finite ``thickness`` [m] the sinking beside the object dies away over that length.
+    """
     depth, box = _in_box(depth)
     pressure = np.zeros(depth.shape, np.float32)
     if box is None:
         return pressure > 0, pressure
-    pressure[box] = _pressure(depth[box], pitch)
-    return pressure > 0, _displacement(pressure, _spectrum(depth.shape, pitch))
+    pressure[box] = _pressure(depth[box], pitch, thickness)
+    return pressure > 0, _displacement(pressure, _spectrum(depth.shape, pitch, thickness))
 
 
 def _in_box(depth: ArrayLike) -> tuple[Array32, tuple[slice, slice] | None]:
@@ -64,7 +69,7 @@ def _in_box(depth: ArrayLike) -> tuple[Array32, tuple[slice, slice] | None]:
     return depth, (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1))
 
 
-def _pressure(depth: Array32, pitch: tuple[float, float]) -> Array32:
+def _pressure(depth: Array32, pitch: tuple[float, float], thickness: float = np.inf) -> Array32:
     """Pressure (h, w), for contact modulus 1, by the constrained conjugate gradients of Polonsky and Keer (1999).
 
     They minimise p K p / 2 - p depth over p >= 0, K the half-space's influence; unlike theirs the load is free and the
@@ -76,7 +81,7 @@ def _pressure(depth: Array32, pitch: tuple[float, float]) -> Array32:
     target = np.full((-(-h // 8) * 8, -(-w // 8) * 8), -1.0, np.float32)
     target[:h, :w] = np.where(depth > 0, depth / scale, -1.0)
     may_touch = target > 0
-    spectrum = _spectrum(target.shape, pitch)
+    spectrum = _spectrum(target.shape, pitch, thickness)
 
     pressure = np.where(may_touch, target, 0)
     sunk = _displacement(pressure, spectrum)
@@ -109,8 +114,9 @@ def _displacement(pressure: Array32, spectrum: NDArray[np.complex64]) -> Array32
 
 
 @lru_cache(maxsize=64)
-def _spectrum(shape: tuple[int, int], pitch: tuple[float, float]) -> NDArray[np.complex64]:
-    """Transform of the influence of one loaded pixel on the others (Love 1929; Johnson 1985, eq. 3.25)."""
+def _spectrum(shape: tuple[int, int], pitch: tuple[float, float], thickness: float = np.inf) -> NDArray[np.complex64]:
+    """Transform of the influence of one loaded pixel on the others (Love 1929; Johnson 1985, eq. 3.25), which a finite
+    ``thickness`` [m] screens."""
     size = [fft.next_fast_len(2 * n, real=True) for n in shape]
     size[1] += size[1] % 2
     x, y = ((np.arange(-(n // 2), n - n // 2 + 1) - 0.5) * d for n, d in zip(size[::-1], pitch, strict=True))
@@ -118,4 +124,5 @@ def _spectrum(shape: tuple[int, int], pitch: tuple[float, float]) -> NDArray[np.
     # The second difference over the pixel's corners; corners are never on an axis, so no division by zero.
     corner = X * np.arcsinh(Y / np.abs(X)) + Y * np.arcsinh(X / np.abs(Y))
     influence = np.diff(np.diff(corner, axis=0), axis=1) / np.pi
+    influence *= np.exp(-np.hypot(*np.meshgrid(x[:-1] + 0.5 * pitch[0], y[:-1] + 0.5 * pitch[1])) / thickness)
     return fft.rfft2(fft.ifftshift(influence)).astype(np.complex64)

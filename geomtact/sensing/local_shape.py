@@ -12,19 +12,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.errors import ImageError
+from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
 Mask = NDArray[np.bool_]
 
+METHODS = ("classical", "learned")  # the default first
 _GREY = 1 / 255
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
 _CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like slopes
 
 
-def contact_mask(image: Any, background: Any = None, sensor: Sensor | str | None = None) -> Mask:
+def contact_mask(
+    image: Any, background: Any = None, sensor: Sensor | str | None = None, method: str = METHODS[0]
+) -> Mask:
     """Where the object touches, in an RGB reading.
 
     Parameters
@@ -33,13 +36,15 @@ def contact_mask(image: Any, background: Any = None, sensor: Sensor | str | None
     background : (H, W, 3) the same sensor without contact; None: a smooth one is estimated from the image itself,
         which serves for contacts much smaller than the window
     sensor : gives the pixel pitch where columns and rows differ, and the size to check; None: square pixels
+    method : "classical": from the gel's slope, up to a factor, which the colours tell where they follow it; or "learned": by a
+        network trained on simulated readings alone
 
     Returns
     -------
     (H, W) bool; all False where nothing stands out of the image's own noise
     """
-    from scipy import ndimage
-
+    if method not in METHODS:
+        raise UsageError(f"contact_mask: no method named {method!r}{nearest_name(str(method), METHODS)}")
     image = as_unit_rgb(image, "image")
     pitch = np.ones(2)
     if sensor is not None:
@@ -57,14 +62,30 @@ def contact_mask(image: Any, background: Any = None, sensor: Sensor | str | None
             change, felt, strong, _ = _change(image, reference, sigma)
     if not felt.any():
         return felt
+    height, mask = _by_network(change, felt) if method == "learned" else _by_slope(change, felt, sigma, pitch)
+    return _components(mask, height, strong, sigma)
+
+
+def _by_slope(change: Array, felt: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
+    """The gel's indentation (H, W) up to a factor, and the contact: within the rim where it is steepest."""
+    from scipy import ndimage
+
     slope = _slope_field(change, felt, sigma, pitch)
     if slope is None:
         height = np.linalg.norm(change, axis=-1) * felt
-        mask = ndimage.binary_fill_holes(height > 0.5 * np.quantile(height[felt], 0.95))
-    else:
-        height = _indentation(integrate(slope, pitch), felt)
-        mask = _inside_rim(height, slope, felt, sigma)
-    return _components(mask, height, strong, sigma)
+        return height, ndimage.binary_fill_holes(height > 0.5 * np.quantile(height[felt], 0.95))
+    height = _indentation(integrate(slope, pitch), felt)
+    return height, _inside_rim(height, slope, felt, sigma)
+
+
+def _by_network(change: Array, felt: Mask) -> tuple[Array, Mask]:
+    """The probability (H, W) of contact, and where it is more likely than not."""
+    from scipy import ndimage
+
+    from geomtact.sensing.mask_network import contact_probability
+
+    probability = contact_probability(change)
+    return probability.astype(float), np.asarray(ndimage.binary_fill_holes(probability > 0.5) & felt)
 
 
 def smooth_background(image: Array) -> Array:

@@ -29,11 +29,15 @@ _KEYS = {
     "max_penetration_mm": float,
     "membrane_radius_mm": float,
     "housing_depth_mm": float,
+    "height_noise_mm": float,
     "note": str,
     "colour": dict,
 }
 _COLOUR_KEYS = ("weights", "slope_rms", "height_rms_mm", "contact_depth_mm")
 _REQUIRED = ("name", "image_size_px", "pixel_pitch_mm", "camera_distance_mm", "max_penetration_mm")
+
+
+HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Sensor:
     max_penetration : how far an object can press into the gel
     membrane_radius : 0 means flat; otherwise the gel bulges towards the object with this radius
     housing_depth : how far the object may reach below z = 0 outside the window; None rules nothing out
+    height_noise : standard deviation of its heights, beside a twentieth of each
     note : where the figures come from
     colour : how its colours tell the gel's slope; None where that is not calibrated
     """
@@ -60,6 +65,7 @@ class Sensor:
     max_penetration: float
     membrane_radius: float = 0.0
     housing_depth: float | None = None
+    height_noise: float = field(default=HEIGHT_NOISE, compare=False)
     note: str = field(default="", compare=False)
     colour: ColourTable | None = field(default=None, compare=False)
 
@@ -83,6 +89,7 @@ class Sensor:
             f"membrane_radius_mm must be 0 (flat) or exceed the window's half diagonal, {1e3 * half_diagonal:.2f} mm",
         )
         need(self.housing_depth is None or self.housing_depth >= 0, "housing_depth_mm must be >= 0")
+        need(self.height_noise > 0, "height_noise_mm must be positive")
 
     @classmethod
     def load(cls, source: str | Path | Sensor) -> Sensor:
@@ -150,6 +157,7 @@ class Sensor:
                 max_penetration=data["max_penetration_mm"] / 1e3,
                 membrane_radius=data.get("membrane_radius_mm", 0.0) / 1e3,
                 housing_depth=None if housing is None else housing / 1e3,
+                height_noise=data.get("height_noise_mm", 1e3 * HEIGHT_NOISE) / 1e3,
                 note=data.get("note", ""),
                 colour=_colour(data["colour"]) if "colour" in data else None,
             )
@@ -172,6 +180,8 @@ class Sensor:
         ]
         if self.housing_depth is not None:
             lines.append(f"housing_depth_mm = {mm(self.housing_depth)}")
+        if self.height_noise != HEIGHT_NOISE:
+            lines.append(f"height_noise_mm = {mm(self.height_noise)}")
         if self.note:
             lines.append(f"note = {_toml_string(self.note)}")
         if self.colour is not None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +15,7 @@ from geomtact.files import write_whole
 from geomtact.geometry.mesh import Mesh
 from geomtact.progress import Progress
 from geomtact.sensing.sensor import Sensor
+from geomtact.training.numbered import write_all
 from geomtact.training.parts import random_part
 from geomtact.training.scenes import Scene, make_scene
 
@@ -66,21 +64,15 @@ def _own(i: int, mesh: Mesh, sensor: Sensor, max_poses: int, seed: int) -> Scene
 
 
 def _scenes(folder: Path, n: int, make: Make, progress: Progress | None, processes: int) -> list[Scene]:
-    folder.mkdir(parents=True, exist_ok=True)
-    todo = [i for i in range(n) if _read(folder / f"{i}.npz") is None]
-    done = n - len(todo)
-    # processes, because much of the work holds the interpreter; spawned, because Embree and OpenMP do not survive a fork
-    with ProcessPoolExecutor(processes, get_context("spawn"), _one_thread) as pool:
-        futures = [pool.submit(_write, folder / f"{i}.npz", make, i) for i in todo]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                done += 1
-                if progress:
-                    progress(done / n, "simulating scenes")
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    write_all(
+        folder,
+        n,
+        partial(_write, make=make),
+        lambda path: _read(path) is not None,
+        "simulating scenes",
+        progress,
+        processes,
+    )
     return [scene for scene in _all(folder, n) if len(scene.true) >= _FEWEST]
 
 
@@ -91,7 +83,7 @@ def _all(folder: Path, n: int) -> Iterator[Scene]:
             yield scene
 
 
-def _write(path: Path, make: Make, i: int) -> None:
+def _write(path: Path, i: int, make: Make) -> None:
     try:
         scene = make(i)
     except MeshError:  # nothing of this part touches this sensor
@@ -106,10 +98,3 @@ def _read(path: Path) -> Scene | None:
         return Scene(**arrays | {"pixel": float(arrays["pixel"])})
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
-
-
-def _one_thread() -> None:
-    import cv2
-
-    os.environ["OMP_NUM_THREADS"] = "1"
-    cv2.setNumThreads(1)

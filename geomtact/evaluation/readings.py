@@ -1,0 +1,362 @@
+"""Real readings judged: contacts against circles drawn by hand, a calibration by the ball it did not see, and balls localized.
+
+Hand-drawn circles mark the imprint, which is wider than the contact: one factor for each set of images and method is fitted on
+every other image and judged on the rest.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.errors import InputError
+from geomtact.evaluation.study import mean_with_interval
+from geomtact.geometry.mesh import Mesh
+from geomtact.inference.localizer import Localizer
+from geomtact.se3 import inverse
+from geomtact.sensing.calibrate import calibrated, measured_diameter
+from geomtact.sensing.image_file import read_image
+from geomtact.sensing.local_shape import METHODS, contact_mask
+from geomtact.sensing.sensor import Sensor
+
+MM = 1e-3
+BALLS = (6.310, 9.500)  # mm, of the folder gelslam_gsmini_balls
+_FACTORS = np.arange(0.5, 2.005, 0.02)  # of imprint over contact, in diameter
+_RESAMPLED = 2000
+
+Mask = NDArray[np.bool_]
+Method = Callable[[Any, Any], Mask]
+
+
+@dataclass(frozen=True, eq=False)
+class Imprint:
+    """A reading on which the ball's imprint was drawn by hand.
+
+    Attributes
+    ----------
+    image, background : (H, W, 3) uint8
+    circle : (column, row, radius) [px]
+    """
+
+    name: str
+    image: NDArray[np.uint8]
+    background: NDArray[np.uint8]
+    circle: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a method makes of one imprint.
+
+    Attributes
+    ----------
+    factor : imprint over contact, in diameter, as fitted on the other half of the images
+    iou : overlap with the circle made smaller by it
+    centre : how far the contact's centroid is off the circle's centre, in shares of the image's width
+    ms : that it took
+    """
+
+    name: str
+    method: str
+    factor: float
+    iou: float
+    centre: float
+    ms: float
+
+
+@dataclass(frozen=True)
+class Pressed:
+    """One ball press localized by heights, the sensor calibrated with presses of the other ball.
+
+    Attributes
+    ----------
+    inside : whether the whole contact is in the window
+    nats : log evidence of the ball that was pressed, less that of the other
+    off_mm : of the first mode's centre from that of the circle drawn by eye
+    deep_mm : how far the first mode presses the gel in
+    """
+
+    name: str
+    ball_mm: float
+    inside: bool
+    nats: float
+    off_mm: float
+    deep_mm: float
+
+
+def imprints(folder: Path) -> dict[str, list[Imprint]]:
+    """The imprints of the data folder, by set.
+
+    Raises
+    ------
+    InputError
+        The folder does not hold them.
+    """
+    fots, pack = folder / "fots_balls", folder / "objectfolder_gelsight_calib" / "dataPack_subset.npz"
+    try:
+        background = read_image(fots / "gelsight_bg.png")[..., :3]
+        rows = circles_of(fots / "gelsight_contact_circles.csv")
+        soft = [
+            Imprint(
+                r["image"],
+                read_image(fots / "gelsight" / r["image"])[..., :3],
+                background,
+                (float(r["center_x_px"]), float(r["center_y_px"]), float(r["radius_px"])),
+            )
+            for r in rows
+        ]
+        with np.load(pack, allow_pickle=False) as data:
+            drawn = zip(data["imgs"], data["touch_center"], data["touch_radius"], strict=True)
+            hard = [
+                Imprint(f"{i}", image, data["f0"], (float(at[0]), float(at[1]), float(r)))
+                for i, (image, at, r) in enumerate(drawn)
+            ]
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{folder}: expected fots_balls and objectfolder_gelsight_calib in it ({error})") from None
+    return {"fots": soft, "objectfolder": hard}
+
+
+def methods() -> dict[str, Method]:
+    """From a reading and its background to the contact: ours, and the classical baseline."""
+    ours: dict[str, Method] = {name: partial(contact_mask, method=name) for name in METHODS}
+    return ours | {"difference": largest_difference}
+
+
+def largest_difference(image: Any, background: Any) -> Mask:
+    """The baseline: the largest component of what differs from the background by more than Otsu's threshold."""
+    from scipy import ndimage
+    from skimage.filters import threshold_otsu
+
+    difference = np.abs(np.asarray(image, float) - np.asarray(background, float)).sum(-1)
+    labels, n = ndimage.label(difference > threshold_otsu(difference))
+    sizes = ndimage.sum_labels(np.ones_like(labels), labels, range(1, n + 1))
+    return np.asarray(labels == 1 + int(np.argmax(sizes)))
+
+
+def find(imprints: Sequence[Imprint], name: str, method: Method) -> list[Found]:
+    """What ``method`` makes of imprints, each judged with the factor that suits the other half of them best."""
+    masks, times = [], []
+    for imprint in imprints:
+        began = time.perf_counter()
+        masks.append(method(imprint.image, imprint.background))
+        times.append(1e3 * (time.perf_counter() - began))
+    ious = np.array([[overlap(mask, i.circle, f) for f in _FACTORS] for mask, i in zip(masks, imprints, strict=True)])
+    suits = [int(np.median(ious[1 - half :: 2], 0).argmax()) for half in (0, 1)]
+    out = []
+    for k, (mask, imprint) in enumerate(zip(masks, imprints, strict=True)):
+        best = suits[k % 2]
+        off = off_centre(mask, imprint.circle)
+        out.append(Found(imprint.name, name, float(_FACTORS[best]), float(ious[k, best]), off, times[k]))
+    return out
+
+
+def overlap(mask: Mask, circle: Sequence[float], factor: float) -> float:
+    """Intersection over union of ``mask`` (H, W) with a ``circle`` made smaller by ``factor``."""
+    v, u = np.indices(mask.shape)
+    disk = np.hypot(u - circle[0], v - circle[1]) <= circle[2] / factor
+    return float((mask & disk).sum() / max((mask | disk).sum(), 1))
+
+
+def off_centre(mask: Mask, circle: Sequence[float]) -> float:
+    """Distance of the centroid of ``mask`` (H, W) from the ``circle``'s centre, in widths of the image; inf without contact."""
+    if not mask.any():
+        return np.inf
+    at = np.argwhere(mask).mean(0)[::-1]
+    return float(np.hypot(*(at - circle[:2])) / mask.shape[1])
+
+
+def summarise_contacts(found: Sequence[Found]) -> dict[str, Any]:
+    """Of one set and method: the factors, the median overlap with its 95 % bootstrap interval, and the median distance of
+    centres."""
+    iou = np.array([f.iou for f in found])
+    rng = np.random.default_rng(0)
+    medians = np.median(rng.choice(iou, (_RESAMPLED, len(iou))), 1)
+    return {
+        "n": len(found),
+        "factors": sorted({f.factor for f in found}),
+        "iou_median": float(np.median(iou)),
+        "iou_interval": [float(q) for q in np.quantile(medians, (0.025, 0.975))],
+        "iou_least": float(iou.min()),
+        "centre_median": float(np.median([f.centre for f in found])),
+        "ms_median": float(np.median([f.ms for f in found])),
+    }
+
+
+def calibrations(folder: Path) -> dict[float, Sensor]:
+    """The GelSight Mini calibrated with the presses of each ball [mm]."""
+    return {ball: _calibrated(folder, ball).sensor for ball in BALLS}
+
+
+def measure_balls(folder: Path, sensors: Mapping[float, Sensor]) -> list[dict[str, float]]:
+    """Each ball's diameter [mm] by its own calibration and by the other's: median, and share by which it is off."""
+    out = []
+    for ball in BALLS:
+        presses = _calibrated(folder, ball).presses
+        for used, sensor in sensors.items():
+            told = float(np.median([measured_diameter(press, sensor) for press in presses])) / MM
+            out.append({"used_mm": used, "ball_mm": ball, "told_mm": told, "off": told / ball - 1})
+    return out
+
+
+def localize_balls(
+    folder: Path, circles: Path, sensors: Mapping[float, Sensor], cache_dir: Any = None, first: int = 0
+) -> Iterator[Pressed]:
+    """Every press localized as either ball, from ``first`` on, with the calibration that saw presses of the other ball alone."""
+    background = _presses(folder) / "background.png"
+    balls = {}
+    for ball in BALLS:
+        for used, sensor in sensors.items():
+            balls[ball, used] = Localizer.prepare(_ball(ball), sensor=sensor, cache_dir=cache_dir)
+    for row in circles_of(circles)[first:]:
+        pressed = float(row["ball_mm"])
+        (other,) = (ball for ball in BALLS if ball != pressed)
+        told = {
+            ball: balls[ball, other].localize(_presses(folder) / row["file"], "reading", background) for ball in BALLS
+        }
+        centre = told[pressed].modes(1)[0].T[:3, 3]
+        seen = sensors[other].from_pixels([float(row["cx_px"]), float(row["cy_px"])])
+        yield Pressed(
+            name=row["file"],
+            ball_mm=pressed,
+            inside=row["inside"] == "1",
+            nats=told[pressed].log_evidence - told[other].log_evidence,
+            off_mm=float(np.linalg.norm(centre[:2] - seen)) / MM,
+            deep_mm=0.5 * pressed - float(centre[2]) / MM,
+        )
+
+
+def summarise_balls(pressed: Sequence[Pressed]) -> list[dict[str, Any]]:
+    """For each ball: the share whose own evidence is larger, by how many nats, and how far centres are off where the contact
+    is whole."""
+    rng, out = np.random.default_rng(0), []
+    for ball in sorted({p.ball_mm for p in pressed}):
+        some = [p for p in pressed if p.ball_mm == ball]
+        whole = np.array([p.off_mm for p in some if p.inside])
+        out.append(
+            {
+                "ball_mm": ball,
+                "n": len(some),
+                "right": float(np.mean([p.nats > 0 for p in some])),
+                "nats": mean_with_interval(np.array([p.nats for p in some]), rng),
+                "whole": len(whole),
+                "off_mm_median": float(np.median(whole)),
+                "within_0.3_mm": float((whole <= 0.3).mean()),
+                "off_mm_largest": float(whole.max()),
+            }
+        )
+    return out
+
+
+@dataclass(frozen=True)
+class Groove:
+    """One mode of the groove scan's middle, localized by its heights on the plate that was scanned.
+
+    Attributes
+    ----------
+    probability : of the mode
+    across_mm, along_mm, deep_mm : how far it is off across the groove, along it, and in height
+    turn_deg, tilt_deg : about the normal, and of it
+    told : how many directions are
+    told_along : the largest component along the groove of a direction that is told, by unit vectors
+    """
+
+    probability: float
+    across_mm: float
+    along_mm: float
+    deep_mm: float
+    turn_deg: float
+    tilt_deg: float
+    told: int
+    told_along: float
+
+
+def localize_groove(folder: Path, cache_dir: Any = None, modes: int = 5) -> tuple[float, list[Groove]]:
+    """The log density at the true pose, and what the leading modes say, of a window of the scan: 6.6 mm by 4.9 mm, of heights
+    without noise, on a plate whose grooves go on beyond it."""
+    height, pitch = read_scan(folder / "gelsight_groove_scan" / "heightmap.tmd")
+    h, w = height.shape
+    sensor = Sensor("groove scan", (240, 180), pitch, 0.0, 1 * MM, height_noise=0.02 * MM)
+    rows, columns = slice(167, 347), slice(173, 413)  # the middle groove
+    # the plate faces the sensor: rows of what is felt run against those of what was scanned
+    seen = height[rows, columns][::-1]
+    seen = (seen - seen.min() + 0.15 * MM).astype(np.float32)
+    approach = [(np.array([0.0, 0.0, 1.0]), 0.1)]
+    localizer = Localizer.prepare(
+        _plate(height, pitch), sensor=sensor, approach=approach, max_poses=400_000, cache_dir=cache_dir
+    )
+    posterior = localizer.localize(seen, "height")
+    true = np.diag([1.0, -1.0, -1.0, 1.0])
+    true[0, 3] = ((w - columns.start - columns.stop) / 2) * pitch[0]
+    true[1, 3] = ((rows.start + rows.stop - h) / 2) * pitch[1]
+    true[2, 3] = localizer.space.caster.depths(sensor, true[None]).max() - seen.max()
+    out = []
+    for mode in posterior.modes(modes):
+        off = mode.T @ inverse(true)
+        along = np.abs(mode.observable[:, 4]) if len(mode.observable) else np.zeros(1)
+        x, y, z = (mode.T[:3, 3] - true[:3, 3]) / MM
+        turn, tilt = np.arctan2(off[1, 0], off[0, 0]), np.arccos(np.clip(off[2, 2], -1, 1))
+        out.append(
+            Groove(
+                mode.probability, x, y, z, np.degrees(turn), np.degrees(tilt), len(mode.observable), float(along.max())
+            )
+        )
+    return float(posterior.log_density(true)), out
+
+
+def read_scan(path: Path) -> tuple[Any, tuple[float, float]]:
+    """Heights (H, W) [m] and the pitch along x and y [m] of a TrueMap file, version 2."""
+    data = path.read_bytes()
+    start = data.index(b"\0", 32) + 1
+    columns, rows = (int(n) for n in np.frombuffer(data, "<u4", 2, start))
+    length = np.frombuffer(data, "<f4", 2, start + 8) * MM
+    height = np.frombuffer(data, "<f4", rows * columns, start + 24).reshape(rows, columns) * MM
+    return height.astype(float), (float(length[0]) / columns, float(length[1]) / rows)
+
+
+def _plate(height: Any, pitch: tuple[float, float]) -> Mesh:
+    """A plate with the relief ``height`` (H, W) [m] on its upper side, x along columns, y along rows."""
+    import trimesh
+
+    every, thick = 6, 3 * MM
+    top = height[::every, ::every]
+    h, w = top.shape
+    x, y = np.meshgrid((np.arange(w) - w / 2) * pitch[0] * every, (np.arange(h) - h / 2) * pitch[1] * every)
+    vertices = np.concatenate([np.stack([x, y, z], -1).reshape(-1, 3) for z in (top, np.full_like(top, -thick))])
+    at, n = np.arange(h * w).reshape(h, w), h * w
+    a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
+    upper = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    ring = np.concatenate([at[0, :-1], at[:-1, -1], at[-1, :0:-1], at[:0:-1, 0]])
+    beside = np.roll(ring, -1)
+    wall = np.concatenate([np.stack([ring, ring + n, beside], 1), np.stack([beside, ring + n, beside + n], 1)])
+    plate = trimesh.Trimesh(vertices, np.concatenate([upper, upper[:, ::-1] + n, wall]))
+    return Mesh(plate.vertices, plate.faces, "grooved plate", "m")
+
+
+def _presses(folder: Path) -> Path:
+    return folder / "gelslam_gsmini_balls"
+
+
+def _calibrated(folder: Path, ball: float) -> Any:
+    images = sorted((_presses(folder) / f"{ball:.3f}mm").glob("*.png"))
+    return calibrated(images, ball * MM, _presses(folder) / "background.png", sensor="gelsight-mini")
+
+
+def _ball(diameter_mm: float) -> Mesh:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5 * diameter_mm * MM)
+    return Mesh(ball.vertices, ball.faces, f"ball of {diameter_mm:.3f} mm", "m")
+
+
+def circles_of(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV of circles, comments left out."""
+    lines = [line for line in path.read_text("utf-8").splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(lines))

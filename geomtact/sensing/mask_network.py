@@ -1,0 +1,86 @@
+"""The network that tells the contact from a change of colour: a small U-Net, trained on simulated readings alone."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import ArrayLike, NDArray
+from safetensors.torch import load_file
+from torch import nn
+
+WEIGHTS = Path(__file__).with_name("mask_network.safetensors")
+WIDTHS = (8, 16, 32, 48)  # channels, at each halving
+_SIDE = 60  # px of the shorter side of what it sees
+_STEP = 8  # px that sides are multiples of
+
+Image = NDArray[np.float32]
+
+
+class MaskNetwork(nn.Module):
+    """Log odds of contact at each pixel."""
+
+    def __init__(self, widths: tuple[int, ...] = WIDTHS):
+        super().__init__()
+        self.down = nn.ModuleList([_block(a, b) for a, b in zip((3, *widths), widths, strict=False)])
+        pairs = list(zip(widths, widths[1:], strict=False))
+        self.up = nn.ModuleList([_block(a + b, a) for a, b in reversed(pairs)])
+        self.out = nn.Conv2d(widths[0], 1, 1)
+
+    def forward(self, change: torch.Tensor) -> torch.Tensor:
+        """Log odds (n, h, w) of ``change`` (n, 3, h, w), in shares of the strongest."""
+        h, w = change.shape[-2:]
+        seen, x = [], F.pad(change, (0, -w % _STEP, 0, -h % _STEP))
+        for i, block in enumerate(self.down):
+            x = block(F.avg_pool2d(x, 2) if i else x)
+            seen.append(x)
+        for block, beside in zip(self.up, reversed(seen[:-1]), strict=True):
+            x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), beside], 1))
+        out: torch.Tensor = self.out(x)[:, 0, :h, :w]
+        return out
+
+
+def contact_probability(change: ArrayLike) -> Image:
+    """Probability (H, W) of contact at each pixel, of a ``change`` of colour (H, W, 3) from the background, RGB."""
+    change = np.asarray(change, np.float32)
+    with torch.inference_mode():
+        log_odds = _network()(torch.from_numpy(seen_change(change))[None])[0].numpy()
+    full = cv2.resize(log_odds, change.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+    return np.asarray(1 / (1 + np.exp(-full)), np.float32)
+
+
+def seen_change(change: ArrayLike) -> Image:
+    """What the network sees (3, h, w) of a change of colour (H, W, 3): smaller, in shares of what hardly any pixel exceeds."""
+    small = to_side(np.asarray(change, np.float32))
+    strongest = float(np.quantile(np.linalg.norm(small, axis=-1), 0.98))
+    return np.ascontiguousarray((small / max(strongest, 1e-6)).transpose(2, 0, 1))
+
+
+def to_side(image: Image) -> Image:
+    """``image`` (H, W, ...) as small as the network sees it: the mean of what falls into each pixel."""
+    h, w = side_shape(image.shape)
+    return np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA))
+
+
+def side_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """How many pixels (h, w) the network sees of an image of ``shape`` (H, W, ...)."""
+    scale = _SIDE / min(shape[:2])
+    return round(shape[0] * scale), round(shape[1] * scale)
+
+
+@lru_cache(maxsize=1)
+def _network() -> MaskNetwork:
+    network = MaskNetwork()
+    network.load_state_dict({name: value.float() for name, value in load_file(WEIGHTS).items()})
+    return network.eval()
+
+
+def _block(before: int, after: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for a, b in ((before, after), (after, after)):
+        layers += [nn.Conv2d(a, b, 3, padding=1), nn.GroupNorm(4, b), nn.SiLU()]
+    return nn.Sequential(*layers)

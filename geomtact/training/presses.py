@@ -1,0 +1,136 @@
+"""What the mask network learns from: random parts pressed into gels of any thickness, with the contact known."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from geomtact.files import write_whole
+from geomtact.geometry.mesh import Mesh
+from geomtact.progress import Progress
+from geomtact.se3 import transform
+from geomtact.sensing.cast import Caster
+from geomtact.sensing.elastic import elastic_contact
+from geomtact.sensing.mask_network import side_shape, to_side
+from geomtact.sensing.sensor import Sensor
+from geomtact.training.numbered import write_all
+from geomtact.training.parts import random_part
+from geomtact.training.readings import random_change
+
+SHAPE = (120, 160)  # of what the camera shows
+READINGS = 2  # of each press
+PITCH = 0.125e-3  # m
+PRESSES = 12  # of each part
+SIZES = (0.3, 2.5)  # longest side of a part, in long sides of the window
+BALLS, RADII = 0.25, (1.5e-3, 8e-3)  # share of balls among the parts, and their radius [m]
+FLAT, TILT = 0.35, 0.05  # share of presses that lie on a face, and by how much that is tilted [rad]
+DEPTHS = (0.15e-3, 2.5e-3)  # m
+THICKNESS = (1.5e-3, 30e-3)  # of the gel [m]
+_AROUND = 30  # px beyond what is shown, in which a part goes on
+_TRIES = 6
+_LEAST = 60  # px of contact
+
+
+@dataclass(frozen=True)
+class Presses:
+    """Presses of one part.
+
+    Attributes
+    ----------
+    change : (n, ``READINGS``, 3, h, w) float16, of colour, in readings under different lamps; in shares of the strongest
+    contact : (n, h, w) float16, share of each pixel in contact
+    """
+
+    change: NDArray[np.float16]
+    contact: NDArray[np.float16]
+
+
+def make_presses(
+    folder: Path, n: int, seed: int, progress: Progress | None = None, processes: int = 2
+) -> list[Presses]:
+    """Of ``n`` parts, in order; those that ``folder`` holds already are read."""
+    write_all(
+        folder,
+        n,
+        partial(_write, seed=seed),
+        lambda path: _read(path) is not None,
+        "pressing parts",
+        progress,
+        processes,
+    )
+    found = (_read(folder / f"{i}.npz") for i in range(n))
+    return [presses for presses in found if presses is not None and len(presses.change)]
+
+
+def press_part(i: int, seed: int) -> Presses:
+    """Presses of the part number ``i``: turned any way, anywhere in the window, log-uniform in depth and in the gel's
+    thickness."""
+    rng = np.random.default_rng([seed, 31, i])
+    h, w = (n + 2 * _AROUND for n in SHAPE)
+    sensor = Sensor(f"{w} x {h}", (w, h), (PITCH, PITCH), 0.0, DEPTHS[1])
+    part = _part(rng, w * PITCH)
+    caster = Caster(part.vertices, part.faces, threads=1)
+    changes: list[list[NDArray[np.float32]]] = []
+    contacts: list[NDArray[np.float32]] = []
+    for _ in range(_TRIES * PRESSES):
+        if len(changes) == PRESSES:
+            break
+        at = rng.uniform(-0.5, 0.5, 2) * PITCH * SHAPE[::-1]
+        T = transform(_turned(part, rng), [*at, w * PITCH * SIZES[1]])
+        depth = caster.depths(sensor, T[None], (h, w))[0]
+        deepest = float(depth.max())
+        if not np.isfinite(deepest):
+            continue
+        depth = depth - deepest + np.exp(rng.uniform(*np.log(DEPTHS)))
+        contact, height = elastic_contact(depth, (PITCH, PITCH), float(np.exp(rng.uniform(*np.log(THICKNESS)))))
+        shown = np.s_[_AROUND:-_AROUND, _AROUND:-_AROUND]
+        if contact[shown].sum() >= _LEAST:
+            changes.append([random_change(height[shown] / PITCH, rng) for _ in range(READINGS)])
+            contacts.append(to_side(contact[shown].astype(np.float32)))
+    h, w = side_shape(SHAPE)
+    return Presses(
+        np.reshape(changes, (len(changes), READINGS, 3, h, w)).astype(np.float16),
+        np.reshape(contacts, (len(changes), h, w)).astype(np.float16),
+    )
+
+
+def _turned(part: Mesh, rng: np.random.Generator) -> NDArray[np.float64]:
+    """A rotation (3, 3): any, or with a face of the part nearly flat on the membrane."""
+    any_way = Rotation.random(random_state=int(rng.integers(1 << 31)))
+    if rng.random() > FLAT:
+        return any_way.as_matrix()
+    a, b, c = np.asarray(part.vertices, float)[np.asarray(part.faces).T]
+    normals = np.cross(b - a, c - a)
+    area = np.linalg.norm(normals, axis=1)
+    normal = any_way.apply(normals[rng.choice(len(area), p=area / area.sum())])
+    flat = Rotation.align_vectors([[0.0, 0.0, -1.0]], [normal])[0]
+    tilt = Rotation.from_rotvec([*(rng.normal(size=2) * TILT), rng.uniform(0, 2 * np.pi)])
+    return (tilt * flat * any_way).as_matrix()
+
+
+def _part(rng: np.random.Generator, window: float) -> Mesh:
+    """A ball, or a random part, of a size that suits a window so long [m]."""
+    if rng.random() < BALLS:
+        ball = trimesh.creation.icosphere(subdivisions=5, radius=np.exp(rng.uniform(*np.log(RADII))))
+        return Mesh(ball.vertices, ball.faces, "ball", "m")
+    return random_part(int(rng.integers(1 << 31)), window * float(np.exp(rng.uniform(*np.log(SIZES)))))
+
+
+def _write(path: Path, i: int, seed: int) -> None:
+    presses = press_part(i, seed)
+    write_whole(path, lambda temporary: np.savez_compressed(temporary, allow_pickle=False, **asdict(presses)))
+
+
+def _read(path: Path) -> Presses | None:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return Presses(data["change"], data["contact"])
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None

@@ -1,0 +1,138 @@
+"""Trains the network that tells the contact from a change of colour, by cross entropy: its outputs are probabilities."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+
+from geomtact.errors import GeomtactError, InputError
+from geomtact.files import write_whole
+from geomtact.progress import Progress
+from geomtact.sensing.mask_network import MaskNetwork
+from geomtact.training import presses as made
+from geomtact.training.presses import Presses
+from geomtact.training.state import not_a_number, resume, save_state
+from geomtact.versions import versions
+
+SCHEMA = "geomtact/mask-network/1"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run depends on, beside its presses."""
+
+    steps: int = 6000
+    batch: int = 24
+    rate: float = 3e-3
+    weight_decay: float = 1e-4
+    validation: int = 40  # parts that are never trained on
+    seed: int = 0
+
+
+def train_mask(
+    parts: Sequence[Presses], settings: Settings, folder: Path, progress: Progress | None = None, check_every: int = 500
+) -> tuple[MaskNetwork, dict[str, list[float]]]:
+    """Train on all ``parts`` but the last ``settings.validation``; a stopped run goes on from ``folder``.
+
+    Returns the network and its curve: cross entropy over the steps, and overlap (IoU) with the contact on parts never seen.
+
+    Raises
+    ------
+    InputError
+        Too few parts.
+    GeomtactError
+        The loss is not a number any more; the last good state stays in ``folder``.
+    """
+    if len(parts) <= settings.validation:
+        raise InputError(f"training: expected more than {settings.validation} parts, got {len(parts)}")
+    (change, contact), judged = (_tensors(p) for p in (parts[: -settings.validation], parts[-settings.validation :]))
+    torch.manual_seed(settings.seed)
+    network = MaskNetwork()
+    optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay)
+    first, curve = resume(folder, network, optimizer, asdict(settings))
+    curve = curve or {"step": [], "training": [], "validation": []}
+    losses: list[float] = []
+    for step in range(first, settings.steps):
+        # every step has a seed of its own, so that a resumed run draws what an uninterrupted one does
+        rng = np.random.default_rng([settings.seed, step])
+        for group in optimizer.param_groups:
+            group["lr"] = (
+                settings.rate * min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / settings.steps))
+            )
+        some = rng.integers(len(change), size=settings.batch)
+        which = rng.integers(change.shape[1], size=settings.batch)
+        x, y = _varied(change[some, which].float(), contact[some].float(), rng)
+        network.train()
+        optimizer.zero_grad()
+        loss = F.binary_cross_entropy_with_logits(network(x), y)
+        loss.backward()
+        losses.append(float(loss.detach()))
+        if not math.isfinite(float(torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0))):
+            raise GeomtactError(not_a_number(folder, step))
+        optimizer.step()
+        if (step + 1) % check_every == 0 or step + 1 == settings.steps:
+            curve["step"].append(step + 1)
+            curve["training"].append(float(np.mean(losses)))
+            curve["validation"].append(validate(network, *judged))
+            losses = []
+            save_state(folder, network, optimizer, asdict(settings), step + 1, curve)
+        if progress:
+            known = f", IoU {curve['validation'][-1]:.2f} on unseen parts" if curve["validation"] else ""
+            progress((step + 1) / settings.steps, f"training the mask network{known}")
+    return network.eval(), curve
+
+
+def validate(network: MaskNetwork, change: torch.Tensor, contact: torch.Tensor) -> float:
+    """Median IoU of what is likelier in contact than not with what is, over the first reading of each press."""
+    network.eval()
+    with torch.inference_mode():
+        said = torch.cat([network(change[i : i + 64, 0].float()) > 0 for i in range(0, len(change), 64)])
+    true = contact > 0.5
+    either = (said | true).sum((1, 2)).clamp(min=1)
+    return float(((said & true).sum((1, 2)) / either).median())
+
+
+def write_mask_network(
+    path: Path, network: MaskNetwork, curve: dict[str, list[float]], settings: Settings, presses: int
+) -> None:
+    """Write ``path`` (safetensors, half precision) and beside it the card (.json)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    weights = {name: value.half().contiguous() for name, value in network.state_dict().items()}
+    write_whole(path, lambda temporary: save_file(weights, temporary))
+    ranges = ("SHAPE", "PITCH", "READINGS", "SIZES", "BALLS", "RADII", "FLAT", "TILT", "DEPTHS", "THICKNESS")
+    card = {
+        "schema": SCHEMA,
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "bytes": path.stat().st_size,
+        "data": {"presses": presses} | {name.lower(): getattr(made, name) for name in ranges},
+        "settings": asdict(settings),
+        "curve": curve,
+        "versions": versions("kornia", "manifold3d"),
+    }
+    path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", "utf-8")
+
+
+def _tensors(parts: Sequence[Presses]) -> tuple[torch.Tensor, torch.Tensor]:
+    """All changes (n, readings, 3, h, w) and contacts (n, h, w) of ``parts``."""
+    change, contact = (np.concatenate([getattr(p, name) for p in parts]) for name in ("change", "contact"))
+    return torch.from_numpy(change), torch.from_numpy(contact)
+
+
+def _varied(change: torch.Tensor, contact: torch.Tensor, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mirrored and turned by quarters, the colours exchanged or their signs: all of it is another gel with other lamps."""
+    for axis in (-1, -2):
+        if rng.random() < 0.5:
+            change, contact = change.flip(axis), contact.flip(axis)
+    if rng.random() < 0.5:
+        change, contact = change.transpose(-1, -2), contact.transpose(-1, -2)
+    order = torch.from_numpy(rng.permutation(3))
+    strength = torch.from_numpy(rng.uniform(0.7, 1.4, (len(change), 1, 1, 1)) * rng.choice([-1, 1])).float()
+    return change[:, order] * strength, contact

@@ -1,0 +1,179 @@
+"""Heights: what counts as contact, how likely poses are, and which part it is."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from geomtact import Localizer, Mesh, Sensor, contact_mask
+from geomtact.cli import app
+from geomtact.contact_space.touch import felt_height, felt_mask
+from geomtact.evaluation.readings import BALLS, calibrations, circles_of, localize_balls, read_scan
+from geomtact.scoring.fitted import _deeper
+from geomtact.scoring.likelihood import height_log_likelihood
+from geomtact.se3 import transform
+from geomtact.sensing.contact import Contact
+from geomtact.sensing.elastic import elastic_contact
+from geomtact.sensing.image_file import read_image
+from geomtact.sensing.reading import read_observation
+from geomtact.sensing.render import Lamps, example_reading, render
+from geomtact.sensing.sensor import HEIGHT_NOISE
+
+CIRCLES = Path(__file__).with_name("circles_gelslam_gsmini.csv")
+MM = 1e-3
+SENSOR = Sensor("small", (160, 120), (0.1 * MM, 0.1 * MM), 0.0, 2 * MM, height_noise=0.03 * MM)
+BALL = 4 * MM  # radius
+
+
+def under_ball(depth, centre=(0.0, 0.0), radius=BALL):
+    """How far a ball lies below the membrane (H, W) [m]: a negative number where it is above."""
+    x, y = SENSOR.pixel_centres()
+    off2 = (x[None] - centre[0]) ** 2 + (y[:, None] - centre[1]) ** 2
+    return np.where(off2 < radius**2, depth - radius + np.sqrt(np.maximum(radius**2 - off2, 0)), -np.inf)
+
+
+@pytest.fixture(scope="module")
+def balls(tmp_path_factory):
+    """The ball, and one half as large again."""
+    cache, out = tmp_path_factory.mktemp("cache"), []
+    for radius in (BALL, 1.5 * BALL):
+        mesh = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+        part = Mesh(mesh.vertices, mesh.faces, f"ball {radius / MM:g}", "m")
+        out.append(Localizer.prepare(part, sensor=SENSOR, max_poses=15_000, cache_dir=cache))
+    return out
+
+
+def test_a_rigid_gel_is_touched_where_it_is_pressed_in():
+    height = np.maximum(under_ball(0.8 * MM), 0).astype(np.float32)
+    assert np.array_equal(Contact.of_height(height).mask, height > 0)
+    plate = np.full_like(height, 0.6 * MM)  # it fills the window
+    plate[:, 60:80] = 0.2 * MM  # but for a groove
+    assert Contact.of_height(plate).mask.all()
+    nothing = Contact.of_height(np.zeros_like(height))
+    assert not nothing.mask.any()
+
+
+def test_beside_an_elastic_contact_the_gel_sinks_and_is_not_touched():
+    touched, height = elastic_contact(under_ball(0.8 * MM), SENSOR.pixel_pitch)
+    found = Contact.of_height(np.where(height > 0.02 * MM, height, 0))
+    assert (height > 0.02 * MM).sum() > 3 * touched.sum()
+    assert (found.mask & touched).sum() / (found.mask | touched).sum() > 0.9
+    assert np.array_equal(found.deep, found.mask)
+
+
+def test_of_all_penetrations_the_true_one_is_likeliest_on_any_gel():
+    depths = 0.05 * MM * np.arange(1, 31)
+    cast = np.stack([under_ball(d) for d in depths])
+    for height in (np.maximum(under_ball(0.8 * MM), 0), elastic_contact(under_ball(0.8 * MM), SENSOR.pixel_pitch)[1]):
+        contact = Contact.of_height(height.astype(np.float32))
+        likely = height_log_likelihood(cast, height, contact.deep, SENSOR.pixel_area(height.shape), 0.02 * MM)
+        assert depths[likely.argmax()] == pytest.approx(0.8 * MM, abs=0.03 * MM)
+
+
+def test_gel_that_is_not_touched_speaks_against_what_would_be_in_it_alone():
+    height, touched = np.zeros((4, 4)), np.zeros((4, 4), bool)
+    above, below = np.full((1, 4, 4), -1 * MM), np.full((1, 4, 4), 1 * MM)
+    free, in_it = (height_log_likelihood(d, height, touched, 1e-6, 0.1 * MM)[0] for d in (above, below))
+    assert free == 0 and in_it < -4
+    height[0] = np.nan
+    assert height_log_likelihood(below, height, touched, 1e-6, 0.1 * MM)[0] == pytest.approx(in_it * 3 / 4)
+
+
+def test_the_sinking_of_a_thin_gel_dies_away_sooner():
+    far, areas = [], []
+    for thickness in (np.inf, 5 * MM, 2 * MM):
+        touched, height = elastic_contact(under_ball(0.8 * MM), SENSOR.pixel_pitch, thickness)
+        far.append(float(height[60, 80 + 45]))
+        areas.append(int(touched.sum()))
+        assert height[touched] == pytest.approx(under_ball(0.8 * MM)[touched], abs=2e-3 * 0.8 * MM)
+    assert far == sorted(far, reverse=True) and far[0] > 2 * far[-1]
+    assert areas == sorted(areas)
+
+
+def test_scores_of_a_contour_line_belong_to_deeper_poses(balls):
+    ball = balls[0]
+    score = np.arange(ball.index.height.size, dtype=np.float32).reshape(ball.index.height.shape)
+    step = ball.sensor.max_penetration / len(score)
+    deeper = _deeper(score, ball.index, 2.2 * step)
+    assert np.array_equal(deeper[2:], score[:-2]) and (deeper[:2] == score.min()).all()
+    assert _deeper(score, ball.index, 0.4 * step) is score
+
+
+@pytest.mark.parametrize("elastic", [False, True])
+def test_heights_tell_how_deep_a_ball_lies_and_how_large_it_is(balls, elastic):
+    ball, other = balls
+    T = transform(np.eye(3), [1 * MM, -0.7 * MM, BALL - 0.7 * MM])
+    height = felt_height(ball.space, T) if elastic else ball.simulate(T).height
+    posterior = ball.localize(height.astype(np.float32))
+    assert posterior.observation.kind == "height"
+    mode = posterior.modes(1)[0]
+    assert mode.T[:3, 3] == pytest.approx(T[:3, 3], abs=0.06 * MM)
+    assert posterior.log_evidence > other.localize(height.astype(np.float32)).log_evidence + 1
+    masks = [each.localize(felt_mask(ball.space, T, elastic)).log_evidence for each in (ball, other)]
+    assert abs(masks[0] - masks[1]) < 1  # a mask hardly tells
+
+
+def test_a_gel_at_rest_shows_its_background_and_slopes_that_face_a_lamp_are_brighter(rng):
+    background = rng.uniform(0.3, 0.6, (120, 160, 3))
+    assert render(np.zeros((120, 160)), SENSOR.pixel_pitch, background, Lamps.around()) == pytest.approx(background)
+    # the red lamp stands where rows grow to: it lights what faces it, the near side of a dent not
+    height = np.maximum(under_ball(0.8 * MM), 0)
+    change = render(height, SENSOR.pixel_pitch, background, Lamps.around()) - background
+    assert change[40:55, 75:85, 0].mean() < -0.02 < 0.02 < change[65:80, 75:85, 0].mean()
+
+
+def test_a_rendered_reading_gives_its_contact_back(rng):
+    touched, height = elastic_contact(under_ball(0.9 * MM, (1.5 * MM, 0.5 * MM)), SENSOR.pixel_pitch)
+    reading, background = (
+        example_reading(h, SENSOR.pixel_pitch, 1 / 255, rng) for h in (height, np.zeros_like(height))
+    )
+    for method in ("classical", "learned"):
+        found = contact_mask(reading, background, SENSOR, method)
+        offset = np.argwhere(found).mean(0) - np.argwhere(touched).mean(0)
+        assert np.hypot(*offset) < 2 and 0.7 < found.sum() / touched.sum() < 2
+        assert not contact_mask(background, background, SENSOR, method).any()
+
+
+def test_simulated_readings_are_localized_as_they_come(tmp_path):
+    run = CliRunner().invoke(
+        app, ["simulate", "hex_nut", "--sensor", "gelsight-mini", "--reading", "--n", "1", "--out", str(tmp_path)]
+    )
+    assert run.exit_code == 0, run.output
+    image, background = (read_image(tmp_path / name) for name in ("hex_nut_1.png", "background.png"))
+    assert image.shape == background.shape == (240, 320, 3)
+    assert read_observation(image, "gelsight-mini", background=background).contact.mask.any()
+
+
+def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp_path):
+    """Every fourth press that lies wholly in the window; the calibration saw presses of the other ball alone."""
+    folder = data_folder / "gelslam_gsmini_balls"
+    sensors = calibrations(data_folder)
+    assert all(0.01 * MM < sensor.height_noise < 0.05 * MM for sensor in sensors.values())
+    observation = read_observation(
+        folder / "9.500mm" / "10.png", sensors[BALLS[0]], background=folder / "background.png"
+    )
+    assert observation.contact.height.max() == pytest.approx(0.8 * MM, abs=0.1 * MM)
+    lines = CIRCLES.read_text("utf-8").splitlines()
+    inside = [row["file"] for row in circles_of(CIRCLES) if row["inside"] == "1"][::4]
+    some = tmp_path / "some.csv"
+    some.write_text("\n".join(line for line in lines if line.startswith("file") or line.split(",")[0] in inside))
+    pressed = list(localize_balls(data_folder, some, sensors, tmp_path))
+    assert len(pressed) == 8
+    assert np.mean([p.nats > 0 for p in pressed]) >= 0.75
+    assert np.median([p.off_mm for p in pressed]) < 0.3
+
+
+def test_the_height_noise_of_a_sensor_is_kept(tmp_path):
+    mine = replace(SENSOR, height_noise=0.02 * MM)
+    assert Sensor.from_toml(mine.to_toml()).height_noise == pytest.approx(0.02 * MM)
+    usual = replace(SENSOR, height_noise=HEIGHT_NOISE)
+    assert "height_noise" not in usual.to_toml() and mine.sha256 == usual.sha256
+
+
+def test_a_scan_is_read_with_its_pitch(data_folder):
+    height, pitch = read_scan(data_folder / "gelsight_groove_scan" / "heightmap.tmd")
+    assert height.shape == (514, 616) and pitch == pytest.approx((0.02746 * MM, 0.02746 * MM), rel=1e-3)
+    assert 0.3 * MM < np.ptp(height) < 0.5 * MM
