@@ -18,6 +18,7 @@ from geomtact.se3 import transform
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.elastic import elastic_contact
 from geomtact.sensing.image_file import read_image
+from geomtact.sensing.local_shape import METHODS
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.render import Lamps, example_reading, render
 from geomtact.sensing.sensor import HEIGHT_NOISE
@@ -130,7 +131,7 @@ def test_a_rendered_reading_gives_its_contact_back(rng):
     reading, background = (
         example_reading(h, SENSOR.pixel_pitch, 1 / 255, rng) for h in (height, np.zeros_like(height))
     )
-    for method in ("classical", "learned"):
+    for method in METHODS:
         found = contact_mask(reading, background, SENSOR, method)
         offset = np.argwhere(found).mean(0) - np.argwhere(touched).mean(0)
         assert np.hypot(*offset) < 2 and 0.7 < found.sum() / touched.sum() < 2

@@ -2,7 +2,8 @@
 
 The difference from the background is taken as a linear image of the gel's slope. Its two strongest colour directions
 span the slope; the 2x2 map that is left unknown is the one that makes the slope field a gradient (free of curl). Its
-integral is the gel's indentation up to a factor; the rim of the contact is where, on the way up, the gel is steepest.
+integral is the gel's indentation up to a factor; the rim of the contact is where, on the way up, the gel is steepest. Or
+the pressure that bends an elastic gel so is worked out, and the contact is where there is any. A network does without.
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ from geomtact.sensing.sensor import Sensor
 
 Mask = NDArray[np.bool_]
 
-METHODS = ("classical", "learned")  # the default first
+METHODS = ("classical", "pressure", "learned")  # the default first
 _GREY = 1 / 255
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
+_PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated readings of many gels and lamps
 _CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like slopes
 
 
@@ -36,8 +38,8 @@ def contact_mask(
     background : (H, W, 3) the same sensor without contact; None: a smooth one is estimated from the image itself,
         which serves for contacts much smaller than the window
     sensor : gives the pixel pitch where columns and rows differ, and the size to check; None: square pixels
-    method : "classical": from the gel's slope, up to a factor, which the colours tell where they follow it; or "learned": by a
-        network trained on simulated readings alone
+    method : "classical": within the rim where the gel is steepest, by its slope, which colours tell up to a factor; "pressure":
+        where, by that slope, a thick elastic gel is pressed on; or "learned": by a network trained on simulated readings alone
 
     Returns
     -------
@@ -62,20 +64,32 @@ def contact_mask(
             change, felt, strong, _ = _change(image, reference, sigma)
     if not felt.any():
         return felt
-    height, mask = _by_network(change, felt) if method == "learned" else _by_slope(change, felt, sigma, pitch)
+    if method == "learned":
+        height, mask = _by_network(change, felt)
+    else:
+        height, mask = _by_slope(change, felt, strong, sigma, pitch, method == "pressure")
     return _components(mask, height, strong, sigma)
 
 
-def _by_slope(change: Array, felt: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
-    """The gel's indentation (H, W) up to a factor, and the contact: within the rim where it is steepest."""
+def _by_slope(
+    change: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array, by_pressure: bool
+) -> tuple[Array, Mask]:
+    """The gel's indentation (H, W), or the pressure on it, up to a factor, and the contact."""
     from scipy import ndimage
 
     slope = _slope_field(change, felt, sigma, pitch)
     if slope is None:
         height = np.linalg.norm(change, axis=-1) * felt
         return height, ndimage.binary_fill_holes(height > 0.5 * np.quantile(height[felt], 0.95))
-    height = _indentation(integrate(slope, pitch), felt)
-    return height, _inside_rim(height, slope, felt, sigma)
+    height = integrate(slope, pitch)
+    way = _inwards(height, felt)
+    if not by_pressure:
+        height = _indentation(way * height, felt)
+        return height, _inside_rim(height, slope, felt, sigma)
+    pressed = way * _pressure(slope, pitch)
+    mask = (pressed > _PRESSED * np.quantile(pressed[strong], 0.98)) & felt
+    mask = ndimage.binary_opening(ndimage.binary_fill_holes(mask), iterations=max(1, round(sigma)))
+    return np.maximum(pressed, 0) * felt, mask
 
 
 def _by_network(change: Array, felt: Mask) -> tuple[Array, Mask]:
@@ -219,6 +233,21 @@ def _slope_field(change: Array, felt: Mask, sigma: float, pitch: Array) -> Array
 
 def integrate(slope: Array, pitch: Array) -> Array:
     """The height (H, W) whose gradient is nearest to ``slope``, mirrored at the border (Frankot, Chellappa 1988)."""
+    return _of_gradient(slope, pitch, 2)
+
+
+def _pressure(slope: Array, pitch: Array) -> Array:
+    """The pressure (H, W), up to a factor, that gives an elastic half-space this ``slope`` (H, W, 2).
+
+    A wave of pressure of number k sinks in by 1/k of it (Johnson 1985, 13.2), so pressure is k times the height: the Riesz
+    transform of the gradient, as noisy as that and no more.
+    """
+    return _of_gradient(slope, pitch, 1)
+
+
+def _of_gradient(slope: Array, pitch: Array, power: int) -> Array:
+    """The field (H, W) whose waves are those of ``slope`` along their direction, over their number to the ``power`` less one;
+    mirrored at the border."""
     from scipy import fft
 
     h, w = slope.shape[:2]
@@ -227,24 +256,27 @@ def integrate(slope: Array, pitch: Array) -> Array:
     gy = np.block([[gy, gy[:, ::-1]], [-gy[::-1], -gy[::-1, ::-1]]])
     kx = 2 * np.pi * fft.fftfreq(2 * w)[None, :] / pitch[0]
     ky = 2 * np.pi * fft.fftfreq(2 * h)[:, None] / pitch[1]
-    k2 = kx**2 + ky**2
-    k2[0, 0] = 1.0
-    return fft.ifft2(-1j * (kx * fft.fft2(gx) + ky * fft.fft2(gy)) / k2).real[:h, :w]
+    k = np.hypot(kx, ky)
+    k[0, 0] = 1.0
+    return fft.ifft2(-1j * (kx * fft.fft2(gx) + ky * fft.fft2(gy)) / k**power).real[:h, :w]
 
 
-def _indentation(height: Array, felt: Mask) -> Array:
-    """``height`` (H, W) with its sign and zero set: the gel rests where nothing is felt, pressed in elsewhere."""
+def _inwards(height: Array, felt: Mask) -> float:
+    """1 where the gel is pressed in towards larger ``height`` (H, W), else -1."""
     from scipy import ndimage
 
-    unfelt = float((~felt).mean())
-    if unfelt > 0.15:
+    if (~felt).mean() > 0.15:
         depth = ndimage.distance_transform_edt(felt)[felt]
         inward = ((height[felt] - height[felt].mean()) * depth).sum()
     else:
         # a contact that fills the window: the dome's difference from the object is curved downwards over most of it
         inward = -np.median(ndimage.laplace(height)[felt])
-    if inward < 0:
-        height = -height
+    return -1.0 if inward < 0 else 1.0
+
+
+def _indentation(height: Array, felt: Mask) -> Array:
+    """``height`` (H, W) with its zero set: the gel rests where nothing is felt, pressed in elsewhere."""
+    unfelt = float((~felt).mean())
     rest = np.median(height[~felt]) if unfelt > 0.05 else np.quantile(height, 0.02)
     return np.maximum(height - rest, 0) * felt
 

@@ -1,0 +1,163 @@
+"""The network that finds contacts: what it learns from, that a run repeats, and how imprints drawn by hand judge it."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from geomtact import InputError, UsageError, contact_mask
+from geomtact.cli import app
+from geomtact.evaluation.readings import (
+    Imprint,
+    find,
+    imprints,
+    largest_difference,
+    methods,
+    off_centre,
+    overlap,
+    summarise_contacts,
+)
+from geomtact.sensing.mask_network import WEIGHTS, MaskNetwork, contact_probability, seen_change
+from geomtact.training.presses import PRESSES, READINGS, make_presses, press_part
+from geomtact.training.train_mask import Settings, train_mask, validate, write_mask_network
+
+
+def disk(x, y, r, shape=(120, 160)):
+    v, u = np.indices(shape)
+    return np.hypot(u - x, v - y) <= r
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return [press_part(i, 7) for i in range(3)]
+
+
+def test_a_press_shows_colour_around_its_contact(parts):
+    again = press_part(0, 7)
+    assert np.array_equal(again.change, parts[0].change) and np.array_equal(again.contact, parts[0].contact)
+    for part in parts:
+        assert part.change.shape == (PRESSES, READINGS, 3, 60, 80) and part.contact.shape == (PRESSES, 60, 80)
+        assert part.contact.min() >= 0 and part.contact.max() <= 1 and (part.contact.max((1, 2)) > 0.5).all()
+        # the gel is flat under a flat face: colours show at the contact's border
+        touched = (part.contact > 0.5).astype(np.uint8)
+        rim, far = (np.stack([cv2.dilate(each, np.ones((n, n))) for each in touched]) > 0 for n in (5, 25))
+        rim &= ~np.stack([cv2.erode(each, np.ones((5, 5))) for each in touched]).astype(bool)
+        size = np.linalg.norm(part.change.astype(float), axis=2)
+        for reading in range(READINGS):
+            assert size[:, reading][rim].mean() > 2 * size[:, reading][~far].mean()
+
+
+def test_presses_are_made_once(tmp_path, monkeypatch):
+    first = make_presses(tmp_path, 1, 7, processes=1)
+    made = (tmp_path / "0.npz").stat().st_mtime_ns
+    second = make_presses(tmp_path, 1, 7, processes=1)
+    assert np.array_equal(first[0].change, second[0].change) and (tmp_path / "0.npz").stat().st_mtime_ns == made
+
+
+def test_a_stopped_run_goes_on_to_the_same_weights(parts, tmp_path):
+    settings = Settings(steps=6, batch=4, validation=1)
+    whole, curve = train_mask(parts, settings, tmp_path / "whole", check_every=3)
+
+    class StopError(Exception):
+        pass
+
+    def stop(share, _):
+        if share > 0.6:
+            raise StopError
+
+    with pytest.raises(StopError):
+        train_mask(parts, settings, tmp_path / "stopped", stop, check_every=3)
+    resumed, same = train_mask(parts, settings, tmp_path / "stopped", check_every=3)
+    assert same == curve and curve["step"] == [3, 6]
+    for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(a, b)
+    with pytest.raises(InputError, match="expected more than 3 parts, got 3"):
+        train_mask(parts, replace(settings, validation=3), tmp_path / "few")
+
+
+def test_a_step_of_training_lowers_the_loss(parts, tmp_path):
+    _, curve = train_mask(parts, Settings(steps=30, batch=8, validation=1), tmp_path, check_every=10)
+    assert curve["training"][-1] < 0.8 * curve["training"][0]
+
+
+def test_what_is_written_says_what_it_was_made_of(tmp_path):
+    network = MaskNetwork().eval()
+    path = tmp_path / "mask.safetensors"
+    write_mask_network(path, network, {"step": []}, Settings(), 12)
+    card = path.with_suffix(".json").read_text("utf-8")
+    assert '"schema": "geomtact/mask-network/1"' in card and '"presses": 12' in card and '"kornia"' in card
+    assert path.stat().st_size < 5e6
+
+
+def test_the_network_that_comes_along_knows_presses_it_never_saw():
+    """Its own parts have other seeds; of simulated readings it is right about most of the contact."""
+    from geomtact.sensing.mask_network import _network
+
+    parts = [press_part(i, 991) for i in range(4)]
+    change, contact = (torch.from_numpy(np.concatenate([getattr(p, n) for p in parts])) for n in ("change", "contact"))
+    assert WEIGHTS.stat().st_size < 5e6
+    assert validate(_network(), change, contact) > 0.6
+
+
+@pytest.mark.parametrize("shape", [(240, 320), (320, 240), (123, 161)])
+def test_images_of_any_shape_get_a_probability_at_each_pixel(shape, rng):
+    change = rng.normal(0, 0.01, (*shape, 3))
+    probability = contact_probability(change)
+    assert probability.shape == shape and (probability >= 0).all() and (probability <= 1).all()
+    # in shares of the strongest: how bright lamps are changes nothing
+    assert contact_probability(7 * change) == pytest.approx(probability, abs=1e-4)
+    assert min(seen_change(change).shape[1:]) == 60
+
+
+def test_an_unknown_method_is_refused(rng):
+    image = rng.uniform(0, 1, (120, 160, 3))
+    with pytest.raises(UsageError, match="no method named 'classicl'.*classical"):
+        contact_mask(image, image, method="classicl")
+
+
+def test_overlap_and_centre_are_those_of_the_circle_made_smaller():
+    mask = disk(80, 60, 20)
+    assert overlap(mask, (80, 60, 20), 1.0) == 1
+    assert overlap(mask, (80, 60, 26), 1.3) == 1
+    assert overlap(mask, (80, 60, 40), 1.0) == pytest.approx(0.25, abs=0.01)
+    assert off_centre(mask, (80, 60, 20)) == pytest.approx(0, abs=1e-9)
+    assert off_centre(mask, (88, 66, 20)) == pytest.approx(10 / 160)
+    assert off_centre(np.zeros((120, 160), bool), (80, 60, 20)) == np.inf
+
+
+def test_the_factor_of_a_half_is_judged_on_the_other():
+    """Contacts of even images fill 1 / 1.3 of the imprint, of odd ones 1 / 1.5: each is judged with the other's factor."""
+    image = np.zeros((120, 160, 3), np.uint8)
+    drawn = [Imprint(f"{i}", np.full_like(image, i), image, (80.0, 60.0, 36.0)) for i in range(8)]
+    found = find(drawn, "made", lambda image, _: disk(80, 60, 36 / (1.5 if image[0, 0, 0] % 2 else 1.3)))
+    assert [f.factor for f in found[:2]] == pytest.approx([1.5, 1.3], abs=0.021)
+    figures = summarise_contacts(found)
+    assert figures["n"] == 8 and figures["iou_median"] == pytest.approx((1.3 / 1.5) ** 2, abs=0.04)
+    assert figures["iou_interval"][0] <= figures["iou_median"] <= figures["iou_interval"][1]
+
+
+def test_the_baseline_takes_the_largest_of_what_differs(rng):
+    background = rng.integers(100, 110, (120, 160, 3)).astype(np.uint8)
+    image = background.copy()
+    image[disk(50, 50, 15)] += 60
+    image[disk(130, 90, 5)] += 60
+    assert overlap(largest_difference(image, background), (50, 50, 15), 1.0) > 0.97
+
+
+def test_real_imprints_are_read_and_ours_is_nearer_than_the_baseline(data_folder):
+    sets = imprints(data_folder)
+    assert {name: len(some) for name, some in sets.items()} == {"fots": 28, "objectfolder": 32}
+    assert set(methods()) == {"classical", "pressure", "learned", "difference"}
+    some = sets["objectfolder"][::4]
+    ours, baseline = (find(some, name, methods()[name]) for name in ("classical", "difference"))
+    assert (
+        np.median([f.iou for f in ours]) > np.median([f.iou for f in baseline]) and max(f.centre for f in ours) < 0.03
+    )
+
+
+def test_a_folder_without_readings_is_refused(tmp_path):
+    run = CliRunner().invoke(app, ["evaluate", "readings", str(tmp_path)])
+    assert run.exit_code == 3 and "expected fots_balls and objectfolder_gelsight_calib in it" in run.output
