@@ -18,7 +18,7 @@ def draw_sheet(
     sets: Mapping[str, Sequence[tuple[Any, NDArray[np.bool_], Sequence[float]]]], factor: Mapping[str, float]
 ) -> bytes:
     """A PNG of all readings by set, each (image (H, W, 3), contact (H, W), circle (column, row, radius) [px]); the circle is
-    made smaller by the set's ``factor``."""
+    divided by the set's ``factor``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -32,7 +32,7 @@ def draw_sheet(
     )
     for band, (name, some) in zip(bands, sets.items(), strict=True):
         band.suptitle(
-            f"{name}: contact found (orange), circle drawn by hand and made smaller by {factor[name]:.2f} (white)",
+            f"{name}: contact found (orange), circle drawn by hand, divided by {factor[name]:.2f} (white)",
             fontsize=10,
         )
         grid = band.subplots(rows[name], _COLUMNS, squeeze=False).ravel()

@@ -247,18 +247,25 @@ def _pressure(slope: Array, pitch: Array) -> Array:
 
 def _of_gradient(slope: Array, pitch: Array, power: int) -> Array:
     """The field (H, W) whose waves are those of ``slope`` along their direction, over their number to the ``power`` less one;
-    mirrored at the border."""
+    mirrored at the border: a sum of cosines, and its slope along an axis one of sines there."""
     from scipy import fft
 
     h, w = slope.shape[:2]
-    gx, gy = slope[..., 0], slope[..., 1]
-    gx = np.block([[gx, -gx[:, ::-1]], [gx[::-1], -gx[::-1, ::-1]]])
-    gy = np.block([[gy, gy[:, ::-1]], [-gy[::-1], -gy[::-1, ::-1]]])
-    kx = 2 * np.pi * fft.fftfreq(2 * w)[None, :] / pitch[0]
-    ky = 2 * np.pi * fft.fftfreq(2 * h)[:, None] / pitch[1]
+    kx, ky = np.pi * np.arange(w) / (w * pitch[0]), np.pi * np.arange(h)[:, None] / (h * pitch[1])
+    along_x = _sines(fft.dct(slope[..., 0], axis=0, norm="ortho"), 1)
+    along_y = _sines(fft.dct(slope[..., 1], axis=1, norm="ortho"), 0)
     k = np.hypot(kx, ky)
     k[0, 0] = 1.0
-    return fft.ifft2(-1j * (kx * fft.fft2(gx) + ky * fft.fft2(gy)) / k**power).real[:h, :w]
+    return np.asarray(fft.idctn(-(kx * along_x + ky * along_y) / k**power, norm="ortho"))
+
+
+def _sines(values: Array, axis: int) -> Array:
+    """The sine transform of ``values`` along ``axis``, in the order of the cosines, of which the first has no sine."""
+    from scipy import fft
+
+    out = np.roll(fft.dst(values, axis=axis, norm="ortho"), 1, axis)
+    out[(slice(None),) * axis + (0,)] = 0
+    return np.asarray(out)
 
 
 def _inwards(height: Array, felt: Mask) -> float:
@@ -337,7 +344,8 @@ def _components(mask: Mask, height: Array, strong: Mask, sigma: float) -> Mask:
         return mask
     area = np.bincount(labels.ravel(), minlength=n + 1)
     backed = np.bincount(labels[strong], minlength=n + 1)
-    deepest = np.r_[0.0, ndimage.maximum(height, labels, range(1, n + 1))]
+    deepest = np.zeros(n + 1)
+    np.maximum.at(deepest, labels.ravel(), height.ravel())
     keep = (area > np.pi * (2 * sigma) ** 2) & (backed > 0) & (deepest > 0.3 * height.max())
     keep[0] = False
     return keep[labels]
