@@ -167,7 +167,10 @@ class Localizer:
             with _timed(touch.timing_ms, "refine"):
                 contact = touch.observation.contact
                 if contact.height is not None and how.modes:
-                    return refine_together(touch, [View(self.refinery, contact, np.eye(4))], how.modes, seed)
+                    before = None
+                    if prior is not None:
+                        before = prior_log_mass(self.index, prior, T_frame_sensor[0], frame, self.cache_dir)
+                    return refine_together(touch, [View(self.refinery, contact, np.eye(4))], how.modes, seed, before)
                 return self.refinery.refine(touch, contact, how.modes, how.thorough)
         localizers = (self, *self.others) if self.others else (self,) * len(images)
         if len(localizers) != len(images):
