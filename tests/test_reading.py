@@ -398,6 +398,19 @@ def test_other_real_gels_agree_with_their_makers_circles(data_folder):
     assert not contact_mask(background, background).any()
 
 
+def test_a_white_gel_is_touched_where_it_darkens(data_folder):
+    """One press of a ball of 4 mm radius: a contact that is round, no wider than the ball, and has no bright halo in it."""
+    folder = data_folder / "ninedtact_calib" / "sensor_1" / "depth_calibration"
+    image, background = read_image(folder / "sample.png"), read_image(folder / "ref.png")
+    mask = contact_mask(image, background, "9dtact")
+    rows, columns = np.nonzero(mask)
+    radius = np.sqrt(mask.sum() / np.pi)
+    assert agreement(mask, disk(columns.mean(), rows.mean(), radius, mask.shape))[0] > 0.95
+    assert 1.5 < radius * 0.0515 < 4.0
+    darker = (background.astype(float) - image).sum(-1)
+    assert darker[mask].min() > 0
+
+
 def test_the_real_digit_without_contact_shows_none(data_folder, rng):
     background = read_image(data_folder / "fots_balls" / "digit_bg.png")
     assert not contact_mask(background, background, "digit").any()

@@ -20,7 +20,7 @@ max_penetration_mm = 2.0
 
 
 def test_the_bundled_sensors_are_these():
-    assert bundled_sensors() == ["digit", "digit-hsp", "gelsight-mini", "gelslim"]
+    assert bundled_sensors() == ["9dtact", "digit", "digit-hsp", "gelsight-mini", "gelslim"]
 
 
 @pytest.mark.parametrize("name", bundled_sensors())

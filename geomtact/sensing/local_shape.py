@@ -24,6 +24,12 @@ _GREY = 1 / 255
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
 _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated readings of many gels and lamps
+_ONE_COLOUR = (
+    0.03  # power of the second colour over that of the first, under which there is but one: a white gel that darkens
+)
+_EITHER_WAY = (
+    0.3  # power of what gets darker over that of what gets brighter, or the other way round, from which slopes are seen
+)
 _CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like slopes
 
 
@@ -66,30 +72,53 @@ def contact_mask(
         return felt
     if method == "learned":
         height, mask = _by_network(change, felt)
+    elif (depth := _darkening(change, felt)) is not None:
+        height, mask = _half_as_large(depth, felt)
+    elif (slope := _slope_field(change, felt, sigma, pitch)) is None:
+        height, mask = _half_as_large(np.linalg.norm(change, axis=-1), felt)
+    elif method == "pressure":
+        height, mask = _by_pressure(slope, felt, strong, sigma, pitch)
     else:
-        height, mask = _by_slope(change, felt, strong, sigma, pitch, method == "pressure")
+        height, mask = _by_rim(slope, felt, sigma, pitch)
     return _components(mask, height, strong, sigma)
 
 
-def _by_slope(
-    change: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array, by_pressure: bool
-) -> tuple[Array, Mask]:
-    """The gel's indentation (H, W), or the pressure on it, up to a factor, and the contact."""
+def _by_rim(slope: Array, felt: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
+    """The gel's indentation (H, W), up to a factor, and the contact: within the rim where it is steepest."""
+    height = integrate(slope, pitch)
+    height = _indentation(_inwards(height, felt) * height, felt)
+    return height, _inside_rim(height, slope, felt, sigma)
+
+
+def _by_pressure(slope: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
+    """The pressure (H, W) on an elastic gel, up to a factor, and the contact: where there is any."""
     from scipy import ndimage
 
-    slope = _slope_field(change, felt, sigma, pitch)
-    if slope is None:
-        height = np.linalg.norm(change, axis=-1) * felt
-        return height, ndimage.binary_fill_holes(height > 0.5 * np.quantile(height[felt], 0.95))
-    height = integrate(slope, pitch)
-    way = _inwards(height, felt)
-    if not by_pressure:
-        height = _indentation(way * height, felt)
-        return height, _inside_rim(height, slope, felt, sigma)
-    pressed = way * _pressure(slope, pitch)
+    pressed = _inwards(integrate(slope, pitch), felt) * _pressure(slope, pitch)
     mask = (pressed > _PRESSED * np.quantile(pressed[strong], 0.98)) & felt
     mask = ndimage.binary_opening(ndimage.binary_fill_holes(mask), iterations=max(1, round(sigma)))
     return np.maximum(pressed, 0) * felt, mask
+
+
+def _darkening(change: Array, felt: Mask) -> Array | None:
+    """By how much (H, W) a gel of one colour changes: a white one as it does where it is pressed in most, darker or brighter; a
+    grey picture of lit slopes either way. None where a change has several colours, and so tells slopes."""
+    power, colours = _colours(change, felt)
+    if power[1] > _ONE_COLOUR * power[2]:
+        return None
+    along = change @ colours[:, 2]
+    power_up, power_down = (float((np.maximum(way * along[felt], 0) ** 2).sum()) for way in (1, -1))
+    if min(power_up, power_down) > _EITHER_WAY * max(power_up, power_down):
+        return np.abs(along)
+    return np.maximum(along if power_up > power_down else -along, 0)
+
+
+def _half_as_large(size: Array, felt: Mask) -> tuple[Array, Mask]:
+    """``size`` (H, W) where it is felt, and where it is more than half of the largest."""
+    from scipy import ndimage
+
+    size = size * felt
+    return size, ndimage.binary_fill_holes(size > 0.5 * np.quantile(size[felt], 0.95))
 
 
 def _by_network(change: Array, felt: Mask) -> tuple[Array, Mask]:
@@ -213,14 +242,18 @@ def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]
     return np.isin(labels, kept[kept > 0]), strong, float(noise)
 
 
+def _colours(change: Array, felt: Mask) -> tuple[Array, Array]:
+    """Power (3,) of the directions of colour (3, 3), in columns, that the change has where it is felt; the strongest last."""
+    values = change[felt]
+    power, colours = np.linalg.eigh(values.T @ values / len(values))
+    return power, colours
+
+
 def _slope_field(change: Array, felt: Mask, sigma: float, pitch: Array) -> Array | None:
     """The gel's slope (H, W, 2) up to a factor; None where the colours of the lights do not tell it."""
     from scipy import ndimage
 
-    values = change[felt]
-    power, colours = np.linalg.eigh(values.T @ values / len(values))
-    if power[1] < 1e-3 * power[2]:
-        return None
+    power, colours = _colours(change, felt)
     plane = change @ (colours[:, 1:] / np.sqrt(power[1:]))
     plane = np.stack([ndimage.gaussian_filter(plane[..., i], sigma) for i in (0, 1)], -1)
     along_y, along_x = np.gradient(plane, axis=0) / pitch[1], np.gradient(plane, axis=1) / pitch[0]
