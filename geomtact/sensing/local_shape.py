@@ -24,12 +24,8 @@ _GREY = 1 / 255
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
 _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated readings of many gels and lamps
-_ONE_COLOUR = (
-    0.03  # power of the second colour over that of the first, under which there is but one: a white gel that darkens
-)
-_EITHER_WAY = (
-    0.3  # power of what gets darker over that of what gets brighter, or the other way round, from which slopes are seen
-)
+_ONE_COLOUR = 0.03  # power of the second colour over that of the first, under which there is but one: a white gel's
+_EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse, from which on slopes are seen
 _CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like slopes
 
 
@@ -107,10 +103,10 @@ def _darkening(change: Array, felt: Mask) -> Array | None:
     if power[1] > _ONE_COLOUR * power[2]:
         return None
     along = change @ colours[:, 2]
-    power_up, power_down = (float((np.maximum(way * along[felt], 0) ** 2).sum()) for way in (1, -1))
-    if min(power_up, power_down) > _EITHER_WAY * max(power_up, power_down):
+    brighter, darker = (max(float(np.quantile(way * along[felt], 0.98)), 0.0) for way in (1, -1))
+    if min(brighter, darker) > _EITHER_WAY * max(brighter, darker):
         return np.abs(along)
-    return np.maximum(along if power_up > power_down else -along, 0)
+    return np.maximum(along if brighter > darker else -along, 0)
 
 
 def _half_as_large(size: Array, felt: Mask) -> tuple[Array, Mask]:
