@@ -49,7 +49,7 @@ def balls(tmp_path_factory):
 
 def test_a_rigid_gel_is_touched_where_it_is_pressed_in():
     height = np.maximum(under_ball(0.8 * MM), 0).astype(np.float32)
-    assert np.array_equal(Contact.of_height(height).mask, height > 0)
+    assert np.array_equal(Contact.of_height(height).mask, height > 0.01 * height.max())
     plate = np.full_like(height, 0.6 * MM)  # it fills the window
     plate[:, 60:80] = 0.2 * MM  # but for a groove
     assert Contact.of_height(plate).mask.all()
@@ -62,7 +62,26 @@ def test_beside_an_elastic_contact_the_gel_sinks_and_is_not_touched():
     found = Contact.of_height(np.where(height > 0.02 * MM, height, 0))
     assert (height > 0.02 * MM).sum() > 3 * touched.sum()
     assert (found.mask & touched).sum() / (found.mask | touched).sum() > 0.9
-    assert np.array_equal(found.deep, found.mask)
+    assert (touched & found.sure).sum() == found.sure.sum() > 0.5 * touched.sum()
+
+
+@pytest.mark.parametrize("radius", [1 * MM, 2 * MM, 3 * MM])
+def test_beside_a_flat_punch_hardly_anything_that_is_not_touched_counts_as_surely_touched(radius):
+    x, y = SENSOR.pixel_centres()
+    punch = np.where(np.hypot(x[None], y[:, None]) < radius, 0.6 * MM, -1 * MM)
+    touched, height = elastic_contact(punch, SENSOR.pixel_pitch)
+    found = Contact.of_height(height)
+    assert (found.sure & touched).sum() == touched.sum()
+    assert found.sure.sum() < 1.35 * touched.sum() < found.mask.sum()
+
+
+def test_sensors_of_one_kind_keep_their_own_calibration(tmp_path):
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=BALL)
+    pair = [replace(SENSOR, height_noise=n * MM) for n in (0.02, 0.2)]
+    both = Localizer.prepare(
+        Mesh(mesh.vertices, mesh.faces, "ball", "m"), sensor=pair, max_poses=5_000, cache_dir=tmp_path
+    )
+    assert [each.sensor.height_noise for each in (both, *both.others)] == pytest.approx([0.02 * MM, 0.2 * MM])
 
 
 def test_of_all_penetrations_the_true_one_is_likeliest_on_any_gel():
@@ -70,7 +89,7 @@ def test_of_all_penetrations_the_true_one_is_likeliest_on_any_gel():
     cast = np.stack([under_ball(d) for d in depths])
     for height in (np.maximum(under_ball(0.8 * MM), 0), elastic_contact(under_ball(0.8 * MM), SENSOR.pixel_pitch)[1]):
         contact = Contact.of_height(height.astype(np.float32))
-        likely = height_log_likelihood(cast, height, contact.deep, SENSOR.pixel_area(height.shape), 0.02 * MM)
+        likely = height_log_likelihood(cast, height, contact.sure, SENSOR.pixel_area(height.shape), 0.02 * MM)
         assert depths[likely.argmax()] == pytest.approx(0.8 * MM, abs=0.03 * MM)
 
 

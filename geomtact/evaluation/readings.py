@@ -328,7 +328,9 @@ def _plate(height: Any, pitch: tuple[float, float]) -> Mesh:
     every, thick = 6, 3 * MM
     top = height[::every, ::every]
     h, w = top.shape
-    x, y = np.meshgrid((np.arange(w) - w / 2) * pitch[0] * every, (np.arange(h) - h / 2) * pitch[1] * every)
+    # a pixel is where its middle is, the origin the middle of the whole scan
+    H, W = height.shape
+    x, y = np.meshgrid((np.arange(w) * every + 0.5 - W / 2) * pitch[0], (np.arange(h) * every + 0.5 - H / 2) * pitch[1])
     vertices = np.concatenate([np.stack([x, y, z], -1).reshape(-1, 3) for z in (top, np.full_like(top, -thick))])
     at, n = np.arange(h * w).reshape(h, w), h * w
     a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))

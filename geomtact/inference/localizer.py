@@ -54,6 +54,7 @@ class Effort:
     thorough: bool = True
 
 
+_HALL = 100.0  # m from the origin from which a translation is taken to be in millimetres
 _ROOM = 10.0  # m between two sensors from which translations are taken to be in millimetres
 EFFORTS = {"fast": Effort("blocks", 0), "balanced": Effort("cells", 5, thorough=False), "exact": Effort("all", 25)}
 
@@ -117,7 +118,8 @@ class Localizer:
                 each: cls.prepare(mesh, unit, each, approach, **options, progress=progress)
                 for each in dict.fromkeys(sensors)
             }
-            return replace(alone[sensors[0]], others=tuple(alone[each] for each in sensors[1:]))
+            first, *others = (_calibrated_as(alone[each], each) for each in sensors)
+            return replace(first, others=tuple(others))
         sensor = Sensor.load(sensor)
         part = load_mesh(mesh, unit, sensor=sensor)
         index = open_index(part, sensor, approach, max_poses, cache_dir, progress)
@@ -201,15 +203,16 @@ class Localizer:
         with _timed(timing, "read"):
             observation = read_observation(image, self.sensor, kind, background)
         mask, above, warnings = observation.contact.mask, 0.0, list(observation.warnings)
-        if observation.contact.height is not None and mask.any():
-            # what lies half as deep as the deepest is contact on any gel, and the object reaches below it by as much
-            mask, above = observation.contact.deep, observation.contact.half
+        if observation.contact.height is not None and observation.contact.height[mask].any():
+            # a contour line of the gel where it surely lies on the object, which reaches below it by as much
+            above = observation.contact.sure_depth
+            mask = observation.contact.deeper(above)
         common: dict[str, Any] = {
             "frame": frame,
             "T_frame_sensor": T_frame_sensor,
             "seed": seed,
             "observations": [observation],
-            "settings": settings | {"kind": observation.kind},
+            "settings": settings | {"kind": observation.kind, "heights": observation.contact.height is not None},
             "timing_ms": timing,
         }
         if not mask.any():
@@ -287,6 +290,14 @@ class Localizer:
         }
 
 
+def _calibrated_as(localizer: Localizer, sensor: Sensor) -> Localizer:
+    """``localizer`` on another sensor of the same geometry, with its own colours and noise."""
+    held = localizer.sensor
+    if (held.colour, held.height_noise) == (sensor.colour, sensor.height_noise):
+        return localizer
+    return replace(localizer, index=replace(localizer.index, sensor=sensor))
+
+
 def _effort(effort: str | Effort) -> Effort:
     if isinstance(effort, Effort):
         return effort
@@ -323,9 +334,14 @@ def check_rig(T_world_sensor: Array, name: str = "T_world_sensor") -> None:
     Raises
     ------
     InputError
-        Two are farther apart than a room is long, or at the same pose.
+        Two are farther apart than a room is long, or at the same pose; or one is farther from the origin than a hall is long.
     """
     T = T_world_sensor
+    far = np.linalg.norm(T[:, :3, 3], axis=1)
+    if far.max() > _HALL:
+        raise InputError(
+            f"{name}: sensor {int(far.argmax()) + 1} is {far.max():.3g} m from the origin; give translations in metres"
+        )
     for i, j in combinations(range(len(T)), 2):
         apart = float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]))
         if apart > _ROOM:

@@ -98,8 +98,7 @@ class View:
         if self.contact is None or self.contact.height is None:
             return np.zeros(len(depths))
         height = np.asarray(cv2.resize(self.contact.height, shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
-        surely = self.contact.mask if self.contact.mask.all() else self.contact.deep
-        touched = to_grid(surely, shape)
+        touched = to_grid(self.contact.sure, shape)
         return np.asarray(
             height_log_likelihood(depths, height, touched, sensor.pixel_area(shape), sensor.height_noise), float
         )

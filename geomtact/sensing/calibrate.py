@@ -128,8 +128,8 @@ def calibrated(
         most = 0.5 * ball_diameter / max((press.radius for press in found), default=np.inf)
         bound = f"; it is at most {1e3 * most:.4f} mm, the ball's radius over the largest imprint's" if found else ""
         raise UsageError(
-            "pixel_pitch: none was given, and presses of unknown depth do not tell it: measure how many pixels a known "
-            f"length takes on the membrane{bound}"
+            "pixel_pitch: none was given (--pitch-mm, --pins or --sensor), and presses of unknown depth do not tell it: measure "
+            f"how many pixels a known length takes on the membrane{bound}"
         )
     pitch, radius = _pair(pitch), 0.5 * ball_diameter
     for press in [p for p in found if p.radius * pitch[0] >= radius]:

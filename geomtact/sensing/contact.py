@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# Share of the deepest to which a gel is pressed in at the border of a contact: between a ball's half on a thick gel (Hertz) and
-# a flat punch's whole
-HALF = 0.5
+# Shares of the deepest: to which a gel is pressed in at the border of a contact, as under a ball on a thick gel (Hertz), and from
+# which on it surely lies on the object: beside a flat punch it is half as deep out to 1.4 radii, and this deep to 1.1
+HALF, SURE = 0.5, 0.7
 _FADING = 0.35  # slope at the border of what is pressed in, in shares of the steepest, under which it fades away there
 _BORDER = 2  # px
+_FAINT = 0.01  # share of the deepest that is no indentation
 
 
 @dataclass(frozen=True)
@@ -23,10 +24,12 @@ class Contact:
     ----------
     mask : (H, W) bool, True where the object touches (the thesis's local shape)
     height : (H, W) float32, depth of the indentation [m], 0 outside the contact; None where only the mask is known
+    share : of the deepest, from which on the gel surely lies on the object, within the mask
     """
 
     mask: NDArray[np.bool_]
     height: NDArray[np.float32] | None = None
+    share: float = HALF
 
     @classmethod
     def of_height(cls, height: NDArray[np.float32]) -> Contact:
@@ -35,7 +38,7 @@ class Contact:
         A rigid gel is pressed in where it is touched. An elastic one sinks beside the object too, and that fades away: then the
         contact is taken to be where it is more than half as deep as at the deepest.
         """
-        pressed = height > 0
+        pressed = height > _FAINT * height.max()
         if not pressed.any():
             return cls(pressed, height)
         slope = np.hypot(*np.gradient(height))
@@ -45,16 +48,21 @@ class Contact:
             fades = np.median(border) < _FADING * np.quantile(slope[pressed], 0.95)
         else:  # all of the gel is pressed in: by what fills the window, or less and less towards its border
             fades = np.median(np.r_[height[0], height[-1], height[:, 0], height[:, -1]]) < HALF * height.max()
-        return cls(cls(pressed, height).deep if fades else pressed, height)
+        return cls(height > HALF * height.max(), height, SURE) if fades else cls(pressed, height)
 
     @property
-    def half(self) -> float:
-        """Half as deep as the gel is pressed in at the deepest [m]."""
+    def sure_depth(self) -> float:
+        """How deep the gel is pressed in where it surely lies on the object, at least [m]."""
         assert self.height is not None
-        return HALF * float(self.height.max(where=self.mask, initial=0))
+        return self.share * float(self.height.max(where=self.mask, initial=0))
 
     @property
-    def deep(self) -> NDArray[np.bool_]:
-        """Where (H, W) the gel surely lies on the object: pressed in more than half as deep as at the deepest."""
+    def sure(self) -> NDArray[np.bool_]:
+        """Where (H, W) the gel surely lies on the object: all of it, where that fills the window."""
         assert self.height is not None
-        return self.mask & (self.height > self.half)
+        return self.mask if self.mask.all() else self.deeper(self.sure_depth)
+
+    def deeper(self, depth: float) -> NDArray[np.bool_]:
+        """Where (H, W) the contact is deeper than ``depth`` [m]."""
+        assert self.height is not None
+        return self.mask & (self.height > depth)

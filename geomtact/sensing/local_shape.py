@@ -8,6 +8,7 @@ the pressure that bends an elastic gel so is worked out, and the contact is wher
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.se3 import Array
+from geomtact.sensing.image_file import read_image
 from geomtact.sensing.sensor import Sensor
 
 Mask = NDArray[np.bool_]
@@ -36,8 +38,8 @@ def contact_mask(
 
     Parameters
     ----------
-    image : (H, W, 3) uint8 or float 0..1, RGB
-    background : (H, W, 3) the same sensor without contact; None: a smooth one is estimated from the image itself,
+    image : (H, W, 3) uint8 or float 0..1, RGB; or a path
+    background : (H, W, 3) the same sensor without contact, or a path; None: a smooth one is estimated from the image itself,
         which serves for contacts much smaller than the window
     sensor : gives the pixel pitch where columns and rows differ, and the size to check; None: square pixels
     method : "classical": within the rim where the gel is steepest, by its slope, which colours tell up to a factor; "pressure":
@@ -143,7 +145,9 @@ def smooth_background(image: Array) -> Array:
 
 
 def as_unit_rgb(image: Any, name: str) -> Array:
-    """An image (H, W, 3), uint8 or float 0..1, as 0..1; what is none is refused under its ``name``."""
+    """An image (H, W, 3), uint8 or float 0..1, or its path, as 0..1; what is none is refused under its ``name``."""
+    if isinstance(image, str | Path):
+        image = read_image(image)[..., :3]
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
         raise ImageError(f"{name}: expected an RGB image (H, W, 3), got an array of shape {image.shape}")

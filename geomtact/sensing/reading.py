@@ -200,7 +200,7 @@ def _height(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str])
     if highest > 10 * sensor.max_penetration:
         raise ImageError(
             f"{name}: expected heights in metres up to about {sensor.max_penetration:g}, the largest is {highest:.4g}; "
-            "convert to metres (16-bit: micrometres), or give --kind mask"
+            "these look like millimetres: divide by 1000 (16-bit grey counts micrometres)"
         )
     if highest > 1.5 * sensor.max_penetration:
         warnings.append(f"{name}: heights up to {1e3 * highest:.2f} mm exceed the sensor's max_penetration_mm")
@@ -213,7 +213,12 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
         warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself")
     else:
         label, reference = _load(background, "background", warnings)
-        _check_size(reference, sensor, label)
+        if reference.shape[:2] != array.shape[:2]:
+            height, width = reference.shape[:2]
+            raise ImageError(
+                f"{label}: expected the reading's size, {array.shape[1]} x {array.shape[0]} px, got {width} x {height} px; "
+                "take it with the same camera settings"
+            )
         reference = _rgb(reference, label)
     seen = _rgb(array, name)
     found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))

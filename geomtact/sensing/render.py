@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.se3 import Array
 
 SPOILT = {"none": 0.0, "moderate": 1 / 255, "heavy": 3 / 255}  # standard deviation of each pixel's brightness
-_GREY = 0.45  # of an example's background
+_GREY = 0.45  # brightness of an example's background in the middle
 _BRIGHTER = 0.6  # by which a slope of one that faces a lamp is
 
 
@@ -61,11 +61,13 @@ def render(height: ArrayLike, pitch: tuple[float, float], background: ArrayLike,
 def example_reading(
     height: ArrayLike, pitch: tuple[float, float], noise: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """A reading (H, W, 3), RGB, of a grey gel between three lamps that is pressed in by ``height`` (H, W) [m]; ``noise`` is of
-    each pixel."""
+    """A reading (H, W, 3), RGB, of a gel between three lamps that is pressed in by ``height`` (H, W) [m]; ``noise`` is of each
+    pixel."""
     h, w = np.shape(height)
-    # darker towards the corners, as behind a lens
-    off = np.hypot(*np.meshgrid(np.linspace(-1, 1, w), np.linspace(-1, 1, h)))
-    background = np.repeat((_GREY * (1 - 0.2 * off**2))[..., None], 3, -1)
-    shown = render(height, pitch, background, Lamps.around()) + noise * rng.normal(size=(h, w, 3))
+    x, y = np.meshgrid(np.linspace(-1, 1, w), np.linspace(-1, 1, h))
+    lamps = Lamps.around()
+    # darker towards the corners, as behind a lens, and in each colour brighter towards its lamp
+    nearer = np.einsum("hwk,ck->hwc", np.stack([x, y], -1), -lamps.response[..., 0])
+    background = _GREY * (1 - 0.2 * (x**2 + y**2))[..., None] * (1 + 0.4 * nearer)
+    shown = render(height, pitch, background, lamps) + noise * rng.normal(size=(h, w, 3))
     return np.rint(255 * np.clip(shown, 0, 1)).astype(np.uint8)
