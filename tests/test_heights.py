@@ -120,6 +120,7 @@ def test_scores_of_a_contour_line_belong_to_deeper_poses(balls):
     deeper = _deeper(score, ball.index, 2.2 * step)
     assert np.array_equal(deeper[2:], score[:-2]) and (deeper[:2] == score.min()).all()
     assert _deeper(score, ball.index, 0.4 * step) is score
+    assert np.array_equal(_deeper(score, ball.index, 99 * step)[-1], score[0])
 
 
 @pytest.mark.parametrize("elastic", [False, True])

@@ -129,8 +129,9 @@ def refine_together(
 
     unexplained = (search.most.sum() - likely.max(initial=-np.inf)) / search.felt
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
-    # in cells not looked into as good a pose may lie, but seldom one that explains several contacts
-    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, _ELSEWHERE if search.felt > 1 else 1.0))
+    # in cells not looked into as good a pose may lie, but seldom one that explains several contacts, the more the less
+    share_elsewhere = 1.0 if search.felt == 1 else min(_ELSEWHERE, 1 / search.felt)
+    doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, share_elsewhere))
     if any(view.contact is not None and view.contact.height is not None for view in views):
         mass = posterior.cell_log_density(home) + posterior.index.log_weight[home]
         told = float(np.logaddexp.reduce(mass + search.heights(poses), initial=-np.inf))

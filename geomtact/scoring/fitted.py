@@ -102,8 +102,9 @@ class FittedScorer:
 
 
 def _deeper(score: NDArray[np.float32], index: Index, by: float) -> NDArray[np.float32]:
-    """Scores (P, n) of poses ``by`` [m] deeper than those scored; those that are not as deep get the lowest there is."""
-    bins = round(by * len(score) / index.sensor.max_penetration)
+    """Scores (P, n) of poses ``by`` [m] deeper than those scored, or of the deepest; those that are not as deep get the lowest
+    there is."""
+    bins = min(round(by * len(score) / index.sensor.max_penetration), len(score) - 1)
     if not bins:
         return score
     out = np.full_like(score, score[np.isfinite(score)].min())
