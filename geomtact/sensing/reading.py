@@ -117,7 +117,8 @@ def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any
     return name, array
 
 
-def _check_size(array: NDArray[Any], sensor: Sensor, name: str) -> None:
+def _check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = None) -> None:
+    """Refuse an image (H, W, ...) of another size than the sensor's; ``do`` says what to do, where it is not transposed."""
     height, width = array.shape[:2]
     if (width, height) == sensor.image_size_px:
         return
@@ -125,6 +126,8 @@ def _check_size(array: NDArray[Any], sensor: Sensor, name: str) -> None:
     if (height, width) == sensor.image_size_px:
         turned = "array.T" if array.ndim == 2 else "array.swapaxes(0, 1)"
         hint = f"the image is transposed: transpose it ({turned}) or rotate it by 90 degrees, as it was taken"
+    elif do is not None:
+        hint = do
     elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
         hint = "the shape agrees: scale a mask to that, or describe this resolution in a sensor file of its own"
     else:
@@ -213,12 +216,7 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
         warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself")
     else:
         label, reference = _load(background, "background", warnings)
-        if reference.shape[:2] != array.shape[:2]:
-            height, width = reference.shape[:2]
-            raise ImageError(
-                f"{label}: expected the reading's size, {array.shape[1]} x {array.shape[0]} px, got {width} x {height} px; "
-                "take it with the same camera settings"
-            )
+        _check_size(reference, sensor, label, "take it with the camera settings of the reading")
         reference = _rgb(reference, label)
     seen = _rgb(array, name)
     found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))
