@@ -169,7 +169,7 @@ def test_simulated_readings_are_localized_as_they_come(tmp_path):
 
 
 def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp_path):
-    """Every fourth press that lies wholly in the window; the calibration saw presses of the other ball alone."""
+    """Every sixth press that lies wholly in the window; the calibration saw presses of the other ball alone."""
     folder = data_folder / "gelslam_gsmini_balls"
     sensors = calibrations(data_folder)
     assert all(0.01 * MM < sensor.height_noise < 0.05 * MM for sensor in sensors.values())
@@ -178,12 +178,12 @@ def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp
     )
     assert observation.contact.height.max() == pytest.approx(0.8 * MM, abs=0.1 * MM)
     lines = CIRCLES.read_text("utf-8").splitlines()
-    inside = [row["file"] for row in circles_of(CIRCLES) if row["inside"] == "1"][::4]
+    inside = [row["file"] for row in circles_of(CIRCLES) if row["inside"] == "1"][::6]
     some = tmp_path / "some.csv"
     some.write_text("\n".join(line for line in lines if line.startswith("file") or line.split(",")[0] in inside))
     pressed = list(localize_balls(data_folder, some, sensors, tmp_path))
-    assert len(pressed) == 8
-    assert np.mean([p.nats > 0 for p in pressed]) >= 0.75
+    assert len(pressed) == 5
+    assert np.mean([p.nats > 0 for p in pressed]) >= 0.8
     assert np.median([p.off_mm for p in pressed]) < 0.3
 
 

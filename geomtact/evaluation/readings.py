@@ -101,6 +101,9 @@ def imprints(folder: Path) -> dict[str, list[Imprint]]:
         The folder does not hold them.
     """
     fots, pack = folder / "fots_balls", folder / "objectfolder_gelsight_calib" / "dataPack_subset.npz"
+    wanted = "fots_balls and objectfolder_gelsight_calib"
+    if not (fots.is_dir() and pack.is_file()):
+        raise InputError(f"{folder}: expected {wanted} in it; give the folder of the readings (docs/readings.md)")
     try:
         background = read_image(fots / "gelsight_bg.png")[..., :3]
         rows = circles_of(fots / "gelsight_contact_circles.csv")
@@ -120,7 +123,7 @@ def imprints(folder: Path) -> dict[str, list[Imprint]]:
                 for i, (image, at, r) in enumerate(drawn)
             ]
     except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{folder}: expected fots_balls and objectfolder_gelsight_calib in it ({error})") from None
+        raise InputError(f"{folder}: expected {wanted} as their makers wrote them ({error})") from None
     return {"fots": soft, "objectfolder": hard}
 
 
@@ -213,8 +216,9 @@ def localize_balls(
     background = _presses(folder) / "background.png"
     balls = {}
     for ball in BALLS:
-        for used, sensor in sensors.items():
-            balls[ball, used] = Localizer.prepare(_ball(ball), sensor=sensor, cache_dir=cache_dir)
+        prepared = Localizer.prepare(_ball(ball), sensor=list(sensors.values()), cache_dir=cache_dir)
+        for used, localizer in zip(sensors, (prepared, *prepared.others), strict=True):
+            balls[ball, used] = localizer
     for row in circles_of(circles)[first:]:
         pressed = float(row["ball_mm"])
         (other,) = (ball for ball in BALLS if ball != pressed)
