@@ -38,9 +38,11 @@ _ROUNDS, _AROUND = (
     12,
 )  # of the last search, each in half the width of the one before, and for the better half of the cells
 _TOLD = 5  # for each mode that is asked for, cells of which it is worked out what the contacts tell
-# Of the joint likelihood at one pose; and shares of their mass that the cells looked into keep, whatever is likely within them,
-# and that all others do. Chosen on scenes that the study does not judge (docs/several-sensors.md)
-_TRUST, _DOUBT, _ELSEWHERE = 0.3, 0.03, 0.2
+# Power of the joint likelihood at one pose; and the share of their mass that the cells looked into keep, whatever is likely
+# within them. Chosen, as are the next, on scenes that the study does not judge (docs/several-sensors.md)
+_TRUST, _DOUBT = 0.3, 0.03
+# The share that all others keep: at least, at most, and for how likely those looked into are in the mean, as a share of the best
+_ELSEWHERE, _AT_MOST, _AS_LIKELY = 0.05, 0.2, 3.0
 _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
 # nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 _ALIKE, _UNLIKE = 3.0, 8.0
@@ -129,17 +131,25 @@ def refine_together(
 
     unexplained = (search.most.sum() - likely.max(initial=-np.inf)) / search.felt
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
-    # in cells not looked into as good a pose may lie, but seldom one that explains several contacts, the more the less
-    share_elsewhere = 1.0 if search.felt == 1 else min(_ELSEWHERE, 1 / search.felt)
+    mass = posterior.cell_log_density(home) + posterior.index.log_weight[home]
+    share_elsewhere = _share_elsewhere(mass, _TRUST * likely) if search.felt > 1 else 1.0
     doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, share_elsewhere))
     if any(view.contact is not None and view.contact.height is not None for view in views):
-        mass = posterior.cell_log_density(home) + posterior.index.log_weight[home]
         told = float(np.logaddexp.reduce(mass + search.heights(poses), initial=-np.inf))
         posterior = replace(posterior, log_evidence=posterior.log_evidence + told)
     posterior = posterior.shared_anew(home, _TRUST * likely, doubt, elsewhere, _BEFORE, log_prior)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: _TOLD * k]
     return replace(posterior, refined=search.told(home[leading], poses[leading]))
+
+
+def _share_elsewhere(log_mass: Array, log_likelihood: Array) -> float:
+    """The share of their mass that cells not looked into keep: a pose as good as the best may lie there, but the more the best of
+    those looked into, with ``log_mass`` (n,) and ``log_likelihood`` (n,), stands out of them, the less likely."""
+    if not len(log_mass):
+        return 1.0
+    in_the_mean = np.logaddexp.reduce(log_mass + log_likelihood) - np.logaddexp.reduce(log_mass)
+    return float(min(_AT_MOST, _ELSEWHERE + _AS_LIKELY * np.exp(in_the_mean - log_likelihood.max())))
 
 
 @dataclass(frozen=True, eq=False)

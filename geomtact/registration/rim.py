@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.registration.protocol import Problem, Surface
 from geomtact.se3 import Array, apply, inverse, unit
+from geomtact.sensing.contact import Contact
 from geomtact.sensing.sensor import Sensor
 
 SINK, SINK_STD = 0.2e-3, 0.35e-3  # m that a gel, rigid or elastic, is taken to sink around the object, give or take
@@ -75,9 +76,8 @@ def make_problem(
     else:
         sink_std = 0.0
         depth, known, clear = _depths(height)
-        half = 0.5 * float(depth.max(where=contact, initial=0.0))
-        # an object that fills the window leaves the gel nowhere to hang free
-        deep = contact if contact.all() else contact & (depth > half)
+        lying = Contact(contact, depth.astype(np.float32))
+        half, deep = lying.sure_depth, lying.sure
         uv, outward, spacing = _outline(deep, pitch_xy, max_points)
         # of an elastic gel, what is not pressed in half as deep as the deepest may hang free of the object, far beside it
         # even: only where the gel drops off steeply a wall is near

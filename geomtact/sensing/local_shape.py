@@ -8,6 +8,7 @@ the pressure that bends an elastic gel so is worked out, and the contact is wher
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from geomtact.sensing.image_file import read_image
 from geomtact.sensing.sensor import Sensor
 
 Mask = NDArray[np.bool_]
+BySlope = Callable[[Array, Mask, Mask, float, Array], tuple[Array, Mask]]  # slope, felt, strong, sigma, pitch
 
 METHODS = ("classical", "pressure", "learned")  # the default first
 _GREY = 1 / 255
@@ -70,18 +72,26 @@ def contact_mask(
         return felt
     if method == "learned":
         height, mask = _by_network(change, felt)
-    elif (depth := _darkening(change, felt)) is not None:
-        height, mask = _half_as_large(depth, felt)
-    elif (slope := _slope_field(change, felt, sigma, pitch)) is None:
-        height, mask = _half_as_large(np.linalg.norm(change, axis=-1), felt)
-    elif method == "pressure":
-        height, mask = _by_pressure(slope, felt, strong, sigma, pitch)
     else:
-        height, mask = _by_rim(slope, felt, sigma, pitch)
+        height, mask = _by_colour(change, felt, strong, sigma, pitch, _by_pressure if method == "pressure" else _by_rim)
     return _components(mask, height, strong, sigma)
 
 
-def _by_rim(slope: Array, felt: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
+def _by_colour(
+    change: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array, by_slope: BySlope
+) -> tuple[Array, Mask]:
+    """How much the gel is pressed in (H, W), up to a factor, and the contact: by its slope, where colours tell that."""
+    values = change[felt]
+    power, colours = np.linalg.eigh(values.T @ values / len(values))
+    if power[1] <= _ONE_COLOUR * power[2]:
+        return _half_as_large(_one_way(change @ colours[:, 2], felt), felt)
+    slope = _slope_field(change @ (colours[:, 1:] / np.sqrt(power[1:])), felt, sigma, pitch)
+    if slope is None:
+        return _half_as_large(np.linalg.norm(change, axis=-1), felt)
+    return by_slope(slope, felt, strong, sigma, pitch)
+
+
+def _by_rim(slope: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
     """The gel's indentation (H, W), up to a factor, and the contact: within the rim where it is steepest."""
     height = integrate(slope, pitch)
     height = _indentation(_inwards(height, felt) * height, felt)
@@ -98,13 +108,9 @@ def _by_pressure(slope: Array, felt: Mask, strong: Mask, sigma: float, pitch: Ar
     return np.maximum(pressed, 0) * felt, mask
 
 
-def _darkening(change: Array, felt: Mask) -> Array | None:
-    """By how much (H, W) a gel of one colour changes: a white one as it does where it is pressed in most, darker or brighter; a
-    grey picture of lit slopes either way. None where a change has several colours, and so tells slopes."""
-    power, colours = _colours(change, felt)
-    if power[1] > _ONE_COLOUR * power[2]:
-        return None
-    along = change @ colours[:, 2]
+def _one_way(along: Array, felt: Mask) -> Array:
+    """By how much (H, W) a gel of one colour changes that gets brighter ``along`` (H, W) or darker: a white one as it does where
+    it is pressed in most, a grey picture of lit slopes either way."""
     brighter, darker = (max(float(np.quantile(way * along[felt], 0.98)), 0.0) for way in (1, -1))
     if min(brighter, darker) > _EITHER_WAY * max(brighter, darker):
         return np.abs(along)
@@ -242,19 +248,10 @@ def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]
     return np.isin(labels, kept[kept > 0]), strong, float(noise)
 
 
-def _colours(change: Array, felt: Mask) -> tuple[Array, Array]:
-    """Power (3,) of the directions of colour (3, 3), in columns, that the change has where it is felt; the strongest last."""
-    values = change[felt]
-    power, colours = np.linalg.eigh(values.T @ values / len(values))
-    return power, colours
-
-
-def _slope_field(change: Array, felt: Mask, sigma: float, pitch: Array) -> Array | None:
-    """The gel's slope (H, W, 2) up to a factor; None where the colours of the lights do not tell it."""
+def _slope_field(plane: Array, felt: Mask, sigma: float, pitch: Array) -> Array | None:
+    """The gel's slope (H, W, 2) up to a factor, of a change in two colours (H, W, 2); None where these do not tell it."""
     from scipy import ndimage
 
-    power, colours = _colours(change, felt)
-    plane = change @ (colours[:, 1:] / np.sqrt(power[1:]))
     plane = np.stack([ndimage.gaussian_filter(plane[..., i], sigma) for i in (0, 1)], -1)
     along_y, along_x = np.gradient(plane, axis=0) / pitch[1], np.gradient(plane, axis=1) / pitch[0]
     curl = np.concatenate([along_y, -along_x], -1)[felt]

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from safetensors.torch import save_file
+from torch import nn
 
 from geomtact.files import write_whole
 from geomtact.scoring.encoder import ARCHITECTURE
@@ -29,15 +30,9 @@ def write_encoder(
 
     ``data`` says where the scenes come from; weights for one ``part`` on one ``sensor`` say so in their metadata too.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    weights = {name: value.half().contiguous() for name, value in network.state_dict().items()}
     known = ("part", "part_sha256", "sensor", "sensor_sha256")
     meta = {"architecture": ARCHITECTURE} | {key: str(data[key]) for key in known if key in data}
-    write_whole(path, lambda temporary: save_file(weights, temporary, meta))
     card = {
-        "schema": SCHEMA,
-        "parameters": sum(p.numel() for p in network.parameters()),
-        "bytes": path.stat().st_size,
         "data": data
         | {
             "scenes": len(scenes),
@@ -47,10 +42,25 @@ def write_encoder(
         "settings": asdict(settings),
         "augmentations": [{"name": a.name, "range": a.range, "reason": a.reason} for a in AUGMENTATIONS],
         "curve": asdict(curve),
-        "versions": versions("kornia", "manifold3d"),
     }
-    path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", "utf-8")
+    write_network(path, network, SCHEMA, card, meta)
     draw_curve(curve, path.with_suffix(".png"))
+
+
+def write_network(
+    path: Path, network: nn.Module, schema: str, card: dict[str, Any], meta: dict[str, str] | None = None
+) -> None:
+    """Write the weights to ``path``, half precision, with ``meta`` in them; and beside it ``card``, with what all cards say."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    weights = {name: value.half().contiguous() for name, value in network.state_dict().items()}
+    write_whole(path, lambda temporary: save_file(weights, temporary, meta))
+    own = {
+        "schema": schema,
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "bytes": path.stat().st_size,
+    }
+    text = json.dumps(own | card | {"versions": versions("kornia", "manifold3d")}, indent=1)
+    path.with_suffix(".json").write_text(text + "\n", "utf-8")
 
 
 def draw_curve(curve: Curve, path: Path) -> None:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from geomtact.errors import MeshError
-from geomtact.files import write_whole
 from geomtact.geometry.mesh import Mesh
 from geomtact.progress import Progress
 from geomtact.sensing.sensor import Sensor
-from geomtact.training.numbered import write_all
+from geomtact.training.numbered import made_once
 from geomtact.training.parts import random_part
 from geomtact.training.scenes import Scene, make_scene
 
@@ -64,37 +62,16 @@ def _own(i: int, mesh: Mesh, sensor: Sensor, max_poses: int, seed: int) -> Scene
 
 
 def _scenes(folder: Path, n: int, make: Make, progress: Progress | None, processes: int) -> list[Scene]:
-    write_all(
-        folder,
-        n,
-        partial(_write, make=make),
-        lambda path: _read(path) is not None,
-        "simulating scenes",
-        progress,
-        processes,
-    )
-    return [scene for scene in _all(folder, n) if len(scene.true) >= _FEWEST]
+    found = made_once(folder, n, partial(_touched, make=make), _scene, "simulating scenes", progress, processes)
+    return [scene for scene in found if len(scene.true) >= _FEWEST]
 
 
-def _all(folder: Path, n: int) -> Iterator[Scene]:
-    for i in range(n):
-        scene = _read(folder / f"{i}.npz")
-        if scene is not None:
-            yield scene
-
-
-def _write(path: Path, i: int, make: Make) -> None:
+def _touched(i: int, make: Make) -> Scene | None:
     try:
-        scene = make(i)
+        return make(i)
     except MeshError:  # nothing of this part touches this sensor
-        return
-    write_whole(path, lambda temporary: np.savez(temporary, allow_pickle=False, **asdict(scene)))
-
-
-def _read(path: Path) -> Scene | None:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-        return Scene(**arrays | {"pixel": float(arrays["pixel"])})
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
+
+
+def _scene(**arrays: Any) -> Scene:
+    return Scene(**arrays | {"pixel": float(arrays["pixel"])})

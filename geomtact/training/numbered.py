@@ -1,32 +1,45 @@
-"""Numbered files of a folder, each made once, by several processes: a stopped run goes on with those that are missing."""
+"""What is made once for each number and kept in a folder, by several processes: a stopped run goes on with what is missing."""
 
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, TypeVar
 
+import numpy as np
+
+from geomtact.files import write_whole
 from geomtact.progress import Progress
 
+T = TypeVar("T")
 
-def write_all(
+
+def made_once(
     folder: Path,
     n: int,
-    write: Callable[[Path, int], None],
-    whole: Callable[[Path], bool],
+    make: Callable[[int], Any],
+    kind: Callable[..., T],
     doing: str,
     progress: Progress | None = None,
     processes: int = 2,
-) -> None:
-    """Have ``write`` make 0.npz to ``n`` - 1.npz in ``folder``, all but those that are ``whole``."""
+) -> list[T]:
+    """What ``make`` makes of the numbers 0 to ``n`` - 1, in order; what ``folder`` holds already is read.
+
+    ``make`` gives a dataclass of arrays, or None, which is left out; ``kind`` takes its fields and gives it back.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    todo = [i for i in range(n) if not whole(folder / f"{i}.npz")]
+    paths, read = [folder / f"{i}.npz" for i in range(n)], partial(_read, kind=kind)
+    todo = [i for i, path in enumerate(paths) if read(path) is None]
     done = n - len(todo)
     # processes, because much of the work holds the interpreter; spawned, because Embree and OpenMP do not survive a fork
     with ProcessPoolExecutor(processes, get_context("spawn"), _one_thread) as pool:
-        futures = [pool.submit(write, folder / f"{i}.npz", i) for i in todo]
+        futures = [pool.submit(_write, paths[i], make, i) for i in todo]
         try:
             for future in as_completed(futures):
                 future.result()
@@ -36,6 +49,21 @@ def write_all(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+    return [made for path in paths if (made := read(path)) is not None]
+
+
+def _write(path: Path, make: Callable[[int], Any], i: int) -> None:
+    made = make(i)
+    if made is not None:
+        write_whole(path, lambda temporary: np.savez(temporary, allow_pickle=False, **asdict(made)))
+
+
+def _read(path: Path, kind: Callable[..., T]) -> T | None:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return kind(**{name: data[name] for name in data.files})
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        return None
 
 
 def _one_thread() -> None:

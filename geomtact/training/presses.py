@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from geomtact.files import write_whole
 from geomtact.geometry.mesh import Mesh
 from geomtact.progress import Progress
 from geomtact.se3 import transform
@@ -20,7 +18,7 @@ from geomtact.sensing.cast import Caster
 from geomtact.sensing.elastic import elastic_contact
 from geomtact.sensing.mask_network import side_shape, to_side
 from geomtact.sensing.sensor import Sensor
-from geomtact.training.numbered import write_all
+from geomtact.training.numbered import made_once
 from geomtact.training.parts import random_part
 from geomtact.training.readings import random_change
 
@@ -56,17 +54,8 @@ def make_presses(
     folder: Path, n: int, seed: int, progress: Progress | None = None, processes: int = 2
 ) -> list[Presses]:
     """Of ``n`` parts, in order; those that ``folder`` holds already are read."""
-    write_all(
-        folder,
-        n,
-        partial(_write, seed=seed),
-        lambda path: _read(path) is not None,
-        "pressing parts",
-        progress,
-        processes,
-    )
-    found = (_read(folder / f"{i}.npz") for i in range(n))
-    return [presses for presses in found if presses is not None and len(presses.change)]
+    found = made_once(folder, n, partial(press_part, seed=seed), Presses, "pressing parts", progress, processes)
+    return [presses for presses in found if len(presses.change)]
 
 
 def press_part(i: int, seed: int) -> Presses:
@@ -121,16 +110,3 @@ def _part(rng: np.random.Generator, window: float) -> Mesh:
         ball = trimesh.creation.icosphere(subdivisions=5, radius=np.exp(rng.uniform(*np.log(RADII))))
         return Mesh(ball.vertices, ball.faces, "ball", "m")
     return random_part(int(rng.integers(1 << 31)), window * float(np.exp(rng.uniform(*np.log(SIZES)))))
-
-
-def _write(path: Path, i: int, seed: int) -> None:
-    presses = press_part(i, seed)
-    write_whole(path, lambda temporary: np.savez_compressed(temporary, allow_pickle=False, **asdict(presses)))
-
-
-def _read(path: Path) -> Presses | None:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            return Presses(data["change"], data["contact"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None

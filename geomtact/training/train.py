@@ -97,7 +97,7 @@ def train(
         # every step has a seed of its own, so that a resumed run draws what an uninterrupted one does
         rng = np.random.default_rng([settings.seed, step])
         for group in optimizer.param_groups:
-            group["lr"] = settings.rate * _schedule(step, settings.steps)
+            group["lr"] = settings.rate * schedule(step, settings.steps)
         network.train()
         optimizer.zero_grad()
         for i in rng.integers(len(learned), size=settings.scenes_a_step):
@@ -169,6 +169,6 @@ def _unpacked(words: NDArray[np.uint64], shape: tuple[int, int]) -> torch.Tensor
     return torch.from_numpy(unpack(words, shape)).float()
 
 
-def _schedule(step: int, steps: int) -> float:
-    """A short rise, then half a cosine."""
+def schedule(step: int, steps: int) -> float:
+    """Share of the learning rate at a step: a short rise, then half a cosine."""
     return min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / steps))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -11,16 +10,15 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.torch import save_file
 
 from geomtact.errors import GeomtactError, InputError
-from geomtact.files import write_whole
 from geomtact.progress import Progress
 from geomtact.sensing.mask_network import MaskNetwork
 from geomtact.training import presses as made
+from geomtact.training.card import write_network
 from geomtact.training.presses import Presses
 from geomtact.training.state import not_a_number, resume, save_state
-from geomtact.versions import versions
+from geomtact.training.train import schedule
 
 SCHEMA = "geomtact/mask-network/1"
 
@@ -64,9 +62,7 @@ def train_mask(
         # every step has a seed of its own, so that a resumed run draws what an uninterrupted one does
         rng = np.random.default_rng([settings.seed, step])
         for group in optimizer.param_groups:
-            group["lr"] = (
-                settings.rate * min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / settings.steps))
-            )
+            group["lr"] = settings.rate * schedule(step, settings.steps)
         some = rng.integers(len(change), size=settings.batch)
         which = rng.integers(change.shape[1], size=settings.batch)
         x, y = _varied(change[some, which].float(), contact[some].float(), rng)
@@ -104,20 +100,13 @@ def write_mask_network(
     path: Path, network: MaskNetwork, curve: dict[str, list[float]], settings: Settings, presses: int
 ) -> None:
     """Write ``path`` (safetensors, half precision) and beside it the card (.json)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    weights = {name: value.half().contiguous() for name, value in network.state_dict().items()}
-    write_whole(path, lambda temporary: save_file(weights, temporary))
     ranges = ("SHAPE", "PITCH", "READINGS", "SIZES", "BALLS", "RADII", "FLAT", "TILT", "DEPTHS", "THICKNESS")
     card = {
-        "schema": SCHEMA,
-        "parameters": sum(p.numel() for p in network.parameters()),
-        "bytes": path.stat().st_size,
         "data": {"presses": presses} | {name.lower(): getattr(made, name) for name in ranges},
         "settings": asdict(settings),
         "curve": curve,
-        "versions": versions("kornia", "manifold3d"),
     }
-    path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", "utf-8")
+    write_network(path, network, SCHEMA, card)
 
 
 def _tensors(parts: Sequence[Presses]) -> tuple[torch.Tensor, torch.Tensor]:
