@@ -23,6 +23,8 @@ from geomtact.sensing.sensor import Sensor
 
 LEAST = 0.05  # nats below which an action does not help
 _CELLS = 128  # drawn from the posterior
+# Of many actions, so many are tried at all poses, for they tell most at so many of one in so many cells
+_CLOSELY, _WITHIN, _ONE_IN = 24, 3, 4
 # Standard deviations at one pose: of where the sensor stops and of the contact's centre [m], and of the contact's log area,
 # log size and stretches. Those of touches with the calibration's noise, half of them elastic, on five parts.
 _BLUR, _NOISE = 0.3e-3, (0.4, 0.15, 0.17, 0.17)
@@ -65,6 +67,8 @@ def next_touch(
 ) -> list[Action]:
     """``actions`` by the information that they are expected to give for their cost, the best first; ties in their order.
 
+    Of more than 24, those that tell less at some of the poses are not tried at the others, and come last.
+
     Parameters
     ----------
     posterior : what is known now; actions are in its frame
@@ -86,8 +90,17 @@ def next_touch(
     if not tried:
         raise UsageError("next_touch: no actions to choose from; give some, or none at all for a grid of touches")
     T = draw_cells(posterior, n, np.random.default_rng(seed), len(PRESSED))
-    judged = [judge(posterior.space, action, T, number) for number, action in enumerate(tried, 1)]
-    return sorted(judged, key=lambda a: -round(a.expected_nats / a.cost, 9))
+    few = T[:_WITHIN, ::_ONE_IN] if len(tried) > _CLOSELY else T
+    judged = _ranked(judge(posterior.space, action, few, number) for number, action in enumerate(tried, 1))
+    if few is T:
+        return judged
+    closely = _ranked(judge(posterior.space, action.of, T, action.number) for action in judged[:_CLOSELY])
+    return closely + judged[_CLOSELY:]
+
+
+def _ranked(judged: Iterable[Action]) -> list[Action]:
+    """The most telling for its cost first; ties in the order in which they were given."""
+    return sorted(judged, key=lambda a: (-round(a.expected_nats / a.cost, 9), a.number))
 
 
 def judge(space: ContactSpace, action: Touch | Probe, T_world_object: Array, number: int = 1) -> Action:
