@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,17 +65,19 @@ def contact_mask(
     sigma = min(image.shape[:2]) / 120
     change, felt, strong, noise = _change(image, reference, sigma)
     if felt.any():
-        noise_share = noise / float(np.quantile(np.linalg.norm(change, axis=-1)[felt], 0.9))
+        noise_share = noise / float(np.quantile(_size(change)[felt], 0.9))
         if noise_share > _NOISE_SHARE:
             sigma *= min(noise_share / _NOISE_SHARE, 2.0)
             change, felt, strong, _ = _change(image, reference, sigma)
     if not felt.any():
         return felt
     if method == "learned":
-        height, mask = _by_network(change, felt)
+        pressed, mask = _by_network(change, felt)
     else:
-        height, mask = _by_colour(change, felt, strong, sigma, pitch, _by_pressure if method == "pressure" else _by_rim)
-    return _components(mask, height, strong, sigma)
+        pressed, mask = _by_colour(
+            change, felt, strong, sigma, pitch, _by_pressure if method == "pressure" else _by_rim
+        )
+    return _components(mask, pressed, strong, sigma)
 
 
 def _by_colour(
@@ -85,9 +88,9 @@ def _by_colour(
     power, colours = np.linalg.eigh(values.T @ values / len(values))
     if power[1] <= _ONE_COLOUR * power[2]:
         return _half_as_large(_one_way(change @ colours[:, 2], felt), felt)
-    slope = _slope_field(change @ (colours[:, 1:] / np.sqrt(power[1:])), felt, sigma, pitch)
+    slope = _slope_field(np.tensordot(change, colours[:, 1:] / np.sqrt(power[1:]), 1), felt, sigma, pitch)
     if slope is None:
-        return _half_as_large(np.linalg.norm(change, axis=-1), felt)
+        return _half_as_large(_size(change), felt)
     return by_slope(slope, felt, strong, sigma, pitch)
 
 
@@ -99,12 +102,15 @@ def _by_rim(slope: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array) 
 
 
 def _by_pressure(slope: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
-    """The pressure (H, W) on an elastic gel, up to a factor, and the contact: where there is any."""
-    from scipy import ndimage
+    """The pressure (H, W), up to a factor, that gives an elastic half-space this ``slope``, and the contact: where there is any.
 
-    pressed = _inwards(integrate(slope, pitch), felt) * _pressure(slope, pitch)
+    A wave of pressure of number k sinks in by 1/k of it (Johnson 1985, 13.2), so pressure is k times the height: the Riesz
+    transform of the gradient, as noisy as that and no more.
+    """
+    height, pressed = _of_gradient(slope, pitch, 2, 1)
+    pressed *= _inwards(height, felt)
     mask = (pressed > _PRESSED * np.quantile(pressed[strong], 0.98)) & felt
-    mask = ndimage.binary_opening(ndimage.binary_fill_holes(mask), iterations=max(1, round(sigma)))
+    mask = _opened(_filled(mask), max(1, round(sigma)))
     return np.maximum(pressed, 0) * felt, mask
 
 
@@ -119,20 +125,16 @@ def _one_way(along: Array, felt: Mask) -> Array:
 
 def _half_as_large(size: Array, felt: Mask) -> tuple[Array, Mask]:
     """``size`` (H, W) where it is felt, and where it is more than half of the largest."""
-    from scipy import ndimage
-
     size = size * felt
-    return size, ndimage.binary_fill_holes(size > 0.5 * np.quantile(size[felt], 0.95))
+    return size, _filled(size > 0.5 * np.quantile(size[felt], 0.95))
 
 
 def _by_network(change: Array, felt: Mask) -> tuple[Array, Mask]:
     """The probability (H, W) of contact, and where it is more likely than not."""
-    from scipy import ndimage
-
     from geomtact.sensing.mask_network import contact_probability
 
     probability = contact_probability(change)
-    return probability.astype(float), np.asarray(ndimage.binary_fill_holes(probability > 0.5) & felt)
+    return probability.astype(float), _filled(probability > 0.5) & felt
 
 
 def smooth_background(image: Array) -> Array:
@@ -194,23 +196,20 @@ def colour_change(image: Array, background: Array) -> tuple[Array, Mask]:
 
 def _change(image: Array, background: Array | None, sigma: float) -> tuple[Array, Mask, Mask, float]:
     """The smoothed change (H, W, 3) from the background, where it is felt and where strongly so, and its noise."""
-    from scipy import ndimage
-
-    smooth = ndimage.gaussian_filter(image, (sigma, sigma, 0))
-    reference = (
-        smooth_background(smooth) if background is None else ndimage.gaussian_filter(background, (sigma, sigma, 0))
-    )
-    change = _without_light_drift(smooth, reference)
+    smooth = _blurred(image, sigma)
+    reference = smooth_background(smooth) if background is None else _blurred(background, sigma)
+    change = _without_light_drift(smooth, reference, _apart(sigma))
     # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
-    floor = 0.0 if background is not None else float(np.median(np.linalg.norm(change, axis=-1)))
+    floor = 0.0 if background is not None else float(np.median(_size(change)))
     return change, *_felt(change, sigma, floor)
 
 
-def _without_light_drift(image: Array, reference: Array) -> Array:
-    """``image`` minus the background, whose brightness is fitted per channel (gain, offset) to the calmer half."""
-    out = np.empty_like(image)
+def _without_light_drift(image: Array, reference: Array, step: int) -> Array:
+    """``image`` minus the background, whose brightness is fitted per channel (gain, offset) to the calmer half of one in
+    ``step`` pixels each way."""
+    gains, offsets = np.ones(3, image.dtype), np.zeros(3, image.dtype)
     for c in range(3):
-        x, y = reference[..., c].ravel(), image[..., c].ravel()
+        x, y = (each[::step, ::step, c].ravel() for each in (reference, image))
         keep = np.ones(x.size, bool)
         for _ in range(6):
             dx = x[keep] - x[keep].mean()
@@ -220,73 +219,62 @@ def _without_light_drift(image: Array, reference: Array) -> Array:
             offset = float(y[keep].mean() - gain * x[keep].mean())
             error = np.abs(y - gain * x - offset)
             keep = error <= np.median(error)
-        out[..., c] = image[..., c] - gain * reference[..., c] - offset
-    return out
+        gains[c], offsets[c] = gain, offset
+    return image - gains * reference - offsets
 
 
 def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]:
     """The regions (H, W) that stand out of the noise somewhere, those places, and the noise: hysteresis."""
-    from scipy import ndimage
-
-    step = max(1, round(3 * sigma))
+    step, apart = max(1, round(3 * sigma)), _apart(sigma)
     noise2 = 0.0
     for c in range(3):
         # second differences over three smoothing lengths cancel slopes, and most pixels lie outside any rim
-        second = [
-            np.abs(a[2 * step :] - 2 * a[step:-step] + a[: -2 * step]) for a in (change[..., c], change[..., c].T)
-        ]
+        lines = (a[:, ::apart] for a in (change[..., c], change[..., c].T))
+        second = [np.abs(a[2 * step :: apart] - 2 * a[step:-step:apart] + a[: -2 * step : apart]) for a in lines]
         deviation = np.median(np.concatenate([s.ravel() for s in second])) / 0.6745 / np.sqrt(6)
         noise2 += max(float(deviation), 0.25 * _GREY) ** 2
     noise = max(np.sqrt(noise2), floor)
-    size = np.linalg.norm(change, axis=-1)
-    strong = size > max(_STRONG * noise, 5 * _GREY)
-    strong = ndimage.binary_opening(strong, iterations=max(1, round(sigma)))
+    size = _size(change)
+    strong = _opened(size > max(_STRONG * noise, 5 * _GREY), max(1, round(sigma)))
     weak = size > max(_WEAK * noise, 0.05 * float(size.max()))
-    weak = ndimage.binary_fill_holes(ndimage.binary_closing(weak, iterations=max(1, round(2 * sigma))) | weak)
-    labels, _ = ndimage.label(weak)
-    kept = np.unique(labels[strong])
-    return np.isin(labels, kept[kept > 0]), strong, float(noise)
+    weak = _filled(_closed(weak, max(1, round(2 * sigma))))
+    n, labels = cv2.connectedComponents(weak.astype(np.uint8), connectivity=4)
+    kept = np.bincount(labels[strong], minlength=n) > 0
+    kept[0] = False
+    return kept[labels], strong, float(noise)
 
 
 def _slope_field(plane: Array, felt: Mask, sigma: float, pitch: Array) -> Array | None:
     """The gel's slope (H, W, 2) up to a factor, of a change in two colours (H, W, 2); None where these do not tell it."""
-    from scipy import ndimage
-
-    plane = np.stack([ndimage.gaussian_filter(plane[..., i], sigma) for i in (0, 1)], -1)
-    along_y, along_x = np.gradient(plane, axis=0) / pitch[1], np.gradient(plane, axis=1) / pitch[0]
-    curl = np.concatenate([along_y, -along_x], -1)[felt]
+    plane = _blurred(plane, sigma)
+    some = (slice(None, None, _apart(sigma)),) * 2
+    along_y, along_x = (np.gradient(plane, axis=axis)[some] / pitch[1 - axis] for axis in (0, 1))
+    curl = np.concatenate([along_y, -along_x], -1)[felt[some]]
     residual, maps = np.linalg.eigh(curl.T @ curl)
     if residual[0] > _CURL_LIMIT * residual[-1]:
         return None
-    return plane @ maps[:, 0].reshape(2, 2).T
+    return np.tensordot(plane, maps[:, 0].reshape(2, 2), (2, 1))
 
 
 def integrate(slope: Array, pitch: Array) -> Array:
     """The height (H, W) whose gradient is nearest to ``slope``, mirrored at the border (Frankot, Chellappa 1988)."""
-    return _of_gradient(slope, pitch, 2)
+    return _of_gradient(slope, pitch, 2)[0]
 
 
-def _pressure(slope: Array, pitch: Array) -> Array:
-    """The pressure (H, W), up to a factor, that gives an elastic half-space this ``slope`` (H, W, 2).
-
-    A wave of pressure of number k sinks in by 1/k of it (Johnson 1985, 13.2), so pressure is k times the height: the Riesz
-    transform of the gradient, as noisy as that and no more.
-    """
-    return _of_gradient(slope, pitch, 1)
-
-
-def _of_gradient(slope: Array, pitch: Array, power: int) -> Array:
-    """The field (H, W) whose waves are those of ``slope`` along their direction, over their number to the ``power`` less one;
-    mirrored at the border: a sum of cosines, and its slope along an axis one of sines there."""
+def _of_gradient(slope: Array, pitch: Array, *powers: int) -> list[Array]:
+    """For each of the ``powers``, the field (H, W) whose waves are those of ``slope`` along their direction, over their number to
+    that power less one; mirrored at the border: a sum of cosines, and its slope along an axis one of sines there."""
     from scipy import fft
 
     h, w = slope.shape[:2]
-    kx, ky = np.pi * np.arange(w) / (w * pitch[0]), np.pi * np.arange(h)[:, None] / (h * pitch[1])
+    kx = (np.pi * np.arange(w) / (w * pitch[0])).astype(slope.dtype)
+    ky = (np.pi * np.arange(h)[:, None] / (h * pitch[1])).astype(slope.dtype)
     along_x = _sines(fft.dct(slope[..., 0], axis=0, norm="ortho"), 1)
     along_y = _sines(fft.dct(slope[..., 1], axis=1, norm="ortho"), 0)
     k = np.hypot(kx, ky)
     k[0, 0] = 1.0
-    return np.asarray(fft.idctn(-(kx * along_x + ky * along_y) / k**power, norm="ortho"))
+    waves = -(kx * along_x + ky * along_y)
+    return [np.asarray(fft.idctn(waves / k**power, norm="ortho")) for power in powers]
 
 
 def _sines(values: Array, axis: int) -> Array:
@@ -300,14 +288,12 @@ def _sines(values: Array, axis: int) -> Array:
 
 def _inwards(height: Array, felt: Mask) -> float:
     """1 where the gel is pressed in towards larger ``height`` (H, W), else -1."""
-    from scipy import ndimage
-
     if (~felt).mean() > 0.15:
-        depth = ndimage.distance_transform_edt(felt)[felt]
+        depth = cv2.distanceTransform(felt.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[felt]
         inward = ((height[felt] - height[felt].mean()) * depth).sum()
     else:
         # a contact that fills the window: the dome's difference from the object is curved downwards over most of it
-        inward = -np.median(ndimage.laplace(height)[felt])
+        inward = -np.median(cv2.Laplacian(height, -1)[felt])
     return -1.0 if inward < 0 else 1.0
 
 
@@ -323,14 +309,12 @@ def _inside_rim(height: Array, slope: Array, felt: Mask, sigma: float) -> Mask:
 
     Inside a contact the gel takes the object's shape; outside it relaxes, and the slope dies away from the rim on.
     """
-    from scipy import ndimage
-
-    steep = np.linalg.norm(slope, axis=-1)
-    ahead = ndimage.gaussian_filter(_uphill_maximum(height, steep), 2 * sigma)
+    steep = np.hypot(slope[..., 0], slope[..., 1])
+    ahead = _blurred(_uphill_maximum(height, steep), 2 * sigma)
     share = steep / np.maximum(ahead, 1e-12)
     share[height > 0.6 * float(height.max())] = 1.0
     inside = (height > 0.1 * float(height.max())) & (share >= _steepest_fall(share, felt))
-    return ndimage.binary_opening(ndimage.binary_fill_holes(inside), iterations=max(1, round(2 * sigma)))
+    return _opened(_filled(inside), max(1, round(2 * sigma)))
 
 
 def _steepest_fall(share: Array, felt: Mask) -> float:
@@ -347,19 +331,18 @@ def _steepest_fall(share: Array, felt: Mask) -> float:
 def _uphill_maximum(height: Array, value: Array) -> Array:
     """The largest ``value`` (H, W) on the steepest way up from each pixel to its summit of ``height`` (H, W)."""
     h, w = height.shape
-    index = np.arange(h * w).reshape(h, w)
+    index = np.arange(h * w, dtype=np.int32).reshape(h, w)
     padded = np.pad(height, 1, constant_values=-np.inf)
     best, target = height.copy(), index.copy()
     for dy, dx in ((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)):
         neighbour = padded[1 + dy : 1 + dy + h, 1 + dx : 1 + dx + w]
-        higher = neighbour > best
-        target[higher] = (index + dy * w + dx)[higher]
+        np.copyto(target, index + np.int32(dy * w + dx), where=neighbour > best)
         best = np.maximum(best, neighbour)
     way, out = target.ravel(), value.ravel().copy()
     # pointer jumping: every round doubles the length of way that is seen
     while True:
-        out = np.maximum(out, out[way])
-        further = way[way]
+        out = np.maximum(out, out.take(way))
+        further = way.take(way)
         if np.array_equal(further, way):
             return out.reshape(h, w)
         way = further
@@ -367,15 +350,47 @@ def _uphill_maximum(height: Array, value: Array) -> Array:
 
 def _components(mask: Mask, height: Array, strong: Mask, sigma: float) -> Mask:
     """The components of ``mask`` that are pressed in, backed by a strong change and larger than the smoothing."""
-    from scipy import ndimage
-
-    labels, n = ndimage.label(mask)
-    if n == 0:
-        return mask
-    area = np.bincount(labels.ravel(), minlength=n + 1)
-    backed = np.bincount(labels[strong], minlength=n + 1)
-    deepest = np.zeros(n + 1)
-    np.maximum.at(deepest, labels.ravel(), height.ravel())
+    n, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    area, backed = (np.bincount(labels[where], minlength=n) for where in (mask, strong))
+    deepest = np.zeros(n)
+    np.maximum.at(deepest, labels[mask].astype(np.intp), height[mask])
     keep = (area > np.pi * (2 * sigma) ** 2) & (backed > 0) & (deepest > 0.3 * height.max())
     keep[0] = False
     return keep[labels]
+
+
+def _size(change: Array) -> Array:
+    """Of a change of colour (H, W, 3), (H, W)."""
+    return np.sqrt(np.einsum("hwc,hwc->hw", change, change))
+
+
+def _apart(sigma: float) -> int:
+    """Pixels from one to the next that tells something else, where all are smoothed by ``sigma``."""
+    return max(1, round(1.5 * sigma))
+
+
+def _blurred(image: Array, sigma: float) -> Any:
+    """``image`` (H, W, C) smoothed by ``sigma`` [px], in single precision."""
+    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+
+
+def _opened(mask: Mask, n: int) -> Mask:
+    """``mask`` (H, W) without what is not 2 ``n`` pixels wide."""
+    return _morphed(mask, cv2.MORPH_OPEN, n)
+
+
+def _closed(mask: Mask, n: int) -> Mask:
+    """``mask`` (H, W) with what is not 2 ``n`` pixels wide beside it."""
+    return _morphed(mask, cv2.MORPH_CLOSE, n)
+
+
+def _morphed(mask: Mask, operation: int, n: int) -> Mask:
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), operation, cross, iterations=n), bool)
+
+
+def _filled(mask: Mask) -> Mask:
+    """``mask`` (H, W) with its holes: what cannot be reached from outside the image."""
+    around = np.pad(~mask, 1, constant_values=True).astype(np.uint8)
+    _, labels = cv2.connectedComponents(around, connectivity=4)
+    return np.asarray(labels != labels[0, 0])[1:-1, 1:-1]
