@@ -41,11 +41,12 @@ _TOLD = 5  # for each mode that is asked for, cells of which it is worked out wh
 # Power of the joint likelihood at one pose; and the share of their mass that the cells looked into keep, whatever is likely
 # within them. Chosen, as are the next, on scenes that the study does not judge (docs/several-sensors.md)
 _TRUST, _DOUBT = 0.3, 0.03
-# The share that all others keep: at least, at most, and for how likely those looked into are in the mean, as a share of the best
-_ELSEWHERE, _AT_MOST, _AS_LIKELY = 0.05, 0.2, 3.0
+# The share that all others keep: halved by every contact, at most, and for how likely those looked into are in the mean, as a
+# share of the best of them
+_ELSEWHERE, _AT_MOST, _AS_LIKELY = 0.4, 0.2, 5.0
 _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
 # nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
-_ALIKE, _UNLIKE = 3.0, 8.0
+_ALIKE, _UNLIKE = 4.0, 8.0
 _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
 _UNFELT = np.log(0.1)  # that a sensor shows nothing where the object would touch it
 
@@ -132,7 +133,7 @@ def refine_together(
     unexplained = (search.most.sum() - likely.max(initial=-np.inf)) / search.felt
     explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
     mass = posterior.cell_log_density(home) + posterior.index.log_weight[home]
-    share_elsewhere = _share_elsewhere(mass, _TRUST * likely) if search.felt > 1 else 1.0
+    share_elsewhere = _share_elsewhere(mass, _TRUST * likely, search.felt) if search.felt > 1 else 1.0
     doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, share_elsewhere))
     if any(view.contact is not None and view.contact.height is not None for view in views):
         told = float(np.logaddexp.reduce(mass + search.heights(poses), initial=-np.inf))
@@ -143,13 +144,16 @@ def refine_together(
     return replace(posterior, refined=search.told(home[leading], poses[leading]))
 
 
-def _share_elsewhere(log_mass: Array, log_likelihood: Array) -> float:
-    """The share of their mass that cells not looked into keep: a pose as good as the best may lie there, but the more the best of
-    those looked into, with ``log_mass`` (n,) and ``log_likelihood`` (n,), stands out of them, the less likely."""
-    if not len(log_mass):
-        return 1.0
-    in_the_mean = np.logaddexp.reduce(log_mass + log_likelihood) - np.logaddexp.reduce(log_mass)
-    return float(min(_AT_MOST, _ELSEWHERE + _AS_LIKELY * np.exp(in_the_mean - log_likelihood.max())))
+def _share_elsewhere(log_mass: Array, log_likelihood: Array, felt: int) -> float:
+    """The share of their mass that cells not looked into keep: a pose may lie there that explains ``felt`` contacts as well as
+    the best, but seldom, the more of them there are and the more the best of those looked into, with ``log_mass`` (n,) and
+    ``log_likelihood`` (n,), stands out of the others."""
+    if len(log_mass) < 2:
+        return _AT_MOST
+    others = np.arange(len(log_mass)) != log_likelihood.argmax()
+    log_mass, beside = log_mass[others], log_likelihood[others] - log_likelihood.max()
+    in_the_mean = np.logaddexp.reduce(log_mass + beside) - np.logaddexp.reduce(log_mass)
+    return float(min(_AT_MOST, _ELSEWHERE / 2**felt + _AS_LIKELY * np.exp(in_the_mean)))
 
 
 @dataclass(frozen=True, eq=False)
