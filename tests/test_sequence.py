@@ -465,7 +465,7 @@ def test_track_follows_a_folder_that_is_being_filled(command, folder, monkeypatc
 
 
 def test_track_tells_what_is_wrong_in_one_line(command, folder):
-    for source, told in (("absent", "no such folder or video"), ("text.avi", "cannot be read as a video")):
+    for source, told in (("absent", "no such folder, video or camera"), ("text.avi", "cannot be read as a video")):
         (folder.parent / "text.avi").write_text("no video")
         assert told in command(source, status=3).stderr.splitlines()[-1]
     assert "is one image" in command(folder / "f_2.png", status=2).stderr

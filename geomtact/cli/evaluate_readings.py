@@ -39,6 +39,8 @@ def judge_readings(
 
     content = study_file.load(out, SCHEMA)
     sets, methods = readings.imprints(folder), readings.methods()
+    if circles is not None:
+        sets["gelslam"] = readings.imprints_by_eye(folder, circles)
     for name, some in sets.items():
         found = {method: readings.find(some, method, find) for method, find in methods.items()}
         study_file.keep(

@@ -31,13 +31,13 @@ class Effort(StrEnum):
 
 def localize(
     images: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
             metavar="IMAGE...",
-            help="Contact mask, height map or RGB reading; several of them with --sensor-poses.",
+            help="Contact mask, height map or RGB reading; several of them with --sensor-poses; with --watch, a folder.",
             show_default=False,
         ),
-    ],
+    ] = None,
     object_name: Annotated[
         str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")
     ] = None,
@@ -58,6 +58,15 @@ def localize(
     ] = None,
     scorer: ScorerName = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            help="In place of images: number, device or URL of a camera. A line of JSON for its newest image."
+        ),
+    ] = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="The same for the newest image in a folder that is being filled.")
+    ] = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder for result.json, posterior.npz, report.html and report.png.")
     ] = None,
@@ -68,6 +77,9 @@ def localize(
     cache_dir: CacheDir = None,
 ) -> None:
     """Localize a part from one image, or from those of several sensors: print the most probable poses and write a report.
+
+    With --camera or --watch, one image after the other by itself, until Ctrl-C; images that come meanwhile are passed over, and
+    those without contact serve as background.
 
     What is not given is taken from the nearest geomtact.toml (this folder or above), then from the image's metadata.
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in the image.
@@ -89,19 +101,41 @@ def localize(
     check_folder(out)
     if prior is not None and not prior.is_file():
         raise InputError(f"--prior {prior}: no such file; give a posterior.npz")
+    images = images or []
+    live = camera is not None or watch
+    if live:
+        unsuited = {"--out": out, "--sensor-poses": sensor_poses, "--json": as_json or None}
+        _check_live(images, camera, watch, [name for name, value in unsuited.items() if value is not None])
+    elif not images:
+        raise UsageError("expected an image, got none; give one, or --camera 0")
     for image in images:
-        if image.is_dir():
+        if image.is_dir() and not watch:
             raise InputError(
-                f"{image}: is a folder; give the images in it, or follow them as a sequence with 'geomtact track'"
+                f"{image}: is a folder; give the images in it, localize the newest with --watch, or follow them as a sequence "
+                "with 'geomtact track'"
             )
     placed = read_sensor_poses(sensor_poses, len(images)) if sensor_poses is not None else None
     if placed is None and len(images) > 1:
         raise UsageError(f"{len(images)} images need --sensor-poses FILE.json; or localize them one at a time")
-    metadata = read_metadata(images[0])
+    metadata = {} if live else read_metadata(images[0])
     values, sources = resolve(given, metadata)
     _check_name("kind", kind, Kind)
     chosen = values["effort"] or Effort.balanced.value
     _check_name("effort", chosen, Effort, sources.get("effort"))
+
+    if live:
+        from geomtact.cli.frames import camera_frames, newest_in
+        from geomtact.cli.live import localize_live
+        from geomtact.sensing.sensor import Sensor
+
+        # a camera that is not there is told before minutes go into an index
+        size = None if values["sensor"] is None else Sensor.load(values["sensor"]).image_size_px
+        frames = newest_in(images[0]) if camera is None else camera_frames(camera, size)
+        localizer = open_localizer(values, sources, scorer, cache_dir, max_poses)
+        options = {"kind": kind, "prior": prior, "effort": chosen, "seed": seed}
+        if not localize_live(localizer, frames, values["background"], options):
+            raise typer.Exit(NO_CONTACT)
+        return
 
     began = time.perf_counter()
     gels = placed.sensor if placed is not None and placed.sensor is not None else [values["sensor"]] * len(images)
@@ -164,6 +198,25 @@ def localize(
         advice = "a mask's contact is what is not 0" if blank else "give a --background, or say what it is with --kind"
         tell(f"no contact found in {where}; {advice}")
         raise typer.Exit(NO_CONTACT)
+
+
+def _check_live(images: list[Path], camera: str | None, watch: bool, unsuited: list[str]) -> None:
+    """Refuse what does not go with --camera or --watch.
+
+    Raises
+    ------
+    UsageError, InputError
+    """
+    if camera is not None and (images or watch):
+        raise UsageError("--camera stands in place of images and of --watch; give one of them")
+    if watch and len(images) != 1:
+        raise UsageError(f"--watch: expected one folder, got {len(images)}")
+    if watch and not images[0].is_dir():
+        raise InputError(f"--watch: {images[0]} is no folder; give the one that is being filled")
+    if unsuited:
+        raise UsageError(
+            f"{unsuited[0]} does not go with --camera and --watch, which print a line of JSON an image; leave it"
+        )
 
 
 def _check_name(option: str, name: str, known: type[StrEnum], file: str | None = None) -> None:

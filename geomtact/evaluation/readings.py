@@ -127,6 +127,27 @@ def imprints(folder: Path) -> dict[str, list[Imprint]]:
     return {"fots": soft, "objectfolder": hard}
 
 
+def imprints_by_eye(folder: Path, circles: Path) -> list[Imprint]:
+    """The GelSight Mini presses that lie wholly in the window, with the circles drawn by eye that the file ``circles`` holds.
+
+    Raises
+    ------
+    InputError
+        A reading is missing.
+    """
+    background = read_image(_presses(folder) / "background.png")[..., :3]
+    return [
+        Imprint(
+            row["file"],
+            read_image(_presses(folder) / row["file"])[..., :3],
+            background,
+            (float(row["cx_px"]), float(row["cy_px"]), float(row["r_px"])),
+        )
+        for row in circles_of(circles)
+        if row["inside"] == "1"
+    ]
+
+
 def methods() -> dict[str, Method]:
     """From a reading and its background to the contact: ours, and the classical baseline."""
     ours: dict[str, Method] = {name: partial(contact_mask, method=name) for name in METHODS}

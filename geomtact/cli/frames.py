@@ -1,0 +1,205 @@
+"""Where sequences of images come from: folders, videos, cameras, names on standard input; all of them in order, or the newest."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from geomtact.errors import InputError, UsageError
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy")
+_POLL = 0.05  # s between looks into a folder that is being filled
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of a sequence.
+
+    Attributes
+    ----------
+    image : path, or (H, W, 3) RGB
+    time : [s] of a video, or since 1970 from a camera; None where the source tells none
+    passed_over : images that came since the one before, and are not given
+    """
+
+    image: Any
+    time: float | None = None
+    passed_over: int = 0
+
+
+def all_frames(source: str, follow: bool = False) -> Iterator[Frame]:
+    """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
+
+    ``follow`` waits for more images in a folder.
+
+    Raises
+    ------
+    UsageError, InputError
+        At once, where it is no source of frames.
+    """
+    path = Path(source)
+    if source == "-":
+        return _named()
+    if source.isdigit() or path.is_char_device():
+        return camera_frames(source)
+    if path.is_dir():
+        images = listed(path)
+        if not images and not follow:
+            raise InputError(f"{path}: no image in this folder; expected {', '.join(_IMAGES)}")
+        return _followed(path) if follow else (Frame(str(image)) for image in images)
+    if not path.is_file():
+        raise InputError(
+            f"{path}: no such folder, video or camera; give a folder of images, a video, a camera's number, or - for paths"
+        )
+    if path.suffix.lower() in _IMAGES:
+        raise UsageError(f"{path}: is one image; give its folder, or use 'geomtact localize'")
+    return _filmed(path)
+
+
+def listed(folder: Path) -> list[Path]:
+    """The images in a folder by name, numbers in it by value: 2 before 10."""
+    images = (path for path in folder.iterdir() if path.suffix.lower() in _IMAGES and not path.name.startswith("."))
+    return sorted(
+        images, key=lambda path: [(not s.isdigit(), int(s) if s.isdigit() else 0, s) for s in _parts(path.name)]
+    )
+
+
+def newest_in(folder: Path) -> Iterator[Frame]:
+    """The newest image of a folder, then the newest of those that have been written into it meanwhile, for ever."""
+    known: set[Path] = set()
+    sizes: dict[Path, int] = {}
+    while True:
+        came = [path for path in listed(folder) if path not in known]
+        if came:
+            newest = max(came, key=lambda path: path.stat().st_mtime_ns)  # of the same age, the first by name
+            if _whole(newest, sizes):
+                known.update(came)
+                yield Frame(str(newest), passed_over=len(came) - 1)
+                continue
+        time.sleep(_POLL)
+
+
+def camera_frames(source: str, size: tuple[int, int] | None = None) -> Iterator[Frame]:
+    """The newest frame of a camera each time it is asked for, until there are no more; none waits in a queue.
+
+    Parameters
+    ----------
+    source : number of the camera, its device, or a URL
+    size : (width, height) [px] that the camera is asked for
+
+    Raises
+    ------
+    InputError
+        It cannot be opened.
+    """
+    import cv2
+
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+    if not capture.isOpened():
+        raise InputError(
+            f"camera {source}: cannot be opened; give the number of a camera of this computer, its device, or a URL"
+        )
+    if size is not None:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+
+    def read() -> Any:
+        ok, image = capture.read()
+        return image[..., ::-1] if ok else None
+
+    return newest(read, capture.release)
+
+
+def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) -> Iterator[Frame]:
+    """What ``read`` gave last, whenever the next frame is asked for, until it gives None; meanwhile it is called again and again.
+    At last ``close`` is called."""
+    held: deque[Any] = deque(maxlen=1)
+    changed, ended, came, given = threading.Condition(), False, 0, 0
+
+    def keep_reading() -> None:
+        nonlocal ended, came
+        try:
+            while not ended and (image := read()) is not None:
+                with changed:
+                    held.append((image, time.time()))
+                    came += 1
+                    changed.notify()
+        finally:
+            with changed:
+                ended = True
+                changed.notify()
+            close()
+
+    threading.Thread(target=keep_reading, daemon=True).start()
+    try:
+        while True:
+            with changed:
+                changed.wait_for(lambda: held or ended)
+                if not held:
+                    return
+                (image, read_at), passed_over, given = held.pop(), came - given - 1, came
+            yield Frame(image, read_at, passed_over)
+    finally:
+        ended = True
+
+
+def _whole(path: Path, sizes: dict[Path, int]) -> bool:
+    """Whether a file has stopped growing since it was last asked."""
+    size = path.stat().st_size
+    grown = size == 0 or sizes.get(path) != size
+    sizes[path] = size
+    return not grown
+
+
+def _parts(name: str) -> list[str]:
+    return [s for s in re.split(r"(\d+)", name) if s]
+
+
+def _followed(folder: Path) -> Iterator[Frame]:
+    """The images of a folder and those that are written into it, for ever; each once it has stopped growing."""
+    seen: set[Path] = set()
+    sizes: dict[Path, int] = {}
+    while True:
+        for path in listed(folder):
+            if path in seen:
+                continue
+            if not _whole(path, sizes):
+                break  # the images after it wait, so that their order is kept
+            seen.add(path)
+            yield Frame(str(path))
+        time.sleep(_POLL)
+
+
+def _named() -> Iterator[Frame]:
+    """The images named by standard input, a line each."""
+    import sys
+
+    for line in sys.stdin:
+        if line.strip():
+            yield Frame(line.strip())
+
+
+def _filmed(path: Path) -> Iterator[Frame]:
+    """The frames of a video (H, W, 3) RGB."""
+    import cv2
+
+    video = cv2.VideoCapture(str(path))
+    if not video.isOpened():
+        raise InputError(f"{path}: cannot be read as a video; give one that OpenCV reads, or a folder of images")
+
+    def frames() -> Iterator[Frame]:
+        while True:
+            ok, image = video.read()
+            if not ok:
+                break
+            yield Frame(image[..., ::-1], 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC))
+        video.release()
+
+    return frames()

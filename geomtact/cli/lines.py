@@ -1,0 +1,34 @@
+"""What is printed of each image of a sequence: a line of JSON."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from geomtact.inference.posterior import Posterior
+
+
+def line_of(n: int, posterior: Posterior) -> dict[str, Any]:
+    """Of the ``n``-th image: whether it shows contact, and the first mode."""
+    from geomtact.se3 import quat_xyzw
+
+    first = next(iter(posterior.modes(1)), None)
+    return {
+        "frame": n,
+        "contact": posterior.contact,
+        "entropy_nats": posterior.entropy_nats if posterior.contact else None,
+        "probability": None if first is None else first.probability,
+        "T": None if first is None else first.T,
+        "quat_xyzw": None if first is None else quat_xyzw(first.T),
+        "translation_mm": None if first is None else 1e3 * first.T[:3, 3],
+        "warnings": posterior.warnings,
+    }
+
+
+def to_line(line: dict[str, Any]) -> str:
+    """As JSON, without a line break."""
+    import json
+
+    from geomtact.report.result import plain
+
+    return json.dumps(plain(line), allow_nan=False)

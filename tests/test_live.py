@@ -1,0 +1,175 @@
+"""Images localized as they come: the newest wins, none waits, and what shows no contact is the background of the rest."""
+
+import importlib
+import json
+import os
+import threading
+from itertools import count
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from geomtact import InputError, Localizer, Mesh, Sensor
+from geomtact.cli.frames import Frame, all_frames, camera_frames, newest, newest_in
+from geomtact.cli.live import localize_live
+from geomtact.cli.shell import one_line_errors
+from geomtact.sensing.reading import write_image
+from geomtact.sensing.render import example_reading
+
+MINI = Sensor.load("gelsight-mini")
+
+
+@pytest.fixture(scope="module")
+def localizer(tmp_path_factory):
+    import trimesh
+
+    box = trimesh.creation.box((8e-3, 6e-3, 5e-3))
+    mesh = Mesh(box.vertices, box.faces, "box", "m")
+    return Localizer.prepare(mesh, sensor=MINI, max_poses=1500, scorer="iou", cache_dir=tmp_path_factory.mktemp("c"))
+
+
+def test_the_newest_wins_and_what_came_meanwhile_is_counted():
+    """A source of 40 images, of which 9 come while the first is worked on, and 20 more while the next one is."""
+    may_read, has_read, numbers = threading.Semaphore(1), threading.Semaphore(0), count()
+
+    def read():
+        may_read.acquire()
+        n = next(numbers)
+        has_read.release()
+        return n if n < 40 else None
+
+    closed = []
+    frames = newest(read, lambda: closed.append(True))
+
+    def come(n):
+        for _ in range(n):
+            may_read.release()
+        for _ in range(n):
+            has_read.acquire()
+
+    first = next(frames)
+    has_read.acquire()
+    assert (first.image, first.passed_over) == (0, 0)
+    come(9)
+    given = [next(frames)]
+    while given[-1].image < 9:  # the last may not have been put down yet
+        given.append(next(frames))
+    assert given[-1].image == 9 and sum(frame.passed_over + 1 for frame in given) == 9 and len(given) <= 2
+    come(20)
+    while given[-1].image < 29:
+        given.append(next(frames))
+    assert len(given) <= 4, "none waits in a queue"
+    for _ in range(11):
+        may_read.release()
+    rest = list(frames)
+    assert rest[-1].image == 39 and closed == [True]
+    images = [frame.image for frame in (first, *given, *rest)]
+    assert images == sorted(set(images))
+    assert sum(frame.passed_over + 1 for frame in (first, *given, *rest)) == 40
+
+
+def test_a_source_that_is_left_is_closed():
+    closed = threading.Event()
+    frames = newest(count().__next__, closed.set)
+    next(frames)
+    frames.close()
+    assert closed.wait(10)
+
+
+def test_a_folder_gives_its_newest_whole_image(tmp_path):
+    for age, name in enumerate(("c.png", "a.png", "b.png")):
+        write_image(tmp_path / name, np.ones((8, 8), bool))
+        os.utime(tmp_path / name, (100 - age, 100 - age))
+    frames = newest_in(tmp_path)
+    first = next(frames)
+    assert first.image == str(tmp_path / "c.png") and first.passed_over == 2
+    write_image(tmp_path / "d.png", np.ones((8, 8), bool))
+    assert next(frames).image == str(tmp_path / "d.png"), "the older ones do not come again"
+
+
+def test_a_camera_that_is_not_there_is_told():
+    for open_it in (camera_frames, all_frames):
+        with pytest.raises(InputError, match="camera 97: cannot be opened"):
+            open_it("97")
+
+
+@pytest.fixture(scope="module")
+def readings(localizer):
+    """Two touches as a camera sees them, and that camera's background."""
+    rng = np.random.default_rng(3)
+    T = localizer.space.sample(40, rng, (8e-4, 1.2e-3))[0]
+    masks = localizer.space.caster.depths(MINI, T, (48, 64)) > 0
+    large = np.argsort([-mask.mean() if not _cut(mask) else 0 for mask in masks])[:2]
+    depths = [np.maximum(localizer.space.caster.depths(MINI, T[i][None], (240, 320))[0], 0) for i in large]
+    return [example_reading(depth, MINI.pixel_pitch, 1 / 255, rng) for depth in (*depths, np.zeros((240, 320)))]
+
+
+def _cut(mask):
+    return mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()
+
+
+def test_what_shows_no_contact_is_the_background_of_the_rest(localizer, readings, capsys):
+    one, other, empty = readings
+    darker = (0.9 * empty.astype(float)).astype(np.uint8)
+    frames = [Frame(image) for image in (empty, one, darker, (0.9 * other.astype(float)).astype(np.uint8))]
+    seen = []
+
+    class Spy:
+        def localize(self, image, background, **options):
+            seen.append(background)
+            return localizer.localize(image, background=background, **options)
+
+    assert localize_live(Spy(), iter(frames), None, {"kind": "reading", "effort": "fast"})
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["contact"] for line in lines] == [False, True, False, True]
+    assert seen[0] is None and seen[1] is empty and seen[2] is empty and seen[3] is darker
+
+
+def test_an_image_that_is_broken_is_passed_over_but_the_first_is_not(localizer, capsys):
+    whole = np.zeros((240, 320), bool)
+    whole[100:140, 100:160] = True
+    broken = np.zeros((3, 3))
+    with pytest.raises(InputError):
+        localize_live(localizer, iter([Frame(broken), Frame(whole)]), None, {"effort": "fast"})
+    assert localize_live(localizer, iter([Frame(whole), Frame(broken), Frame(whole)]), None, {"effort": "fast"})
+    out, err = capsys.readouterr()
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert [line["frame"] for line in lines] == [1, 3] and "image 2 is passed over" in err
+    assert lines[0]["T"] == lines[1]["T"], "each image is localized by itself"
+
+
+def test_the_command_line(localizer, readings, monkeypatch, tmp_path):
+    module = importlib.import_module("geomtact.cli.localize")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(module, "open_localizer", lambda *_: localizer)
+    app = typer.Typer()
+    app.command()(one_line_errors(module.localize))
+
+    def run(*args):
+        result = CliRunner().invoke(app, [*(str(a) for a in args), "--effort", "fast"])
+        return result.exit_code, result.stdout, " ".join(result.output.split())
+
+    video = cv2.VideoWriter("film.avi", cv2.VideoWriter_fourcc(*"MJPG"), 10, (320, 240))
+    for image in (readings[2], readings[0], readings[0]):
+        video.write(np.ascontiguousarray(image[..., ::-1]))
+    video.release()
+    status, out, _ = run("--camera", "film.avi")
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert status == (0 if any(line["contact"] for line in lines) else 4)
+    assert sum(line["passed_over"] + 1 for line in lines) == 3
+
+    for args, said in (
+        ((), "expected an image, got none"),
+        (("film.avi", "--camera", "0"), "--camera stands in place of images"),
+        (("--watch",), "--watch: expected one folder, got 0"),
+        ((".", "--watch", "--json"), "--json does not go with --camera and --watch"),
+    ):
+        status, _, text = run(*args)
+        assert status == 2 and said in text
+    status, _, text = run("film.avi", "--watch")
+    assert status == 3 and "film.avi is no folder" in text
+    status, _, text = run(".")
+    assert status == 3 and "localize the newest with --watch" in text
