@@ -35,7 +35,7 @@ _KEYS = {
 }
 _COLOUR_KEYS = ("weights", "slope_rms", "height_rms_mm", "contact_depth_mm")
 _REQUIRED = ("name", "image_size_px", "pixel_pitch_mm", "camera_distance_mm", "max_penetration_mm")
-
+_YAML = (".yaml", ".yml")
 
 HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
 
@@ -74,6 +74,14 @@ class Sensor:
             if not ok:
                 raise SensorError(f"sensor {self.name!r}: {what}")
 
+        lengths = (
+            *self.pixel_pitch,
+            self.camera_distance,
+            self.max_penetration,
+            self.membrane_radius,
+            self.height_noise,
+        )
+        need(not np.isinf([*lengths, self.housing_depth or 0]).any(), "a length is infinite; give millimetres")
         need(all(n >= 8 for n in self.image_size_px), f"image_size_px must be at least 8, got {self.image_size_px}")
         pitch_mm = [round(1e3 * p, 9) for p in self.pixel_pitch]
         need(all(p > 0 for p in self.pixel_pitch), f"pixel_pitch_mm must be positive, got {pitch_mm}")
@@ -93,7 +101,7 @@ class Sensor:
 
     @classmethod
     def load(cls, source: str | Path | Sensor) -> Sensor:
-        """A bundled sensor by name, or one from a TOML file.
+        """A bundled sensor by name, or one from a TOML file, or from a YAML file of gs_sdk or TACTO.
 
         Raises
         ------
@@ -106,13 +114,18 @@ class Sensor:
         if text in bundled_sensors():
             return cls.from_toml(_folder().joinpath(f"{text}.toml").read_text("utf-8"), text)
         path = Path(text)
-        if path.suffix == ".toml" or path.is_file():
+        if path.suffix in (".toml", *_YAML) or path.is_file():
             try:
-                return cls.from_toml(path.read_text("utf-8"), str(path))
+                said = path.read_text("utf-8")
             except FileNotFoundError:
                 raise SensorError(f"sensor file {path}: no such file; give a TOML file or a bundled sensor") from None
             except (OSError, UnicodeDecodeError) as error:
                 raise SensorError(f"sensor file {path}: cannot be read ({error}); give a TOML file") from None
+            if path.suffix not in _YAML:
+                return cls.from_toml(said, str(path))
+            from geomtact.sensing.others import sensor_of_yaml
+
+            return sensor_of_yaml(said, str(path))
         raise SensorError(f"no sensor named {text!r}{nearest_name(text, bundled_sensors())}; or give a .toml file")
 
     @classmethod

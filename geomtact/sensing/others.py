@@ -1,0 +1,80 @@
+"""Sensor files of other makers: what gs_sdk and TACTO write of a sensor's geometry, read as a :class:`Sensor`.
+
+Neither says how deep a gel may be pressed in, and gs_sdk nothing of the camera's distance: then 2 mm, and parallel rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomtact.errors import SensorError
+from geomtact.sensing.sensor import Sensor
+
+_DEPTH = 2e-3  # m that an object can press in
+_TACTO_SIZE = (240, 320)  # px; the file does not say
+_KINDS = "one of gs_sdk with ppmm, imgw and imgh, or one of TACTO with sensor: camera and gel"
+
+
+def sensor_of_yaml(text: str, origin: str) -> Sensor:
+    """The sensor that the YAML file of gs_sdk or of TACTO, named ``origin``, describes.
+
+    ``ppmm`` of gs_sdk is millimetres per pixel. TACTO's gel, if curved, is taken for a sphere that falls by ``curvatureMax`` to
+    the gel's corners, seen from the camera's ``position`` with ``yfov``; its picture has 240 x 320 px.
+
+    Raises
+    ------
+    SensorError
+        It is no such file, or says what cannot be.
+    """
+    import yaml
+
+    try:
+        data = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise SensorError(f"{origin}: not valid YAML ({' '.join(str(error).split())}); expected {_KINDS}") from None
+    name = Path(origin).stem
+    try:
+        if isinstance(data, dict) and "ppmm" in data:
+            return _of_gs_sdk(data, name)
+        if isinstance(data, dict) and isinstance(data.get("sensor"), dict):
+            return _of_tacto(data["sensor"], name)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        raise SensorError(f"{origin}: expected {_KINDS}; what this one holds does not do ({error})") from None
+    except SensorError as error:
+        raise SensorError(f"{origin}: {error}") from None
+    raise SensorError(f"{origin}: expected {_KINDS}; or write a TOML file, see 'geomtact sensors'")
+
+
+def _of_gs_sdk(data: Mapping[str, Any], name: str) -> Sensor:
+    pitch = 1e-3 * float(data["ppmm"])
+    return Sensor(
+        str(data.get("device_name") or name),
+        (int(data["imgw"]), int(data["imgh"])),
+        (pitch, pitch),
+        camera_distance=0.0,
+        max_penetration=_DEPTH,
+        note=f"From gs_sdk's file {name}, which says nothing of the camera's distance, the gel's curvature and its depth.",
+    )
+
+
+def _of_tacto(data: Mapping[str, Any], name: str) -> Sensor:
+    camera, gel = data["camera"], data["gel"]
+    camera = camera[0] if isinstance(camera, list) else camera
+    distance = float(np.linalg.norm(np.subtract(gel["origin"], camera["position"], dtype=float)))
+    width, height = _TACTO_SIZE
+    pitch = 2 * distance * float(np.tan(np.radians(float(camera["yfov"])) / 2)) / height
+    fall = float(gel.get("curvatureMax", 0)) if gel.get("curvature") else 0.0
+    corner2 = (float(gel["width"]) ** 2 + float(gel["height"]) ** 2) / 4
+    return Sensor(
+        name,
+        (width, height),
+        (pitch, pitch),
+        distance,
+        _DEPTH,
+        membrane_radius=(corner2 + fall**2) / (2 * fall) if fall > 0 else 0.0,
+        note=f"From TACTO's file {name}, which says nothing of the gel's depth: 2 mm. The picture is taken as 240 x 320 px.",
+    )
