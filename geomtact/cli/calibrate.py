@@ -69,6 +69,10 @@ def calibrate(
     _print(found, ball_mm)
     out.write_text(found.sensor.to_toml(), "utf-8")
     typer.echo(f"wrote {out}: geomtact.contact_height(image, background, {str(out)!r}) tells heights")
+    if sensor is None:
+        typer.echo(
+            "its geometry is a camera with parallel rays before a flat gel, 2 mm deep: write in what you know of it"
+        )
     if plot is not None:
         plot.write_bytes(draw_calibration(found, 1e-3 * ball_mm))
         typer.echo(f"wrote {plot}")

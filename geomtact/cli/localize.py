@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,10 @@ from geomtact.cli.library import CacheDir
 from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit, open_localizer
 from geomtact.cli.shell import NO_CONTACT, check_folder, print_table, tell
 from geomtact.errors import InputError, UsageError, nearest_name
+
+if TYPE_CHECKING:
+    from geomtact.inference.identify import Identification
+    from geomtact.inference.localizer import Localizer
 
 MODES = 5
 
@@ -39,7 +43,11 @@ def localize(
         ),
     ] = None,
     object_name: Annotated[
-        str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")
+        str | None,
+        typer.Option(
+            "--object",
+            help="Part (see 'geomtact objects') or mesh file; if it may be one of several, a folder, or names with commas.",
+        ),
     ] = None,
     unit: Unit = None,
     sensor: SensorName = None,
@@ -85,10 +93,12 @@ def localize(
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in the image.
     """
     import time
-    from dataclasses import replace
+    from dataclasses import asdict, replace
 
+    from geomtact.cli.parts import parts_of
     from geomtact.cli.project import resolve
     from geomtact.cli.sensor_poses import read_sensor_poses
+    from geomtact.inference.identify import identify
     from geomtact.sensing.reading import read_metadata, read_observation
 
     given = {
@@ -123,6 +133,11 @@ def localize(
     chosen = values["effort"] or Effort.balanced.value
     _check_name("effort", chosen, Effort, sources.get("effort"))
 
+    parts = parts_of(values["object"])
+    if len(parts) > 1 and (live or prior is not None):
+        raise UsageError(
+            "--object: several parts go with images alone, not with --camera, --watch or --prior; give one of them"
+        )
     if live:
         from geomtact.cli.frames import camera_frames, newest_in
         from geomtact.cli.live import localize_live
@@ -137,24 +152,29 @@ def localize(
             raise typer.Exit(NO_CONTACT)
         return
 
-    began = time.perf_counter()
     gels = placed.sensor if placed is not None and placed.sensor is not None else [values["sensor"]] * len(images)
     for image, gel in zip(images, gels, strict=True):
         if gel is not None:
             # a bad image is told before minutes go into an index
             read_observation(image, gel, kind, values["background"])
-    opened = {
-        gel: open_localizer({**values, "sensor": gel}, sources, scorer, cache_dir, max_poses)
-        for gel in dict.fromkeys(gels)
-    }
+    timing = {"prepare": 0.0}
+
+    def opened(part: str | None) -> Localizer:
+        began = time.perf_counter()
+        told = sources if part == parts[0] else {}
+        on = {
+            gel: open_localizer({**values, "object": part, "sensor": gel}, told, scorer, cache_dir, max_poses)
+            for gel in dict.fromkeys(gels)
+        }
+        timing["prepare"] += 1e3 * (time.perf_counter() - began)
+        first, *others = (on[gel] for gel in gels)
+        return replace(first, others=tuple(others)) if len(on) > 1 else first
+
     made_of = metadata.get("geomtact:object")
-    if made_of and values["object"] and Path(made_of).stem != Path(values["object"]).stem:
-        tell(f"{images[0]}: was made of {made_of}, as its metadata says, and is localized on {values['object']}")
-    localizer = opened[gels[0]]
-    if len(opened) > 1:
-        localizer = replace(localizer, others=tuple(opened[gel] for gel in gels[1:]))
-    prepared = time.perf_counter()
-    posterior = localizer.localize(
+    if made_of and len(parts) == 1 and parts[0] and Path(made_of).stem != Path(parts[0]).stem:
+        tell(f"{images[0]}: was made of {made_of}, as its metadata says, and is localized on {parts[0]}")
+    found = identify(
+        map(opened, parts),
         [str(image) for image in images],
         kind=kind,
         background=values["background"],
@@ -164,12 +184,15 @@ def localize(
         seed=seed,
         rig=None if placed is None else placed.rig,
     )
+    localizer, posterior = found.localizer, found.posterior
     localized = time.perf_counter()
     modes = posterior.modes(MODES)
+    if len(parts) > 1 and found.foreign:
+        tell("warning: what is shown is unlike all of the parts: is it another one?")
     for warning in posterior.warnings:
         tell(f"warning: {warning}")
 
-    settings = {
+    settings: dict[str, Any] = {
         "image": str(images[0]) if len(images) == 1 else [str(image) for image in images],
         "kind": kind,
         "prior": prior and str(prior),
@@ -177,20 +200,23 @@ def localize(
         "taken_from": sources,
         "cache_dir": cache_dir and str(cache_dir),
     }
-    timing = {"prepare": 1e3 * (prepared - began), "modes": 1e3 * (time.perf_counter() - localized)}
+    told_parts = [asdict(candidate) for candidate in found.candidates] if len(parts) > 1 else None
+    timing["modes"] = 1e3 * (time.perf_counter() - localized)
     if out is not None:
         from geomtact.report.write import write_all
 
-        content = write_all(out, posterior, modes, localizer.simulate, settings, timing)
+        content = write_all(out, posterior, modes, localizer.simulate, settings, timing, told_parts)
     elif as_json:
         from geomtact.report.result import result
 
-        content = result(posterior, modes, settings, timing)
+        content = result(posterior, modes, settings, timing, told_parts)
     if as_json:
         from geomtact.report.result import to_text
 
         typer.echo(to_text(content), nl=False)
     else:
+        if len(parts) > 1:
+            _print_parts(found)
         _print(posterior, modes, out)
     if not posterior.contact:
         where = "the image" if len(images) == 1 else f"any of the {len(images)} images"
@@ -230,6 +256,14 @@ def _check_name(option: str, name: str, known: type[StrEnum], file: str | None =
     if name not in names:
         what = f"no {option} named {name!r}{nearest_name(name, names)}"
         raise InputError(f"{file}: {what}") if file else UsageError(f"--{option}: {what}")
+
+
+def _print_parts(found: Identification) -> None:
+    rows = [
+        [c.name, f"{100 * c.probability:.1f} %", f"{c.log_evidence:.1f}", "yes" if c.unlike else ""]
+        for c in found.candidates
+    ]
+    print_table(("part", "probability", "log evidence", "unlike"), rows, ("probability", "log evidence"))
 
 
 def _print(posterior, modes, out: Path | None) -> None:

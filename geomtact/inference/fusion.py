@@ -151,7 +151,11 @@ def fused_posterior(
         log_evidence=sum(t.log_evidence for t in touches) + fused.log_evidence,
         observations=first.observations + [o for touch in touches if touch is not first for o in touch.observations],
         settings=first.settings
-        | {"T_world_sensor": [t.T_frame_sensor.tolist() for t in touches], "touched": [t.contact for t in touches]},
+        | {
+            "T_world_sensor": [t.T_frame_sensor.tolist() for t in touches],
+            "touched": [t.contact for t in touches],
+            "odd": any(t.settings.get("odd", False) for t in touches),
+        },
         timing_ms=timing,
         warnings=each + ([against] if against else []),
     )

@@ -141,7 +141,9 @@ def refine_together(
     posterior = posterior.shared_anew(home, _TRUST * likely, doubt, elsewhere, _BEFORE, log_prior)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: _TOLD * k]
-    return replace(posterior, refined=search.told(home[leading], poses[leading]))
+    told_at = search.told(home[leading], poses[leading])
+    said = {"unexplained_nats": float(unexplained) if np.isfinite(unexplained) else None}
+    return replace(posterior, refined=told_at, settings=posterior.settings | said)
 
 
 def _share_elsewhere(log_mass: Array, log_likelihood: Array, felt: int) -> float:

@@ -22,6 +22,7 @@ def result(
     modes: Sequence[Mode],
     settings: Mapping[str, Any] | None = None,
     timing_ms: Mapping[str, float] | None = None,
+    parts: Sequence[Mapping[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """The content of ``result.json``, ready for ``json.dumps``.
 
@@ -30,6 +31,7 @@ def result(
     posterior : what was found
     modes : of the posterior, most probable first
     settings, timing_ms : added to the posterior's own; its own settings, which are the resolved ones, go first
+    parts : of which it may be, where there are several, the most probable first
     """
     mesh, sensor = posterior.mesh, posterior.sensor
     return plain(
@@ -37,6 +39,7 @@ def result(
             "schema": SCHEMA,
             "object": {"name": mesh.name, "sha256": mesh.sha256, "unit": mesh.unit},
             "sensor": sensor.name,
+            **({} if parts is None else {"parts": parts}),
             "frame": posterior.frame,
             "contact": bool(posterior.contact),
             "modes": [

@@ -26,6 +26,7 @@ def write_all(
     simulate: Callable[[Array], Contact],
     settings: Mapping[str, Any] | None = None,
     timing_ms: Mapping[str, float] | None = None,
+    parts: Sequence[Mapping[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """Write posterior.npz, report.png, report.html and result.json into ``folder``, which is made if need be.
 
@@ -35,6 +36,7 @@ def write_all(
     posterior, modes : what was found
     simulate : the contact at a pose T_sensor_object, without noise
     settings, timing_ms : added to the posterior's own in result.json
+    parts : of which it may be, where there are several
 
     Returns
     -------
@@ -48,7 +50,7 @@ def write_all(
     picture = draw(posterior, modes, summaries, simulate)
     write_whole(folder / "report.png", lambda path: path.write_bytes(picture.whole))
     timing = {**(timing_ms or {}), "report": 1e3 * (time.perf_counter() - began)}
-    content = result(posterior, modes, settings, timing)
+    content = result(posterior, modes, settings, timing, parts)
     html = page(content, table(summaries), [*facts(posterior), *caution(summaries)], picture.bands)
     write_whole(folder / "report.html", lambda path: path.write_text(html, "utf-8"))
     write_whole(folder / "result.json", lambda path: path.write_text(to_text(content), "utf-8"))

@@ -1,0 +1,34 @@
+"""Several parts by one --object: names with commas between them, or a folder of mesh files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from geomtact.errors import InputError
+
+_MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")
+
+
+def parts_of(object_name: str | None) -> list[str | None]:
+    """The parts that ``--object`` names, each as it would be named alone; bundled parts of a folder by their names.
+
+    Raises
+    ------
+    InputError
+        A folder without meshes, or a part named twice.
+    """
+    if object_name is None:
+        return [None]
+    folder = Path(object_name)
+    if not folder.is_dir():
+        names = [name.strip() for name in object_name.split(",")] if not folder.exists() else [object_name]
+        if len(set(names)) < len(names) or "" in names:
+            raise InputError(f"--object {object_name}: expected each part once, with a comma between two")
+        return list(names)
+    from geomtact.geometry.catalogue import catalogue
+
+    bundled = {entry.file.resolve(): name for name, entry in catalogue().items()}
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _MESHES)
+    if not files:
+        raise InputError(f"--object {folder}: no mesh in this folder; expected {', '.join(_MESHES)}")
+    return [bundled.get(path.resolve(), str(path)) for path in files]

@@ -1,0 +1,122 @@
+"""Which of several parts is it? By how likely each makes what the sensors show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from geomtact.errors import NoPoseAgreesError, UsageError
+from geomtact.inference.posterior import Posterior
+from geomtact.se3 import Array
+
+if TYPE_CHECKING:
+    from geomtact.inference.localizer import Localizer
+
+UNEXPLAINED = 8.0  # nats a contact, by which the best pose falls behind those that suit each sensor best: not this part
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One of the parts that it may be.
+
+    Attributes
+    ----------
+    name : of the part
+    probability : that it is this one, of those given
+    log_evidence : of what is shown, if it is; -inf where no pose agrees with all sensors
+    unlike : whether hardly any touch of this part is so unlikely, or no pose explains all contacts
+    """
+
+    name: str
+    probability: float
+    log_evidence: float
+    unlike: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """The part, and its pose.
+
+    Attributes
+    ----------
+    candidates : the most probable first
+    localizer, posterior : of the most probable part
+    """
+
+    candidates: list[Candidate]
+    localizer: Localizer
+    posterior: Posterior
+
+    @property
+    def foreign(self) -> bool:
+        """Whether what is shown is unlike all of the parts."""
+        return all(candidate.unlike for candidate in self.candidates)
+
+
+def identify(
+    localizers: Iterable[Localizer], image: Any, weights: Sequence[float] | None = None, **options: Any
+) -> Identification:
+    """The probabilities of parts, and the pose of the most probable, given what one sensor shows, or several.
+
+    Parameters
+    ----------
+    localizers : one a part, all prepared for the same sensors; of a generator, the best so far is held and one other
+    image : as of ``Localizer.localize``
+    weights : (n,) how probable each part is beforehand, up to a factor; all alike by default
+    options : of ``Localizer.localize``; a ``prior`` would be of each part's own frame
+
+    Raises
+    ------
+    UsageError
+        There is no part, or not one weight for each.
+    NoPoseAgreesError
+        Of no part.
+    """
+    names: list[str] = []
+    evidence: list[float] = []
+    unlike: list[bool] = []
+    best: tuple[float, Localizer, Posterior] | None = None
+    known = None if weights is None else _log_weights(weights)
+    for i, localizer in enumerate(localizers):
+        if known is not None and i >= len(known):
+            raise UsageError(f"identify: expected a weight for each part, got {len(known)} for more")
+        names.append(localizer.mesh.name)
+        try:
+            posterior = localizer.localize(image, **options)
+        except NoPoseAgreesError as error:
+            evidence.append(-np.inf)
+            unlike.append(True)
+            last_error = error
+            continue
+        evidence.append(posterior.log_evidence)
+        unlike.append(_is_unlike(posterior))
+        merit = evidence[-1] + (0.0 if known is None else float(known[i]))
+        if best is None or merit > best[0]:
+            best = merit, localizer, posterior
+    if not names:
+        raise UsageError("identify: expected parts to choose from, got none")
+    if known is not None and len(known) != len(names):
+        raise UsageError(f"identify: expected a weight for each of {len(names)} parts, got {len(known)}")
+    if best is None:
+        raise last_error
+    merits = np.array(evidence) + (0.0 if known is None else known)
+    probability = np.exp(merits - np.logaddexp.reduce(merits))
+    order = np.argsort(-probability, kind="stable")
+    candidates = [Candidate(names[i], float(probability[i]), evidence[i], unlike[i]) for i in order]
+    return Identification(candidates, best[1], best[2])
+
+
+def _log_weights(weights: Sequence[float]) -> Array:
+    given = np.asarray(weights, float)
+    if given.ndim != 1 or not np.isfinite(given).all() or (given < 0).any() or not given.sum() > 0:
+        raise UsageError(f"identify: expected weights >= 0, one a part, got {weights}")
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(given / given.sum()))
+
+
+def _is_unlike(posterior: Posterior) -> bool:
+    unexplained = posterior.settings.get("unexplained_nats", 0.0)
+    return posterior.contact and (posterior.settings["odd"] or unexplained is None or unexplained > UNEXPLAINED)

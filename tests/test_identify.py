@@ -1,0 +1,162 @@
+"""Which part is it: probabilities of parts by their evidence."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+
+from geomtact import InputError, Localizer, Mesh, UsageError
+from geomtact.cli.parts import parts_of
+from geomtact.errors import NoPoseAgreesError
+from geomtact.inference.identify import identify
+from geomtact.sensing.reading import write_image
+
+
+@pytest.fixture(scope="module")
+def drawer(tmp_path_factory):
+    """Three parts unlike each other."""
+    folder = tmp_path_factory.mktemp("cache")
+
+    def part(name, shape):
+        mesh = Mesh(shape.vertices, shape.faces, name, "m")
+        return Localizer.prepare(mesh, sensor="gelslim", max_poses=4000, scorer="moments", cache_dir=folder)
+
+    return [
+        part("rod", trimesh.creation.box((60e-3, 3e-3, 3e-3))),
+        part("ball", trimesh.creation.icosphere(3, 12e-3)),
+        part("block", trimesh.creation.box((30e-3, 30e-3, 30e-3))),
+    ]
+
+
+def touches(localizer, n=1, seed=0):
+    """What the sensor feels at poses drawn from the contact pose space."""
+    T = localizer.space.sample(n, np.random.default_rng(seed), (3e-4, 1.5e-3))[0]
+    return [localizer.simulate(each).mask for each in T]
+
+
+def test_touches_are_told_from_those_of_other_parts(drawer):
+    """In the mean own evidence is no smaller than another part's (a Kullback-Leibler divergence is not negative). A ball's is
+    larger by far; the corners of a rod and of a block are alike. Few touches are called unlike their own part."""
+    unlike = []
+    for own in drawer:
+        found = [
+            {c.name: c for c in identify(drawer, mask, kind="mask", effort="fast").candidates}
+            for mask in touches(own, 40)
+        ]
+        unlike += [each[own.mesh.name].unlike for each in found]
+        for other in drawer:
+            gain = [each[own.mesh.name].log_evidence - each[other.mesh.name].log_evidence for each in found]
+            assert np.mean(gain) >= -3 * np.std(gain) / np.sqrt(len(gain))
+            if own is not other and "ball" in (own.mesh.name, other.mesh.name):
+                assert np.mean(gain) > 1
+    assert np.mean(unlike) < 0.05
+
+
+def test_the_most_probable_comes_first_with_its_posterior(drawer):
+    for own in drawer:
+        found = identify(drawer, touches(own)[0], kind="mask", effort="fast")
+        probabilities = [c.probability for c in found.candidates]
+        assert sum(probabilities) == pytest.approx(1) and probabilities == sorted(probabilities)[::-1]
+        assert found.posterior.mesh is found.localizer.mesh and found.localizer.mesh.name == found.candidates[0].name
+
+
+def test_probabilities_are_evidence_times_weights(drawer):
+    mask = touches(drawer[1])[0]
+    alike = {c.name: c for c in identify(drawer, mask, kind="mask", effort="fast").candidates}
+    for name, candidate in alike.items():
+        own = next(each for each in drawer if each.mesh.name == name)
+        assert candidate.log_evidence == own.localize(mask, "mask", effort="fast").log_evidence
+    weights = (1.0, 2.0, 0.0)
+    found = {
+        c.name: c.probability for c in identify(iter(drawer), mask, weights, kind="mask", effort="fast").candidates
+    }
+    assert found["block"] == 0
+    expected = 2 * alike["ball"].probability / alike["rod"].probability
+    assert found["ball"] / found["rod"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("said", "unlike"),
+    [
+        ({"odd": False}, False),
+        ({"odd": True}, True),
+        ({"odd": False, "unexplained_nats": 7.9}, False),
+        ({"odd": False, "unexplained_nats": 8.1}, True),
+        ({"odd": False, "unexplained_nats": None}, True),
+    ],
+)
+def test_unlike_all_is_what_is_odd_or_unexplained_of_each(drawer, said, unlike):
+    def localizer(said):
+        posterior = SimpleNamespace(contact=True, log_evidence=0.0, settings=said)
+        return SimpleNamespace(mesh=drawer[0].mesh, localize=lambda image: posterior)
+
+    assert identify([localizer(said)], None).foreign == unlike
+    assert not identify([localizer(said), localizer({"odd": False})], None).foreign, "one that it is like is enough"
+
+
+def test_no_contact_tells_nothing(drawer):
+    found = identify(drawer, np.zeros((320, 427), bool), kind="mask", effort="fast")
+    assert not found.posterior.contact and not found.foreign
+    assert [c.probability for c in found.candidates] == pytest.approx([1 / 3] * 3)
+
+
+def test_a_part_that_no_pose_of_agrees_is_out(drawer, monkeypatch):
+    mask = touches(drawer[1])[0]
+
+    def refuses(self, *args, **kwargs):
+        raise NoPoseAgreesError("none")
+
+    class Refusing:
+        mesh = drawer[0].mesh
+        localize = refuses
+
+    found = identify([Refusing(), drawer[1]], mask, kind="mask", effort="fast")
+    assert found.localizer is drawer[1] and found.candidates[1].probability == 0 and found.candidates[1].unlike
+    with pytest.raises(NoPoseAgreesError):
+        identify([Refusing()], mask)
+
+
+@pytest.mark.parametrize("weights", [(1.0,), (1.0, 1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (0.0, 0.0, 0.0), (np.nan, 1, 1)])
+def test_weights_that_do_not_fit_are_refused(drawer, weights):
+    with pytest.raises(UsageError, match="identify: expected"):
+        identify(drawer, touches(drawer[0])[0], weights, kind="mask", effort="fast")
+    with pytest.raises(UsageError, match="expected parts"):
+        identify([], None)
+
+
+def test_parts_by_a_folder_and_by_names(tmp_path):
+    assert parts_of(None) == [None] and parts_of("pin") == ["pin"] and parts_of("pin, head") == ["pin", "head"]
+    meshes = Path(__file__).parents[1] / "meshes"
+    assert "pin" in parts_of(str(meshes)) and len(parts_of(str(meshes))) == 10
+    with pytest.raises(InputError, match="no mesh in this folder"):
+        parts_of(str(tmp_path))
+    with pytest.raises(InputError, match="each part once"):
+        parts_of("pin,pin")
+    for name in ("b.stl", "a.ply", "note.txt"):
+        (tmp_path / name).touch()
+    assert parts_of(str(tmp_path)) == [str(tmp_path / "a.ply"), str(tmp_path / "b.stl")]
+    odd = tmp_path / "a,b.stl"
+    odd.touch()
+    assert parts_of(str(odd)) == [str(odd)], "a file's name may hold a comma"
+
+
+def test_the_command_line_tells_the_part(drawer, tmp_path):
+    (tmp_path / "parts").mkdir()
+    for localizer in drawer[:2]:
+        mesh = localizer.mesh
+        trimesh.Trimesh(1e3 * mesh.vertices, mesh.faces).export(tmp_path / "parts" / f"{mesh.name}.stl")
+    write_image(tmp_path / "touch.png", touches(drawer[1], seed=2)[0])
+    run = [sys.executable, "-m", "geomtact", "localize", "touch.png", "--object", "parts", "--unit", "mm"]
+    run += ["--sensor", "gelslim", "--max-poses", "1500", "--scorer", "moments", "--effort", "fast", "--cache-dir", "c"]
+    done = subprocess.run([*run, "--out", "out"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    said = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert said["object"]["name"] == "ball" and [part["name"] for part in said["parts"]] == ["ball", "rod"]
+    assert "log evidence" in done.stdout
+    refused = subprocess.run([*run, "--prior", "out/posterior.npz"], cwd=tmp_path, capture_output=True, text=True)
+    assert refused.returncode == 2 and "several parts go with images alone" in " ".join(refused.stderr.split())
