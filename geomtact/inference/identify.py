@@ -71,7 +71,7 @@ def identify(
     Raises
     ------
     UsageError
-        There is no part, or not one weight for each.
+        There is no part, or not one weight for each; or none with a weight could show this.
     NoPoseAgreesError
         Of no part.
     """
@@ -103,6 +103,10 @@ def identify(
     if best is None:
         raise last_error
     merits = np.array(evidence) + (0.0 if known is None else known)
+    if merits.max() == -np.inf:
+        raise UsageError(
+            "identify: no pose of a part whose weight is above 0 agrees with the images; give others a weight"
+        )
     probability = np.exp(merits - np.logaddexp.reduce(merits))
     order = np.argsort(-probability, kind="stable")
     candidates = [Candidate(names[i], float(probability[i]), evidence[i], unlike[i]) for i in order]

@@ -232,10 +232,10 @@ class Localizer:
             log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
             evidence, likeliest = self.scorer.witness.evidence(self.index, mask, log_prior)
             posterior = Posterior(self.index, rows.first, log_prob, runs=rows.runs, log_evidence=evidence, **common)
-        posterior.settings["odd"] = odd = self.scorer.witness.odd(evidence, likeliest)
-        if prior is None and odd:
+        odd = prior is None and self.scorer.witness.odd(evidence, likeliest)
+        if odd:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
-        return replace(posterior, warnings=warnings)
+        return replace(posterior, warnings=warnings, settings=posterior.settings | {"odd": odd})
 
     def simulate(self, T_sensor_object: Any) -> Contact:
         """What the sensor would see at a pose (4, 4), without noise (thesis 6.1.3)."""
