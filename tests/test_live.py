@@ -5,6 +5,7 @@ import json
 import os
 import threading
 from itertools import count
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -90,6 +91,26 @@ def test_a_folder_gives_its_newest_whole_image(tmp_path):
     assert next(frames).image == str(tmp_path / "d.png"), "the older ones do not come again"
 
 
+def test_a_folder_that_fills_faster_than_it_is_looked_at_is_not_waited_for(tmp_path):
+    filled = threading.Event()
+
+    def fill():
+        for i in range(60):
+            path = tmp_path / f"{i}.png"
+            path.write_bytes(b"an image")
+            (tmp_path / f"{i - 5}.png").unlink(missing_ok=True)
+            if filled.wait(0.02):
+                return
+
+    writer = threading.Thread(target=fill)
+    writer.start()
+    frames = newest_in(tmp_path)
+    numbers = [int(Path(next(frames).image).stem) for _ in range(5)]
+    filled.set()
+    writer.join()
+    assert numbers == sorted(set(numbers)) and numbers[-1] < 60
+
+
 def test_a_camera_that_is_not_there_is_told():
     for open_it in (camera_frames, all_frames):
         with pytest.raises(InputError, match="camera 97: cannot be opened"):
@@ -111,10 +132,12 @@ def _cut(mask):
     return mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()
 
 
-def test_what_shows_no_contact_is_the_background_of_the_rest(localizer, readings, capsys):
+def live(images):
+    yield from (Frame(image) for image in images)
+
+
+def test_the_first_without_contact_is_the_background_of_the_rest(localizer, readings, capsys):
     one, other, empty = readings
-    darker = (0.9 * empty.astype(float)).astype(np.uint8)
-    frames = [Frame(image) for image in (empty, one, darker, (0.9 * other.astype(float)).astype(np.uint8))]
     seen = []
 
     class Spy:
@@ -122,10 +145,14 @@ def test_what_shows_no_contact_is_the_background_of_the_rest(localizer, readings
             seen.append(background)
             return localizer.localize(image, background=background, **options)
 
-    assert localize_live(Spy(), iter(frames), None, {"kind": "reading", "effort": "fast"})
+    options = {"kind": "reading", "effort": "fast"}
+    assert localize_live(Spy(), live([empty, one, empty + np.uint8(1), other]), None, options)
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["contact"] for line in lines] == [False, True, False, True]
-    assert seen[0] is None and seen[1] is empty and seen[2] is empty and seen[3] is darker
+    assert seen[0] is None and all(np.array_equal(background, empty) for background in seen[1:])
+    seen.clear()
+    localize_live(Spy(), live([empty, one]), empty, options)
+    assert seen == [empty, empty], "a given one is kept"
 
 
 def test_an_image_that_is_broken_is_passed_over_but_the_first_is_not(localizer, capsys):
@@ -133,8 +160,8 @@ def test_an_image_that_is_broken_is_passed_over_but_the_first_is_not(localizer, 
     whole[100:140, 100:160] = True
     broken = np.zeros((3, 3))
     with pytest.raises(InputError):
-        localize_live(localizer, iter([Frame(broken), Frame(whole)]), None, {"effort": "fast"})
-    assert localize_live(localizer, iter([Frame(whole), Frame(broken), Frame(whole)]), None, {"effort": "fast"})
+        localize_live(localizer, live([broken, whole]), None, {"effort": "fast"})
+    assert localize_live(localizer, live([whole, broken, whole]), None, {"effort": "fast"})
     out, err = capsys.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
     assert [line["frame"] for line in lines] == [1, 3] and "image 2 is passed over" in err

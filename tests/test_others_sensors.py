@@ -61,9 +61,16 @@ def test_it_may_be_written_out_as_toml(tmp_path):
         ("ppmm: 0.06\nimgw: 320", "does not do \\('imgh'\\)"),
         ("ppmm: [1]\nimgw: 320\nimgh: 240", "does not do"),
         ("ppmm: -1\nimgw: 320\nimgh: 240", "pixel_pitch_mm must be positive"),
-        ("sensor: {camera: [], gel: {}}", "does not do"),
-        ("sensor: {camera: [{position: [0, 0], yfov: 60}], gel: {origin: [0, 0, 1]}}", "does not do"),
-        ("ppmm: .inf\nimgw: 320\nimgh: 240", "a length is infinite"),
+        ("sensor: {camera: [], gel: {}}", "expected one camera"),
+        ("sensor: {camera: [{position: [0, 0], yfov: 60}], gel: {origin: [0, 0, 1]}}", "the gel before the camera"),
+        ("ppmm: .inf\nimgw: 320\nimgh: 240", "millimetres per pixel"),
+        ("ppmm: 15.8\nimgw: 320\nimgh: 240", "millimetres per pixel in gs_sdk, and 15.8 are too many"),
+        ("ppmm: 0.06\nimgw: 320.7\nimgh: 240", "whole numbers, got 320.7"),
+        ("ppmm: !!bool x", "not valid YAML"),
+        ("ppmm: !!timestamp abc", "not valid YAML"),
+        (TACTO.replace("    - cam0:", "    - cam0:\n    - cam1:") % "True", "does not do|one camera"),
+        (TACTO.replace("width: 0.03", "mesh: gel.obj") % "True", "expected one camera before a flat or spherical gel"),
+        (TACTO.replace("0.02, 0", "-0.02, 0") % "True", "the gel before the camera"),
         ("ppmm: .nan\nimgw: 320\nimgh: 240", "pixel_pitch_mm must be positive"),
         ("!!python/object/apply:os.system ['true']", "not valid YAML"),
     ],
@@ -72,3 +79,11 @@ def test_what_is_wrong_is_told_in_one_line(tmp_path, text, told):
     with pytest.raises(SensorError, match=told) as error:
         Sensor.load(written(tmp_path, text))
     assert "\n" not in str(error.value) and "mine.yaml" in str(error.value)
+
+
+def test_a_length_without_end_is_refused(tmp_path):
+    text = Sensor.load("digit").to_toml()
+    for key in ("pixel_pitch_mm = [inf, inf]", "camera_distance_mm = inf", "membrane_radius_mm = inf"):
+        lines = [key if line.startswith(key.split(" =")[0]) else line for line in text.splitlines()]
+        with pytest.raises(SensorError, match="a length is infinite"):
+            Sensor.from_toml("\n".join(lines))

@@ -6,7 +6,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,10 +33,10 @@ class Frame:
     passed_over: int = 0
 
 
-def all_frames(source: str, follow: bool = False) -> Iterator[Frame]:
+def all_frames(source: str, follow: bool = False, size: tuple[int, int] | None = None) -> Iterator[Frame]:
     """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
 
-    ``follow`` waits for more images in a folder.
+    ``follow`` waits for more images in a folder; ``size`` is as of :func:`camera_frames`.
 
     Raises
     ------
@@ -46,13 +46,13 @@ def all_frames(source: str, follow: bool = False) -> Iterator[Frame]:
     path = Path(source)
     if source == "-":
         return _named()
-    if source.isdigit() or path.is_char_device():
-        return camera_frames(source)
     if path.is_dir():
         images = listed(path)
         if not images and not follow:
             raise InputError(f"{path}: no image in this folder; expected {', '.join(_IMAGES)}")
         return _followed(path) if follow else (Frame(str(image)) for image in images)
+    if path.is_char_device() or (source.isdigit() and not path.exists()):
+        return camera_frames(source, size)
     if not path.is_file():
         raise InputError(
             f"{path}: no such folder, video or camera; give a folder of images, a video, a camera's number, or - for paths"
@@ -70,22 +70,21 @@ def listed(folder: Path) -> list[Path]:
     )
 
 
-def newest_in(folder: Path) -> Iterator[Frame]:
-    """The newest image of a folder, then the newest of those that have been written into it meanwhile, for ever."""
+def newest_in(folder: Path) -> Generator[Frame, None, None]:
+    """The newest whole image of a folder, then the newest of those that have been written into it meanwhile, for ever."""
     known: set[Path] = set()
     sizes: dict[Path, int] = {}
     while True:
-        came = [path for path in listed(folder) if path not in known]
-        if came:
-            newest = max(came, key=lambda path: path.stat().st_mtime_ns)  # of the same age, the first by name
-            if _whole(newest, sizes):
-                known.update(came)
-                yield Frame(str(newest), passed_over=len(came) - 1)
-                continue
-        time.sleep(_POLL)
+        came = sorted((path for path in listed(folder) if path not in known), key=_age)
+        whole = [i for i, path in enumerate(came) if _whole(path, sizes)]
+        if whole:
+            known.update(came[: whole[-1] + 1])
+            yield Frame(str(came[whole[-1]]), passed_over=whole[-1])
+        else:
+            time.sleep(_POLL)
 
 
-def camera_frames(source: str, size: tuple[int, int] | None = None) -> Iterator[Frame]:
+def camera_frames(source: str, size: tuple[int, int] | None = None) -> Generator[Frame, None, None]:
     """The newest frame of a camera each time it is asked for, until there are no more; none waits in a queue.
 
     Parameters
@@ -96,7 +95,7 @@ def camera_frames(source: str, size: tuple[int, int] | None = None) -> Iterator[
     Raises
     ------
     InputError
-        It cannot be opened.
+        It cannot be opened, or gives no image.
     """
     import cv2
 
@@ -114,10 +113,13 @@ def camera_frames(source: str, size: tuple[int, int] | None = None) -> Iterator[
         ok, image = capture.read()
         return image[..., ::-1] if ok else None
 
-    return newest(read, capture.release)
+    first = [read()]
+    if first[0] is None:
+        raise InputError(f"camera {source}: gives no image; does another program use it?")
+    return newest(lambda: first.pop() if first else read(), capture.release)
 
 
-def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) -> Iterator[Frame]:
+def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) -> Generator[Frame, None, None]:
     """What ``read`` gave last, whenever the next frame is asked for, until it gives None; meanwhile it is called again and again.
     At last ``close`` is called."""
     held: deque[Any] = deque(maxlen=1)
@@ -137,7 +139,8 @@ def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) ->
                 changed.notify()
             close()
 
-    threading.Thread(target=keep_reading, daemon=True).start()
+    reader = threading.Thread(target=keep_reading, daemon=True)
+    reader.start()
     try:
         while True:
             with changed:
@@ -148,11 +151,23 @@ def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) ->
             yield Frame(image, read_at, passed_over)
     finally:
         ended = True
+        reader.join(2)  # else it would be within OpenCV still when Python ends
+
+
+def _age(path: Path) -> tuple[int, str]:
+    """Orders files by when they were last written to; one that has gone comes first."""
+    try:
+        return path.stat().st_mtime_ns, path.name
+    except FileNotFoundError:
+        return 0, path.name
 
 
 def _whole(path: Path, sizes: dict[Path, int]) -> bool:
-    """Whether a file has stopped growing since it was last asked."""
-    size = path.stat().st_size
+    """Whether a file has stopped growing since it was last asked; one that has gone is not whole."""
+    try:
+        size = path.stat().st_size
+    except FileNotFoundError:
+        size = 0
     grown = size == 0 or sizes.get(path) != size
     sizes[path] = size
     return not grown

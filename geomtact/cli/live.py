@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
 
 
-def localize_live(localizer: Localizer, frames: Iterator[Frame], background: Any, options: dict[str, Any]) -> bool:
+def localize_live(
+    localizer: Localizer, frames: Generator[Frame, None, None], background: Any, options: dict[str, Any]
+) -> bool:
     """Print a line of JSON for each of the ``frames``, until there are no more or Ctrl-C; whether any showed contact.
 
-    A reading that shows none is the background of those after it, so that slow drifts of its light do no harm. After the first,
-    an image that cannot be read is told, and passed over.
+    Without a ``background``, the first reading that shows none is that of those after it. An image that cannot be read is told,
+    and passed over, but for the first.
     """
     touched = False
     try:
@@ -35,8 +37,8 @@ def localize_live(localizer: Localizer, frames: Iterator[Frame], background: Any
                 tell(f"warning: image {n} is passed over: {error}")
                 continue
             touched |= posterior.contact
-            if not posterior.contact and posterior.observation.kind == "reading":
-                background = frame.image
+            if background is None and not posterior.contact and posterior.observation.kind == "reading":
+                background = posterior.observation.image
             line = line_of(n, posterior)
             own = {
                 "image": frame.image if isinstance(frame.image, str) else None,
@@ -46,4 +48,6 @@ def localize_live(localizer: Localizer, frames: Iterator[Frame], background: Any
             typer.echo(to_line(line | own | {"ms": 1e3 * (time.perf_counter() - began)}))
     except KeyboardInterrupt:
         tell("stopped")
+    finally:
+        frames.close()
     return touched

@@ -87,7 +87,7 @@ def localize(
     """Localize a part from one image, or from those of several sensors: print the most probable poses and write a report.
 
     With --camera or --watch, one image after the other by itself, until Ctrl-C; images that come meanwhile are passed over, and
-    those without contact serve as background.
+    the first without contact serves as background if none is given.
 
     What is not given is taken from the nearest geomtact.toml (this folder or above), then from the image's metadata.
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in the image.
@@ -98,6 +98,7 @@ def localize(
     from geomtact.cli.parts import parts_of
     from geomtact.cli.project import resolve
     from geomtact.cli.sensor_poses import read_sensor_poses
+    from geomtact.geometry.catalogue import catalogue
     from geomtact.inference.identify import identify
     from geomtact.sensing.reading import read_metadata, read_observation
 
@@ -138,6 +139,8 @@ def localize(
         raise UsageError(
             "--object: several parts go with images alone, not with --camera, --watch or --prior; give one of them"
         )
+    if len(parts) == 1:
+        values["object"] = parts[0]
     if live:
         from geomtact.cli.frames import camera_frames, newest_in
         from geomtact.cli.live import localize_live
@@ -162,8 +165,10 @@ def localize(
     def opened(part: str | None) -> Localizer:
         began = time.perf_counter()
         told = sources if part == parts[0] else {}
+        # in a folder of several, bundled parts have units of their own
+        own = {"object": part, "unit": None if len(parts) > 1 and part in catalogue() else values["unit"]}
         on = {
-            gel: open_localizer({**values, "object": part, "sensor": gel}, told, scorer, cache_dir, max_poses)
+            gel: open_localizer({**values, **own, "sensor": gel}, told, scorer, cache_dir, max_poses)
             for gel in dict.fromkeys(gels)
         }
         timing["prepare"] += 1e3 * (time.perf_counter() - began)

@@ -17,16 +17,16 @@ def parts_of(object_name: str | None) -> list[str | None]:
     InputError
         A folder without meshes, or a part named twice.
     """
-    if object_name is None:
-        return [None]
+    from geomtact.geometry.catalogue import catalogue
+
+    if object_name is None or object_name in catalogue():
+        return [object_name]
     folder = Path(object_name)
     if not folder.is_dir():
         names = [name.strip() for name in object_name.split(",")] if not folder.exists() else [object_name]
         if len(set(names)) < len(names) or "" in names:
             raise InputError(f"--object {object_name}: expected each part once, with a comma between two")
         return list(names)
-    from geomtact.geometry.catalogue import catalogue
-
     bundled = {entry.file.resolve(): name for name, entry in catalogue().items()}
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _MESHES)
     if not files:

@@ -92,6 +92,7 @@ def read(path: Path) -> dict[str, str]:
             raise InputError(f"{path}: unknown key {key!r}{nearest_name(key, KEYS)}")
         if not isinstance(value, str):
             raise InputError(f"{path}: {key} must be text in quotes, got {value!r}")
-        if key in ("object", "sensor", "background") and (path.parent / value).is_file():
-            entries[key] = str(path.parent / value)
+        beside = path.parent / value
+        if key in ("object", "sensor", "background") and (beside.is_file() or (key == "object" and beside.is_dir())):
+            entries[key] = str(beside)
     return entries

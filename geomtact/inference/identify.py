@@ -104,9 +104,7 @@ def identify(
         raise last_error
     merits = np.array(evidence) + (0.0 if known is None else known)
     if merits.max() == -np.inf:
-        raise UsageError(
-            "identify: no pose of a part whose weight is above 0 agrees with the images; give others a weight"
-        )
+        raise UsageError("identify: none of the parts whose weight is above 0 can show this; give others a weight")
     probability = np.exp(merits - np.logaddexp.reduce(merits))
     order = np.argsort(-probability, kind="stable")
     candidates = [Candidate(names[i], float(probability[i]), evidence[i], unlike[i]) for i in order]

@@ -25,6 +25,7 @@ LEAST = 0.05  # nats below which an action does not help
 _CELLS = 128  # drawn from the posterior
 # Of many actions, so many are tried at all poses, for they tell most at so many of one in so many cells
 _CLOSELY, _WITHIN, _ONE_IN = 24, 3, 4
+_LEAST_CELLS = 32  # of which that is done
 # Standard deviations at one pose: of where the sensor stops and of the contact's centre [m], and of the contact's log area,
 # log size and stretches. Those of touches with the calibration's noise, half of them elastic, on five parts.
 _BLUR, _NOISE = 0.3e-3, (0.4, 0.15, 0.17, 0.17)
@@ -90,7 +91,7 @@ def next_touch(
     if not tried:
         raise UsageError("next_touch: no actions to choose from; give some, or none at all for a grid of touches")
     T = draw_cells(posterior, n, np.random.default_rng(seed), len(PRESSED))
-    few = T[:_WITHIN, ::_ONE_IN] if len(tried) > _CLOSELY else T
+    few = T[:_WITHIN, ::_ONE_IN] if len(tried) > _CLOSELY and n >= _LEAST_CELLS else T
     judged = _ranked(judge(posterior.space, action, few, number) for number, action in enumerate(tried, 1))
     if few is T:
         return judged
@@ -166,7 +167,7 @@ def discarded(likelihood: Array) -> float:
 
 def ambiguity(ranked: Sequence[Action]) -> str | None:
     """Why none of the actions helps, in words; None where one does."""
-    most = max(action.expected_nats for action in ranked)
+    most = max(action.expected_nats for action in ranked[:_CLOSELY])  # others were tried at few poses
     if most >= LEAST:
         return None
     if max(action.contact for action in ranked) <= LEAST:

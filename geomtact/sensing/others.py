@@ -34,7 +34,7 @@ def sensor_of_yaml(text: str, origin: str) -> Sensor:
 
     try:
         data = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError, ValueError, KeyError, AttributeError, IndexError, TypeError) as error:
         raise SensorError(f"{origin}: not valid YAML ({' '.join(str(error).split())}); expected {_KINDS}") from None
     name = Path(origin).stem
     try:
@@ -51,9 +51,14 @@ def sensor_of_yaml(text: str, origin: str) -> Sensor:
 
 def _of_gs_sdk(data: Mapping[str, Any], name: str) -> Sensor:
     pitch = 1e-3 * float(data["ppmm"])
+    if pitch > 1e-3:
+        raise SensorError(f"ppmm is millimetres per pixel in gs_sdk, and {data['ppmm']} are too many; give 1 over it")
+    if not (isinstance(data["imgw"], int) and isinstance(data["imgh"], int)):
+        raise SensorError(f"imgw and imgh must be whole numbers, got {data['imgw']} and {data['imgh']}")
+    named = data.get("device_name")
     return Sensor(
-        str(data.get("device_name") or name),
-        (int(data["imgw"]), int(data["imgh"])),
+        named if isinstance(named, str) and named else name,
+        (data["imgw"], data["imgh"]),
         (pitch, pitch),
         camera_distance=0.0,
         max_penetration=_DEPTH,
@@ -63,8 +68,12 @@ def _of_gs_sdk(data: Mapping[str, Any], name: str) -> Sensor:
 
 def _of_tacto(data: Mapping[str, Any], name: str) -> Sensor:
     camera, gel = data["camera"], data["gel"]
+    if gel.get("mesh") or (isinstance(camera, list) and len(camera) != 1):
+        raise SensorError("expected one camera before a flat or spherical gel; write a TOML file for others")
     camera = camera[0] if isinstance(camera, list) else camera
-    distance = float(np.linalg.norm(np.subtract(gel["origin"], camera["position"], dtype=float)))
+    distance = float(gel["origin"][0]) - float(camera["position"][0])  # it looks along x
+    if not distance > 0:
+        raise SensorError(f"expected the gel before the camera, along x, got {distance:g} m; write a TOML file")
     width, height = _TACTO_SIZE
     pitch = 2 * distance * float(np.tan(np.radians(float(camera["yfov"])) / 2)) / height
     fall = float(gel.get("curvatureMax", 0)) if gel.get("curvature") else 0.0
