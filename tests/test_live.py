@@ -89,6 +89,8 @@ def test_a_folder_gives_its_newest_whole_image(tmp_path):
     assert first.image == str(tmp_path / "c.png") and first.passed_over == 2
     write_image(tmp_path / "d.png", np.ones((8, 8), bool))
     assert next(frames).image == str(tmp_path / "d.png"), "the older ones do not come again"
+    write_image(tmp_path / "a.png", np.zeros((8, 8), bool))
+    assert next(frames).image == str(tmp_path / "a.png"), "but one that is written anew does"
 
 
 def test_a_folder_that_fills_faster_than_it_is_looked_at_is_not_waited_for(tmp_path):

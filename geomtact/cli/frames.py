@@ -14,6 +14,7 @@ from typing import Any
 from geomtact.errors import InputError, UsageError
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy")
+State = tuple[int, int]  # when a file was last written to [ns], and its size
 _POLL = 0.05  # s between looks into a folder that is being filled
 
 
@@ -71,14 +72,17 @@ def listed(folder: Path) -> list[Path]:
 
 
 def newest_in(folder: Path) -> Generator[Frame, None, None]:
-    """The newest whole image of a folder, then the newest of those that have been written into it meanwhile, for ever."""
-    known: set[Path] = set()
-    sizes: dict[Path, int] = {}
+    """The newest whole image of a folder, then the newest of those that have been written into it meanwhile, or written anew,
+    for ever."""
+    given: dict[Path, State] = {}
+    before: dict[Path, State] = {}
     while True:
-        came = sorted((path for path in listed(folder) if path not in known), key=_age)
-        whole = [i for i, path in enumerate(came) if _whole(path, sizes)]
+        now = {path: state for path in listed(folder) if (state := _state(path))}
+        came = sorted((path for path in now if now[path] != given.get(path)), key=lambda path: (now[path], path.name))
+        whole = [i for i, path in enumerate(came) if now[path] == before.get(path)]
+        before = now
         if whole:
-            known.update(came[: whole[-1] + 1])
+            given.update((path, now[path]) for path in came[: whole[-1] + 1])
             yield Frame(str(came[whole[-1]]), passed_over=whole[-1])
         else:
             time.sleep(_POLL)
@@ -154,23 +158,13 @@ def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) ->
         reader.join(2)  # else it would be within OpenCV still when Python ends
 
 
-def _age(path: Path) -> tuple[int, str]:
-    """Orders files by when they were last written to; one that has gone comes first."""
+def _state(path: Path) -> State | None:
+    """What changes while a file is written; None of one that is empty, or has gone."""
     try:
-        return path.stat().st_mtime_ns, path.name
+        stat = path.stat()
     except FileNotFoundError:
-        return 0, path.name
-
-
-def _whole(path: Path, sizes: dict[Path, int]) -> bool:
-    """Whether a file has stopped growing since it was last asked; one that has gone is not whole."""
-    try:
-        size = path.stat().st_size
-    except FileNotFoundError:
-        size = 0
-    grown = size == 0 or sizes.get(path) != size
-    sizes[path] = size
-    return not grown
+        return None
+    return (stat.st_mtime_ns, stat.st_size) if stat.st_size else None
 
 
 def _parts(name: str) -> list[str]:
@@ -180,12 +174,14 @@ def _parts(name: str) -> list[str]:
 def _followed(folder: Path) -> Iterator[Frame]:
     """The images of a folder and those that are written into it, for ever; each once it has stopped growing."""
     seen: set[Path] = set()
-    sizes: dict[Path, int] = {}
+    before: dict[Path, State | None] = {}
     while True:
         for path in listed(folder):
             if path in seen:
                 continue
-            if not _whole(path, sizes):
+            state = _state(path)
+            if state is None or before.get(path) != state:
+                before[path] = state
                 break  # the images after it wait, so that their order is kept
             seen.add(path)
             yield Frame(str(path))
