@@ -34,10 +34,10 @@ class Frame:
     passed_over: int = 0
 
 
-def all_frames(source: str, follow: bool = False, size: tuple[int, int] | None = None) -> Iterator[Frame]:
+def all_frames(source: str, follow: bool = False, sensor: str | None = None) -> Iterator[Frame]:
     """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
 
-    ``follow`` waits for more images in a folder; ``size`` is as of :func:`camera_frames`.
+    ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def all_frames(source: str, follow: bool = False, size: tuple[int, int] | None =
             raise InputError(f"{path}: no image in this folder; expected {', '.join(_IMAGES)}")
         return _followed(path) if follow else (Frame(str(image)) for image in images)
     if path.is_char_device() or (source.isdigit() and not path.exists()):
-        return camera_frames(source, size)
+        return camera_frames(source, sensor)
     if not path.is_file():
         raise InputError(
             f"{path}: no such folder, video or camera; give a folder of images, a video, a camera's number, or - for paths"
@@ -88,21 +88,24 @@ def newest_in(folder: Path) -> Generator[Frame, None, None]:
             time.sleep(_POLL)
 
 
-def camera_frames(source: str, size: tuple[int, int] | None = None) -> Generator[Frame, None, None]:
+def camera_frames(source: str, sensor: str | None = None) -> Generator[Frame, None, None]:
     """The newest frame of a camera each time it is asked for, until there are no more; none waits in a queue.
 
     Parameters
     ----------
     source : number of the camera, its device, or a URL
-    size : (width, height) [px] that the camera is asked for
+    sensor : name or file of the one whose size of image the camera is asked for
 
     Raises
     ------
-    InputError
-        It cannot be opened, or gives no image.
+    SensorError, InputError
+        There is no such sensor; or the camera cannot be opened, or gives no image.
     """
     import cv2
 
+    from geomtact.sensing.sensor import Sensor
+
+    size = None if sensor is None else Sensor.load(sensor).image_size_px
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
     if not capture.isOpened():
@@ -113,14 +116,10 @@ def camera_frames(source: str, size: tuple[int, int] | None = None) -> Generator
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
 
-    def read() -> Any:
-        ok, image = capture.read()
-        return image[..., ::-1] if ok else None
-
-    first = [read()]
+    first = [_next_rgb(capture)]
     if first[0] is None:
         raise InputError(f"camera {source}: gives no image; does another program use it?")
-    return newest(lambda: first.pop() if first else read(), capture.release)
+    return newest(lambda: first.pop() if first else _next_rgb(capture), capture.release)
 
 
 def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) -> Generator[Frame, None, None]:
@@ -206,11 +205,14 @@ def _filmed(path: Path) -> Iterator[Frame]:
         raise InputError(f"{path}: cannot be read as a video; give one that OpenCV reads, or a folder of images")
 
     def frames() -> Iterator[Frame]:
-        while True:
-            ok, image = video.read()
-            if not ok:
-                break
-            yield Frame(image[..., ::-1], 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC))
+        while (image := _next_rgb(video)) is not None:
+            yield Frame(image, 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC))
         video.release()
 
     return frames()
+
+
+def _next_rgb(capture: Any) -> Any:
+    """The next image (H, W, 3) of an OpenCV capture, or None."""
+    ok, image = capture.read()
+    return image[..., ::-1] if ok else None

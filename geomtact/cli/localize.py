@@ -144,11 +144,9 @@ def localize(
     if live:
         from geomtact.cli.frames import camera_frames, newest_in
         from geomtact.cli.live import localize_live
-        from geomtact.sensing.sensor import Sensor
 
         # a camera that is not there is told before minutes go into an index
-        size = None if values["sensor"] is None else Sensor.load(values["sensor"]).image_size_px
-        frames = newest_in(images[0]) if camera is None else camera_frames(camera, size)
+        frames = newest_in(images[0]) if camera is None else camera_frames(camera, values["sensor"])
         localizer = open_localizer(values, sources, scorer, cache_dir, max_poses)
         options = {"kind": kind, "prior": prior, "effort": chosen, "seed": seed}
         if not localize_live(localizer, frames, values["background"], options):

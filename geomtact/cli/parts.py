@@ -6,8 +6,6 @@ from pathlib import Path
 
 from geomtact.errors import InputError
 
-_MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")
-
 
 def parts_of(object_name: str | None) -> list[str | None]:
     """The parts that ``--object`` names, each as it would be named alone; bundled parts of a folder by their names.
@@ -18,6 +16,7 @@ def parts_of(object_name: str | None) -> list[str | None]:
         A folder without meshes, or a part named twice.
     """
     from geomtact.geometry.catalogue import catalogue
+    from geomtact.geometry.mesh import FORMATS
 
     if object_name is None or object_name in catalogue():
         return [object_name]
@@ -28,7 +27,7 @@ def parts_of(object_name: str | None) -> list[str | None]:
             raise InputError(f"--object {object_name}: expected each part once, with a comma between two")
         return list(names)
     bundled = {entry.file.resolve(): name for name, entry in catalogue().items()}
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _MESHES)
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in FORMATS)
     if not files:
-        raise InputError(f"--object {folder}: no mesh in this folder; expected {', '.join(_MESHES)}")
+        raise InputError(f"--object {folder}: no mesh in this folder; expected {', '.join(FORMATS)}")
     return [bundled.get(path.resolve(), str(path)) for path in files]

@@ -64,7 +64,6 @@ def track(
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in any image.
     """
     from geomtact.cli.project import resolve
-    from geomtact.sensing.sensor import Sensor
 
     _check_name("kind", kind, Kind)
     if prior is not None and not prior.is_file():
@@ -81,8 +80,7 @@ def track(
     values, sources = resolve(given, _metadata(source))
     chosen = values["effort"] or Effort.balanced.value
     _check_name("effort", chosen, Effort, sources.get("effort"))
-    size = None if values["sensor"] is None else Sensor.load(values["sensor"]).image_size_px
-    frames = all_frames(source, follow, size)
+    frames = all_frames(source, follow, values["sensor"])
     localizer = open_localizer(values, sources, scorer, cache_dir, max_poses)
 
     from geomtact.inference.motion import UniformBall

@@ -105,17 +105,9 @@ def imprints(folder: Path) -> dict[str, list[Imprint]]:
     if not (fots.is_dir() and pack.is_file()):
         raise InputError(f"{folder}: expected {wanted} in it; give the folder of the readings (docs/readings.md)")
     try:
-        background = read_image(fots / "gelsight_bg.png")[..., :3]
         rows = circles_of(fots / "gelsight_contact_circles.csv")
-        soft = [
-            Imprint(
-                r["image"],
-                read_image(fots / "gelsight" / r["image"])[..., :3],
-                background,
-                (float(r["center_x_px"]), float(r["center_y_px"]), float(r["radius_px"])),
-            )
-            for r in rows
-        ]
+        columns = ("image", "center_x_px", "center_y_px", "radius_px")
+        soft = _drawn(rows, columns, fots / "gelsight", fots / "gelsight_bg.png")
         with np.load(pack, allow_pickle=False) as data:
             drawn = zip(data["imgs"], data["touch_center"], data["touch_radius"], strict=True)
             hard = [
@@ -135,17 +127,21 @@ def imprints_by_eye(folder: Path, circles: Path) -> list[Imprint]:
     InputError
         A reading is missing.
     """
-    background = read_image(_presses(folder) / "background.png")[..., :3]
-    return [
-        Imprint(
-            row["file"],
-            read_image(_presses(folder) / row["file"])[..., :3],
-            background,
-            (float(row["cx_px"]), float(row["cy_px"]), float(row["r_px"])),
-        )
-        for row in circles_of(circles)
-        if row["inside"] == "1"
-    ]
+    rows = [row for row in circles_of(circles) if row["inside"] == "1"]
+    presses = _presses(folder)
+    return _drawn(rows, ("file", "cx_px", "cy_px", "r_px"), presses, presses / "background.png")
+
+
+def _drawn(rows: Sequence[Mapping[str, str]], columns: Sequence[str], folder: Path, background: Path) -> list[Imprint]:
+    """The readings of ``folder`` that ``rows`` name, with the circles drawn on them; ``columns`` are those of the name and of
+    the circle's column, row and radius."""
+    empty = read_image(background)[..., :3]
+    out = []
+    for row in rows:
+        name, *circle = (row[column] for column in columns)
+        u, v, radius = map(float, circle)
+        out.append(Imprint(name, read_image(folder / name)[..., :3], empty, (u, v, radius)))
+    return out
 
 
 def methods() -> dict[str, Method]:

@@ -20,6 +20,7 @@ from geomtact.se3 import Array
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 UNITLESS_FORMATS = (".stl", ".obj", ".ply", ".off")
 METRE_FORMATS = (".glb", ".gltf")
+FORMATS = UNITLESS_FORMATS + METRE_FORMATS
 _REEXPORT = "; if its numbers are {unit}, re-export it in metres, or save it as STL or PLY and give --unit {unit}"
 
 # Beyond these no tactile sensor is meant; they also keep squares and cubes of lengths far from overflow.
@@ -199,13 +200,12 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
             )
         return name, entry.file, entry.unit, entry.symmetry
     suffix = path.suffix.lower()
-    formats = UNITLESS_FORMATS + METRE_FORMATS
-    if suffix not in formats:
+    if suffix not in FORMATS:
         if path.exists():
-            raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(formats)}")
-        raise MeshError(f"no part named {text!r}{nearest_name(text, parts)}; or give a mesh file ({' '.join(formats)})")
+            raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(FORMATS)}")
+        raise MeshError(f"no part named {text!r}{nearest_name(text, parts)}; or give a mesh file ({' '.join(FORMATS)})")
     if not path.is_file():
-        beside = [p.name for p in path.parent.glob("*") if p.suffix.lower() in formats]
+        beside = [p.name for p in path.parent.glob("*") if p.suffix.lower() in FORMATS]
         hint = did_you_mean(path.name, beside) or f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
         raise MeshError(f"{text}: no such file{hint}")
     if suffix in METRE_FORMATS:

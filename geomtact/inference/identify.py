@@ -75,39 +75,35 @@ def identify(
     NoPoseAgreesError
         Of no part.
     """
-    names: list[str] = []
-    evidence: list[float] = []
-    unlike: list[bool] = []
+    told: list[tuple[str, float, bool]] = []  # name, evidence, unlike
+    merits: list[float] = []
     best: tuple[float, Localizer, Posterior] | None = None
     known = None if weights is None else _log_weights(weights)
     for i, localizer in enumerate(localizers):
         if known is not None and i >= len(known):
             raise UsageError(f"identify: expected a weight for each part, got {len(known)} for more")
-        names.append(localizer.mesh.name)
         try:
             posterior = localizer.localize(image, **options)
         except NoPoseAgreesError as error:
-            evidence.append(-np.inf)
-            unlike.append(True)
+            told.append((localizer.mesh.name, -np.inf, True))
+            merits.append(-np.inf)
             last_error = error
             continue
-        evidence.append(posterior.log_evidence)
-        unlike.append(_is_unlike(posterior))
-        merit = evidence[-1] + (0.0 if known is None else float(known[i]))
-        if best is None or merit > best[0]:
-            best = merit, localizer, posterior
-    if not names:
+        told.append((localizer.mesh.name, posterior.log_evidence, _is_unlike(posterior)))
+        merits.append(posterior.log_evidence + (0.0 if known is None else float(known[i])))
+        if best is None or merits[-1] > best[0]:
+            best = merits[-1], localizer, posterior
+    if not told:
         raise UsageError("identify: expected parts to choose from, got none")
-    if known is not None and len(known) != len(names):
-        raise UsageError(f"identify: expected a weight for each of {len(names)} parts, got {len(known)}")
+    if known is not None and len(known) != len(told):
+        raise UsageError(f"identify: expected a weight for each of {len(told)} parts, got {len(known)}")
     if best is None:
         raise last_error
-    merits = np.array(evidence) + (0.0 if known is None else known)
-    if merits.max() == -np.inf:
+    if best[0] == -np.inf:
         raise UsageError("identify: none of the parts whose weight is above 0 can show this; give others a weight")
     probability = np.exp(merits - np.logaddexp.reduce(merits))
     order = np.argsort(-probability, kind="stable")
-    candidates = [Candidate(names[i], float(probability[i]), evidence[i], unlike[i]) for i in order]
+    candidates = [Candidate(told[i][0], float(probability[i]), *told[i][1:]) for i in order]
     return Identification(candidates, best[1], best[2])
 
 
