@@ -18,6 +18,7 @@ Array32 = NDArray[np.float32]
 
 _TOLERANCE = 1e-3  # largest mismatch between gel and object under contact, as a share of the depth
 _MAX_ITERATIONS = 200
+_LEAST_INFLUENCE = 1e-3  # of the largest, that is inverted as it is
 
 
 def elastic_mask(depth: ArrayLike, pitch: tuple[float, float]) -> NDArray[np.bool_]:
@@ -73,7 +74,8 @@ def _pressure(depth: Array32, pitch: tuple[float, float], thickness: float = np.
     """Pressure (h, w), for contact modulus 1, by the constrained conjugate gradients of Polonsky and Keer (1999).
 
     They minimise p K p / 2 - p depth over p >= 0, K the half-space's influence; unlike theirs the load is free and the
-    depth given. Depths are scaled to a maximum of 1, so that float32 serves.
+    depth given. Steps are preconditioned by K's inverse on a gel that is touched everywhere, after Vollebregt (2014), which
+    takes a third of them. Depths are scaled to a maximum of 1, so that float32 serves.
     """
     h, w = depth.shape
     scale = float(depth.max())
@@ -81,11 +83,11 @@ def _pressure(depth: Array32, pitch: tuple[float, float], thickness: float = np.
     target = np.full((-(-h // 8) * 8, -(-w // 8) * 8), -1.0, np.float32)
     target[:h, :w] = np.where(depth > 0, depth / scale, -1.0)
     may_touch = target > 0
-    spectrum = _spectrum(target.shape, pitch, thickness)
+    spectrum, inverse = _spectrum(target.shape, pitch, thickness), _inverse(target.shape, pitch, thickness)
 
-    pressure = np.where(may_touch, target, 0)
-    sunk = _displacement(pressure, spectrum)
-    pressure *= np.vdot(pressure, target) / np.vdot(pressure, sunk)
+    wanted = np.where(may_touch, target, 0)
+    pressure = np.where(may_touch, np.maximum(_displacement(wanted, inverse), 0), 0)
+    pressure *= np.vdot(pressure, wanted) / np.vdot(pressure, _displacement(pressure, spectrum))
     direction = np.zeros_like(pressure)
     previous = 0.0  # squared residual of the last step; 0 restarts the conjugate directions
     for _ in range(_MAX_ITERATIONS):
@@ -95,14 +97,16 @@ def _pressure(depth: Array32, pitch: tuple[float, float], thickness: float = np.
         entered = may_touch & ~touching & (gap < -_TOLERANCE)
         if np.abs(inside).max() < _TOLERANCE and not entered.any():
             break
-        square = float(np.vdot(inside, inside))
-        direction = inside + (square / previous if previous else 0.0) * np.where(touching, direction, 0)
+        eased = np.where(touching, _displacement(inside, inverse), 0)
+        square = float(np.vdot(inside, eased))
+        direction = eased + (square / previous if previous else 0.0) * np.where(touching, direction, 0)
         sunk = _displacement(direction, spectrum)
         step = np.vdot(inside, direction) / max(float(np.vdot(sunk, direction)), 1e-30)
         pressure = np.maximum(pressure - step * direction, 0)
         again = may_touch & (pressure == 0) & (gap < 0)
         previous = 0.0 if again.any() else square
-        pressure[again] = -step * gap[again]
+        if again.any():
+            pressure[again] = np.maximum(-step * _displacement(np.where(again, gap, 0), inverse)[again], 0)
     return (pressure[:h, :w] * scale).astype(np.float32)
 
 
@@ -126,3 +130,10 @@ def _spectrum(shape: tuple[int, int], pitch: tuple[float, float], thickness: flo
     influence = np.diff(np.diff(corner, axis=0), axis=1) / np.pi
     influence *= np.exp(-np.hypot(*np.meshgrid(x[:-1] + 0.5 * pitch[0], y[:-1] + 0.5 * pitch[1])) / thickness)
     return fft.rfft2(fft.ifftshift(influence)).astype(np.complex64)
+
+
+@lru_cache(maxsize=64)
+def _inverse(shape: tuple[int, int], pitch: tuple[float, float], thickness: float = np.inf) -> NDArray[np.complex64]:
+    """Transform of the pressure under a displacement, were the gel touched everywhere."""
+    size = np.abs(_spectrum(shape, pitch, thickness))
+    return (1 / np.maximum(size, _LEAST_INFLUENCE * size.max())).astype(np.complex64)
