@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from geomtact import Localizer, Mesh, load_mesh
 from geomtact.cli import app
 from geomtact.evaluation import known_approach, study
-from geomtact.evaluation.pose_error import add, add_s, coverage, mssd, normalised_add, random_add
+from geomtact.evaluation.pose_error import add, add_s, coverage, mssd, random_add
 from geomtact.geometry.distance import PoseDistance
 from geomtact.se3 import exp, random_rotations, transform
 from geomtact.sensing.noise import CLEAN, MODERATE
@@ -93,13 +93,13 @@ def test_mssd_of_a_ball_is_the_distance_of_the_centres(rng):
     np.testing.assert_allclose(mssd(T, others, ball), apart, rtol=1e-9)
 
 
-def test_a_random_guess_has_normalised_add_one(localizer):
+def test_expected_error_of_a_random_guess(localizer):
     distance, rng = PoseDistance(localizer.mesh), np.random.default_rng(5)
     expected = random_add(distance, localizer.space, n=150)
     T, _ = localizer.space.sample(150, rng)
     guess, _ = localizer.space.sample(150, rng)
-    found = [normalised_add(a, b, distance, expected)[0] for a, b in zip(T, guess, strict=True)]
-    assert np.mean(found) == pytest.approx(1, abs=5 * np.std(found) * np.sqrt(2 / 150))
+    found = [distance.mean(a, b[None])[0] for a, b in zip(T, guess, strict=True)]
+    assert np.mean(found) == pytest.approx(expected, abs=5 * np.std(found) * np.sqrt(2 / 150))
 
 
 def test_coverage_of_calibrated_levels_and_its_intervals():

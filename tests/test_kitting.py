@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from geomtact import load_mesh, se3
-from geomtact.cli import app
 from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.fixture import Fixture, upwards
 from geomtact.evaluation.kitting import (
@@ -200,8 +198,3 @@ def test_right_wrong_and_refused_are_all_there_is():
     settings = {"touches": TOUCHES, "goal_mm": 1e3 * GOAL, "clearances_mm": [1e3 * c for c in CLEARANCES]}
     content = {"parts": {name: {"settings": settings, "figures": figures} for name in PARTS}}
     assert draw_kitting(content).startswith(b"\x89PNG")
-
-
-def test_kitting_is_a_study_without_a_kind_of_gel():
-    done = CliRunner().invoke(app, ["evaluate", "kitting", "--felt", "elastic"])
-    assert done.exit_code == 2 and "No such option: --felt" in done.output

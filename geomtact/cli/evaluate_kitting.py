@@ -33,13 +33,13 @@ def judge_kitting(
     Prints them for each clearance and number of touches, and writes them and every run to --out.
     """
     from geomtact.evaluation import kitting, kitting_study, study
-    from geomtact.evaluation.touches import PENETRATION
+    from geomtact.evaluation.touches import penetrations
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir):
         settings = study.describe(localizer) | {
             "noise": {"name": noise.value, **asdict(strength)},
-            "penetration_mm": [1e3 * depth for depth in PENETRATION],
+            "penetration_mm": [1e3 * depth for depth in penetrations(localizer.space)],
             "sure": kitting.SURE,
             "clearances_mm": [1e3 * clearance for clearance in kitting_study.CLEARANCES],
             "goal_mm": 1e3 * kitting_study.GOAL,

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from geomtact.evaluation.track_study import Followed
 
 SCHEMA = "geomtact/track/1"
-_TITLES = {"filter": "the filter", "frames": "independent frames", "thesis": "the thesis's filter"}
 
 
 def judge_track(
@@ -92,11 +91,13 @@ def _rounded(value: Any) -> Any:
 def _print(content: Mapping[str, Any]) -> None:
     import numpy as np
 
+    from geomtact.report.track_plot import LABELS
+
     figures = content["figures"]
     typer.echo(f"{figures['n']} trajectories, {figures['stretches']} of which begin without features")
     headings = ("method", "gain [nats]", "more than frames", "better", "claimed", "lost")
     rows, regions = [], []
-    for method, title in _TITLES.items():
+    for method, title in LABELS.items():
         f = figures[method]
         more = "{:+.2f} ({:+.2f} to {:+.2f})".format(*f["more"]) if method != "frames" else ""
         better = f"{100 * f['better']:.0f} %" if method != "frames" else ""

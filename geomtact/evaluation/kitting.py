@@ -17,7 +17,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.errors import InputError
 from geomtact.evaluation.fixture import Fixture
-from geomtact.evaluation.touches import PENETRATION, counts
+from geomtact.evaluation.touches import counts, penetrations
 from geomtact.geometry.approach import facing
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
@@ -134,7 +134,7 @@ def touch_with_jaw(
     Where neither finger meets the part, that both met nothing is felt, at the jaw's origin. A finger stopped by too small a
     contact tells nothing.
     """
-    stopped, touches = close_jaw(space, T_world_part, T_world_jaw, rng.uniform(*PENETRATION, 2))
+    stopped, touches = close_jaw(space, T_world_part, T_world_jaw, rng.uniform(*penetrations(space), 2))
     T, masks = [], []
     for T_world_sensor in stopped[touches]:
         mask = _felt(space, T_world_sensor, T_world_part, elastic)
@@ -225,7 +225,7 @@ def kit(
 
 def draw_part(space: ContactSpace, rng: np.random.Generator) -> Array:
     """A pose (4, 4) of the part at which a jaw at the world's origin grasps it, and both fingers feel it."""
-    least = PENETRATION[0]
+    least = penetrations(space)[0]
     while True:
         T_world_part = inverse(first_grasp(space.mesh, rng))
         stopped, touches = close_jaw(space, T_world_part, np.eye(4), (least, least))

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.pose_error import mssd
-from geomtact.evaluation.touches import PENETRATION, Touch, random_touches
+from geomtact.evaluation.study import RESAMPLES, WRONG_MM
+from geomtact.evaluation.touches import Touch, penetrations, random_touches
 from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
 from geomtact.planning.actions import Touch as Planned
@@ -27,7 +28,6 @@ from geomtact.sensing.noise import Noise
 
 SURE, MOST = 0.95, 10
 POLICIES = ("best", "random")
-_RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def _run(localizer: Localizer, scene: int, first: Touch, policy: str, seed: int,
         touch = _chosen(posterior, tried, policy, rng)
         if touch is None:
             break
-        stop = touch.reached(localizer.space, T_world_object, rng.uniform(*PENETRATION))[0]
+        stop = touch.reached(localizer.space, T_world_object, rng.uniform(*penetrations(localizer.space)))[0]
         tried.append(stop)
         image = _made(localizer, inverse(stop) @ T_world_object, first.elastic, noise, rng)
         if image is None:
@@ -125,11 +125,11 @@ def summarise(runs: Sequence[Run]) -> dict[str, Any]:
             "touches_mean": float(counts[-1].mean()),
             "sure": float(sure.mean()),
             "sure_after": sure_after,
-            "wrong": float((error[sure] > 10).mean()) if sure.any() else None,
+            "wrong": float((error[sure] > WRONG_MM).mean()) if sure.any() else None,
             "mssd_mm_median": float(np.median(error)),
         }
     best, random = counts
-    rows = np.random.default_rng(0).integers(len(best), size=(_RESAMPLES, len(best)))
+    rows = np.random.default_rng(0).integers(len(best), size=(RESAMPLES, len(best)))
     # all sure at once: no touch was needed by either
     ratios = best[rows].mean(1) / np.maximum(random[rows].mean(1), 1e-9)
     out["ratio"] = [

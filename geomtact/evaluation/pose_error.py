@@ -58,11 +58,6 @@ def random_add(distance: PoseDistance, space: ContactSpace, n: int = 200, seed: 
     return float(np.mean([distance.mean(a, b[None])[0] for a, b in zip(T[:n], T[n:], strict=True)]))
 
 
-def normalised_add(T_true: ArrayLike, T: ArrayLike, distance: PoseDistance, expected: float) -> Array:
-    """The thesis's normalised pose distance (m,): ADD modulo symmetry over ``expected`` [m], see :func:`random_add`."""
-    return distance.mean(T_true, _poses(T)) / expected
-
-
 @dataclass(frozen=True)
 class Coverage:
     """Share of truths inside the region of ``nominal`` mass, with the interval (low, high) that its count allows."""

@@ -18,7 +18,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.contact_class import contact_class
 from geomtact.evaluation.information import agreement, fisher_information, split
 from geomtact.evaluation.shapes import SHAPES
-from geomtact.evaluation.touches import PENETRATION, Touch
+from geomtact.evaluation.touches import Touch, penetrations
 from geomtact.geometry.rotations import Directions
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
@@ -210,7 +210,7 @@ def _start(
         off = draw(rng)
         start = moved(T, [*(off[:3] * problem.length), 0.0, 0.0, 0.0], problem)
         start[:2, 3] += off[3:]
-        depth = rng.uniform(PENETRATION[0], min(PENETRATION[1], space.sensor.max_penetration))
+        depth = rng.uniform(*penetrations(space))
         settled, ok = space.settle(start[None], depth)
         if ok[0]:
             return settled[0]

@@ -24,7 +24,7 @@ THESIS_PARTS = ("pin", "damping_pin", "head", "elbow_pipe")
 NOMINAL = (0.5, 0.8, 0.9, 0.95)
 MODES = 10  # the thesis's best10, of modes instead of poses
 WRONG_MM = 10.0  # MSSD beyond which a first mode is wrong
-_RESAMPLES = 2000
+RESAMPLES = 2000
 CERTAIN = 0.5  # a first mode below this probability is one of high entropy
 Felt = Callable[[ContactSpace, Array, bool], NDArray[np.bool_]]
 
@@ -151,7 +151,7 @@ def by_class(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
 
 def mean_with_interval(values: Array, rng: np.random.Generator) -> list[float]:
     """The mean of ``values`` (n,) and the bounds of its 95 % bootstrap interval."""
-    means = rng.choice(values, (_RESAMPLES, len(values))).mean(1)
+    means = rng.choice(values, (RESAMPLES, len(values))).mean(1)
     return [float(values.mean()), *(float(bound) for bound in np.quantile(means, [0.025, 0.975]))]
 
 
@@ -201,6 +201,7 @@ def _figures(outcomes: Sequence[Outcome], random_add_mm: float) -> dict[str, Any
     }
     names = ("gain", "mssd_mm", "add_mm", "mssd10_mm", "add10_mm", "probability", "ms")
     out |= {f"{name}_median": float(np.median(column[name])) for name in names}
+    # the thesis's normalised pose distance
     out["normalised_add_median"] = out["add_mm_median"] / random_add_mm
     out["normalised_add10_median"] = out["add10_mm_median"] / random_add_mm
     return out

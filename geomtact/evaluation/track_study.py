@@ -22,11 +22,8 @@ from geomtact.inference.sequence import make_filter
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 
-METHODS = (
-    "filter",
-    "frames",
-    "thesis",
-)  # ours, each frame alone, and the thesis's 50 poses that count each frame in full
+# Ours, each frame alone, and the thesis's 50 poses that count each frame in full
+METHODS = ("filter", "frames", "thesis")
 FRAMES = 16
 STRETCH = 10  # frames without features that begin every other pair of trajectories, where the part has such
 LOST = 0.01  # share below which the true mode counts as lost: of all mass, or of what the frame alone gives it

@@ -136,10 +136,6 @@ class Mesh:
         """``n`` points uniform over the surface (n, 3) [m]: those of :meth:`sample_surface`."""
         return self.sample_surface(n, seed)[0]
 
-    def surface_normals(self, n: int, seed: int = 0) -> Array:
-        """Outward unit normals (n, 3) at :meth:`surface_points` of the same ``n`` and ``seed``."""
-        return self.sample_surface(n, seed)[1]
-
     def with_symmetry(self, tolerance: float = 5e-5) -> Mesh:
         """This mesh with its symmetry found (``tolerance`` in metres), or itself if it is known already."""
         if self.symmetry is not None:

@@ -25,11 +25,10 @@ from geomtact.errors import NoPoseAgreesError
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
-from geomtact.inference.refine_together import View, refine_together
+from geomtact.inference.refine_together import UNFELT, View, refine_together
 from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, inverse
 
-_UNFELT = 0.1  # share of touching poses at which a sensor may yet show nothing: a contact too small or too shallow
 # Of what two sensors show, at least: what a cell's width hides of the pose it hides from all of them
 _CORRELATION = 0.1
 _NEGLIGIBLE = 25.0  # nats below the most probable place
@@ -47,7 +46,7 @@ class Fused:
     cells : (n,) of the index of the first sensor that has contact
     log_prob : (n,) log probability of each, normalised
     first : which sensor that is
-    log_evidence : log of the mean over the uniform distribution, on the first sensor's space, of the product of densities
+    log_evidence : log of the mean over the prior, on the first sensor's space, of the product of densities, each counted in full
     support : (N,) for each sensor, by how many nats the others make its reading likelier than the uniform does; 0 for one
     """
 
@@ -141,7 +140,6 @@ def fused_posterior(
         log_prior = prior_log_mass(first.index, prior, first.T_frame_sensor, first.frame, cache_dir)
     fused = fuse(touches, log_prior, rig)
     timing["fuse"] = 1e3 * (time.perf_counter() - began)
-    each = [f"sensor {i + 1}: {warning}" for i, touch in enumerate(touches) for warning in touch.warnings]
     against = disagreement(fused)
     posterior = replace(
         first,
@@ -150,14 +148,9 @@ def fused_posterior(
         runs=None,
         log_evidence=sum(t.log_evidence for t in touches) + fused.log_evidence,
         observations=first.observations + [o for touch in touches if touch is not first for o in touch.observations],
-        settings=first.settings
-        | {
-            "T_world_sensor": [t.T_frame_sensor.tolist() for t in touches],
-            "touched": [t.contact for t in touches],
-            "odd": any(t.settings.get("odd", False) for t in touches),
-        },
+        settings=first.settings | _said(touches) | {"odd": any(t.settings.get("odd", False) for t in touches)},
         timing_ms=timing,
-        warnings=each + ([against] if against else []),
+        warnings=_warnings(touches) + ([against] if against else []),
     )
     if modes:
         views = [
@@ -183,7 +176,23 @@ def _nothing_felt(touches: Sequence[Posterior], prior: Any, cache_dir: str | Pat
         density = before(T) if before is not None else np.zeros(len(T))
         return density + np.sum([other.log_density(T) for other in others], axis=0)
 
-    return replace(first, elsewhere=elsewhere, observations=[o for touch in touches for o in touch.observations])
+    return replace(
+        first,
+        elsewhere=elsewhere,
+        observations=[o for touch in touches for o in touch.observations],
+        settings=first.settings | _said(touches),
+        warnings=_warnings(touches),
+    )
+
+
+def _said(touches: Sequence[Posterior]) -> dict[str, Any]:
+    """What is told of every sensor."""
+    return {"T_world_sensor": [t.T_frame_sensor.tolist() for t in touches], "touched": [t.contact for t in touches]}
+
+
+def _warnings(touches: Sequence[Posterior]) -> list[str]:
+    """What every sensor warns of, with its number."""
+    return [f"sensor {i}: {warning}" for i, touch in enumerate(touches, 1) for warning in touch.warnings]
 
 
 def disagreement(fused: Fused) -> str | None:
@@ -208,7 +217,7 @@ def _seen(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Likelihood (n,) of what ``other`` shows at each place of ``carry.here``, and of its showing any contact, or none."""
     if not other.contact:
-        free = 1 - (1 - _UNFELT) * carry.reached()
+        free = 1 - (1 - UNFELT) * carry.reached()
         return free, free
     return carry.mean(other.densities, doubtful)
 

@@ -10,12 +10,11 @@ import numpy as np
 
 from geomtact.errors import NoPoseAgreesError, UsageError
 from geomtact.inference.posterior import Posterior
+from geomtact.inference.refine_together import UNLIKE
 from geomtact.se3 import Array
 
 if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
-
-UNEXPLAINED = 8.0  # nats a contact, by which the best pose falls behind those that suit each sensor best: not this part
 
 
 @dataclass(frozen=True)
@@ -117,4 +116,4 @@ def _log_weights(weights: Sequence[float]) -> Array:
 
 def _is_unlike(posterior: Posterior) -> bool:
     unexplained = posterior.settings.get("unexplained_nats", 0.0)
-    return posterior.contact and (posterior.settings["odd"] or unexplained is None or unexplained > UNEXPLAINED)
+    return posterior.contact and (posterior.settings["odd"] or unexplained is None or unexplained > UNLIKE)

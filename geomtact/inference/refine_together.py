@@ -1,4 +1,4 @@
-"""The leading modes of several sensors taken below the grid, by all contacts at once.
+"""The leading modes of several sensors, or of heights, taken below the grid, by all contacts at once.
 
 A cell is wider than the contacts of several sensors leave the pose, so its own pose is far from where they agree. Poses
 drawn within the most probable cells are cast on every sensor, the likeliest of each is registered to all contacts together, and
@@ -33,10 +33,8 @@ _CELLS, _PER_MODE = 200, 10  # that are looked into: so many, and more for each 
 _DRAWS = 8  # poses drawn within each
 _POINTS, _ROUGH = 60, 20  # of each outline, at most: to work out what is told, and to register all that is looked into
 _HOPEFUL = 4  # of the poses tried for a cell, that are asked for by more than two sensors
-_ROUNDS, _AROUND = (
-    3,
-    12,
-)  # of the last search, each in half the width of the one before, and for the better half of the cells
+# Of the last search, each in half the width of the one before, and for the better half of the cells
+_ROUNDS, _AROUND = 3, 12
 _TOLD = 5  # for each mode that is asked for, cells of which it is worked out what the contacts tell
 # Power of the joint likelihood at one pose; and the share of their mass that the cells looked into keep, whatever is likely
 # within them. Chosen, as are the next, on scenes that the study does not judge (docs/several-sensors.md)
@@ -46,9 +44,9 @@ _TRUST, _DOUBT = 0.3, 0.03
 _ELSEWHERE, _AT_MOST, _AS_LIKELY = 0.4, 0.2, 5.0
 _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
 # nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
-_ALIKE, _UNLIKE = 4.0, 8.0
+ALIKE, UNLIKE = 4.0, 8.0
 _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
-_UNFELT = np.log(0.1)  # that a sensor shows nothing where the object would touch it
+UNFELT = 0.1  # share of touching poses at which a sensor may yet show nothing: a contact too small or too shallow
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +88,7 @@ class View:
         sensor, shape = self.refinery.space.sensor, depths.shape[1:]
         deepest = depths.max((1, 2))
         if self.contact is None:
-            return np.where(deepest > 0, _UNFELT, 0.0)
+            return np.where(deepest > 0, np.log(UNFELT), 0.0)
         off = np.clip(np.maximum(-deepest, deepest - sensor.max_penetration), 0, _FAR)
         likely = cast_log_likelihood(depths, to_grid(self.mask, shape), sensor.pixel_area(shape))
         return likely + self.heights(depths) - 0.5 * (off / _NEAR) ** 2
@@ -131,7 +129,7 @@ def refine_together(
     home, poses, likely = home[held], poses[held], likely[held]
 
     unexplained = (search.most.sum() - likely.max(initial=-np.inf)) / search.felt
-    explains = float(np.clip((_UNLIKE - unexplained) / (_UNLIKE - _ALIKE), 0, 1))
+    explains = float(np.clip((UNLIKE - unexplained) / (UNLIKE - ALIKE), 0, 1))
     mass = posterior.cell_log_density(home) + posterior.index.log_weight[home]
     share_elsewhere = _share_elsewhere(mass, _TRUST * likely, search.felt) if search.felt > 1 else 1.0
     doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, share_elsewhere))

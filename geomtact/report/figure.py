@@ -84,7 +84,8 @@ def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummar
     for observation in posterior.observations[:1]:
         image = _displayable(observation.image)
         touched = posterior.settings.get("touched", [True])
-        of_several = f" of sensor {touched.index(True) + 1} of {len(touched)}" if len(touched) > 1 else ""
+        first = touched.index(True) if any(touched) else 0
+        of_several = f" of sensor {first + 1} of {len(touched)}" if len(touched) > 1 else ""
         _in_window(image_axes, posterior, image, f"The image{of_several}")
         outline(contact_axes, posterior, observation.contact, OBSERVED)
         shown = np.where(observation.contact.mask, 0.75, 0.97)

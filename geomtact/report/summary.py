@@ -135,7 +135,8 @@ def summaries_of(posterior: Posterior, modes: Sequence[Mode]) -> list[ModeSummar
 def facts(posterior: Posterior) -> list[str]:
     """What the whole distribution amounts to, one sentence each."""
     if not posterior.contact:
-        return ["No contact was found in the image."]
+        several = len(posterior.observations) > 1
+        return [f"No contact was found in {'any of the images' if several else 'the image'}."]
     known = max(0.0, -posterior.entropy_nats)
     empty = [str(number) for number, touched in enumerate(posterior.settings.get("touched", []), 1) if not touched]
     said = (
