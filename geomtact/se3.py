@@ -28,15 +28,23 @@ def check_transforms(T: ArrayLike, name: str = "T") -> Array:
         raise PoseError(f"{name}: expected rigid transforms of shape (..., 4, 4), got {out.shape}")
     if not np.isfinite(out).all():
         raise PoseError(f"{name}: expected finite numbers, got NaN or infinity")
-    R = out[..., :3, :3]
-    error = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0)
-    if error > 1e-6 or (np.linalg.det(R) < 0).any():
-        raise PoseError(
-            f"{name}: the upper left 3x3 is no rotation (R R^T differs from 1 by {error:.2g}); "
-            "orthonormalise it, and give translations in metres"
-        )
-    if np.abs(out[..., 3, :] - [0, 0, 0, 1]).max(initial=0.0) > 1e-9:
-        raise PoseError(f"{name}: the last row must be 0 0 0 1")
+    R, last = out[..., :3, :3], out[..., 3, :]
+    error = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max((-1, -2))
+    mirrors, moved = np.linalg.det(R) < 0, np.abs(last - [0, 0, 0, 1]).max(-1)
+    bad = np.flatnonzero((error > 1e-6) | mirrors | (moved > 1e-9))
+    if len(bad):
+        i = int(bad[0])
+        which = name if out.ndim == 2 else f"{name}, matrix {i + 1} of {error.size}"
+        if error.flat[i] > 1e-6:
+            raise PoseError(
+                f"{which}: the upper left 3x3 is no rotation (R R^T differs from 1 by {error.flat[i]:.2g}); "
+                "orthonormalise it, and give translations in metres"
+            )
+        if mirrors.flat[i]:
+            raise PoseError(f"{which}: the upper left 3x3 is no rotation but mirrors; use right-handed axes")
+        transposed = np.abs(out.reshape(-1, 4, 4)[i, :, 3] - [0, 0, 0, 1]).max() <= 1e-9
+        hint = "; it looks transposed: translations stand in the last column" if transposed else ""
+        raise PoseError(f"{which}: the last row must be 0 0 0 1{hint}")
     return out
 
 

@@ -1,6 +1,7 @@
 """Several sensors at once: products, shares of cells, sensors that feel nothing, and sensors that disagree."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -243,7 +244,7 @@ def test_a_sensor_that_is_hardly_possible_is_told(plug, rng):
     _, sensors = world(touches, rng)
     fused = fuse([single(plug, touch, T) for touch, T in zip(touches, sensors, strict=True)])
     assert disagreement(fused) is None
-    against = type(fused)(fused.cells, fused.log_prob, 0, -9.0, np.array([1.0, -4.0, 2.0]))
+    against = replace(fused, support=np.array([1.0, -4.0, 2.0]))
     assert disagreement(against).startswith("sensor 2 of 3 disagrees")
 
 
@@ -264,6 +265,45 @@ def test_a_prior_counts_once(plug, rng):
     some = graded.cells[likely]
     slope = np.polyfit(before[likely], graded.cell_log_density(some) - plain.cell_log_density(some), 1)[0]
     assert slope == pytest.approx(1, abs=0.1)
+
+
+def test_a_posterior_told_elsewhere_is_a_prior(plug, rng):
+    """One after the other, two sensors do not rule out the truth, and tell more than each alone."""
+    gains = []
+    for seed in range(50, 58):
+        touches = random_touches(plug, 2, seed)
+        T, sensors = world(touches, rng)
+        before, alone = (single(plug, touch, at) for touch, at in zip(touches, sensors, strict=True))
+        after = plug.localize(touches[1].mask, "mask", None, sensors[1], prior=before, effort="fast")
+        assert np.exp(after.log_prob).sum() == pytest.approx(1, abs=1e-4)
+        gains.append([posterior.log_density(T) for posterior in (before, alone, after)])
+    assert np.isfinite(gains).all()
+    first, second, both = np.mean(gains, 0)
+    assert both > max(first, second) + 0.3
+
+
+def test_an_image_that_counts_twice_is_told(plug, rng):
+    touches = random_touches(plug, 2, 12)
+    _, sensors = world(touches, rng)
+    images = [touch.mask for touch in touches]
+    assert not any("same" in warning for warning in plug.localize(images, "mask", None, sensors).warnings)
+    again = plug.localize([images[0], images[0]], "mask", None, sensors, effort="fast")
+    assert any(warning.startswith("images 1 and 2 are the same") for warning in again.warnings)
+    once = plug.localize(images[0], "mask", None, sensors[0], effort="fast")
+    then = plug.localize(images[1], "mask", None, sensors[1], prior=once, effort="fast")
+    for prior in (once, then):  # what the prior's own prior was made from counts too
+        twice = plug.localize(images[0], "mask", None, sensors[0], prior=prior, effort="fast")
+        assert any("counts twice" in warning for warning in twice.warnings)
+    assert not any("counts twice" in warning for warning in then.warnings)
+
+
+def test_the_evidence_of_a_touch_told_twice_is_hardly_more(plug):
+    """Two sensors at one place show the same, so that together they say about what each says."""
+    touch = random_touches(plug, 1, 13)[0]
+    sensors = np.stack([np.eye(4), se3.transform(np.eye(3), [0, 0, 2e-6])])
+    once = plug.localize(touch.mask, "mask", effort="fast").log_evidence
+    twice = plug.localize([touch.mask] * 2, "mask", None, sensors, effort="fast").log_evidence
+    assert abs(twice - once) < 0.3 * abs(once)  # what is left is the share of a cell that touches the second sensor
 
 
 def test_saved_and_loaded_it_says_the_same(plug, rng, tmp_path, cache_dir):

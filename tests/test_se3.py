@@ -103,7 +103,7 @@ def test_one_bad_transform_among_many_is_found_and_named(rng):
     T = exp(rng.normal(size=(50, 6)))
     assert check_transforms(T, "mine") is not None
     T[37, 0, 0] += 1e-5
-    with pytest.raises(PoseError, match="^mine: "):
+    with pytest.raises(PoseError, match="^mine, matrix 38 of 50: "):
         check_transforms(T, "mine")
 
 

@@ -20,6 +20,7 @@ from geomtact.evaluation import track_study
 from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference.motion import GaussianTwist, UniformBall
+from geomtact.inference.prior import GaussianPrior
 from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
@@ -296,6 +297,20 @@ def test_a_prior_holds_for_the_first_frame(flat_nut, creeping):
     difference = first.cell_log_density(flat_nut.index.possible) - expected.cell_log_density(flat_nut.index.possible)
     # but for the modes that were refined under another prior
     assert np.ptp(np.quantile(difference[likely], [0.05, 0.95])) < 0.05
+
+
+def test_a_prior_waits_for_the_first_contact(flat_nut, creeping):
+    """It lies over the sensor where that touches first, not where it stood before."""
+    trajectory, _ = creeping[0]
+    T_world_sensor = np.stack([se3.transform(se3.exp([1.0, 0, 0, 0, 0, 0])[:3, :3], [0, 0, -0.06]), np.eye(4)])
+    truth = trajectory.T_sensor_object[0]
+    prior = GaussianPrior(truth, np.diag([0.05**2] * 3 + [1e-3**2] * 3))
+    frames = [np.zeros_like(trajectory.masks[0]), trajectory.masks[0]]
+    gains = [
+        list(track(flat_nut, frames, poses, prior=prior))[-1].log_density(truth)
+        for poses in (T_world_sensor, T_world_sensor[[1, 1]])
+    ]
+    assert gains[0] == pytest.approx(gains[1], abs=1e-6) and gains[0] > 3
 
 
 def test_bad_frames_are_told_by_their_number(flat_nut, creeping, tmp_path):

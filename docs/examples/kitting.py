@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from geomtact import Localizer, Sensor
+from geomtact import GeomtactError, Localizer, Sensor
 from geomtact.evaluation.fixture import Fixture
 from geomtact.evaluation.kitting import SURE, draw_part, kit
 from geomtact.se3 import apply, inverse, transform, unit
@@ -24,13 +24,19 @@ BLUE, RED, GREEN = "#0072B2", "#D55E00", "#009E73"
 PIXELS, CLOSING, PLACING = 120, 5, 10  # of the pictures; frames of a closing and of the placing
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--part", default="pin")
+parser.add_argument("--part", default="pin", help="a bundled part, or a mesh file with --unit")
+parser.add_argument("--unit", help="of a mesh file: mm, cm, m or inch")
 parser.add_argument("--clearance-mm", type=float, default=1.0)
 parser.add_argument("--touches", type=int, default=4)
 parser.add_argument("--seed", type=int, default=0)
 options = parser.parse_args()
+if options.touches < 1 or options.clearance_mm < 0:
+    parser.error("expected --touches of 1 or more and a --clearance-mm of 0 or more")
 
-localizer = Localizer.prepare(options.part, sensor="gelslim")
+try:
+    localizer = Localizer.prepare(options.part, options.unit, sensor="gelslim")
+except GeomtactError as error:
+    parser.error(str(error))
 space, mesh, rng = localizer.space, localizer.mesh, np.random.default_rng(options.seed)
 fixture, clearance = Fixture(mesh), 1e-3 * options.clearance_mm
 truth = draw_part(space, rng)  # only the simulated fingers know it, and the check at the end
@@ -82,7 +88,8 @@ def draw(fingers, believed, probabilities, placed=None, title=""):
     left.set_title("grey: believed, blue: true")
     colours = [GREEN if p >= SURE else "0.6" for p in probabilities]
     middle.bar(range(1, len(probabilities) + 1), probabilities, color=colours)
-    middle.axhline(SURE, color="k", lw=0.8, ls="--")
+    middle.axhline(SURE, color="k", lw=0.8, ls="--", label=f"sure: {SURE:g}")
+    middle.legend(loc="upper left", frameon=False, fontsize=8)
     middle.set(xlim=(0.4, options.touches + 0.6), xticks=range(1, options.touches + 1), ylim=(0, 1))
     middle.set(title="P(fits)", xlabel="touches")
     recess = covered(truth[None])

@@ -9,13 +9,13 @@ if TYPE_CHECKING:
 
 
 def line_of(n: int, posterior: Posterior) -> dict[str, Any]:
-    """Of the ``n``-th image: whether it shows contact, and the first mode."""
+    """Of the ``n``-th image: whether it shows contact (None if it could not be read), and the first mode."""
     from geomtact.se3 import quat_xyzw
 
     first = next(iter(posterior.modes(1)), None)
     return {
         "frame": n,
-        "contact": posterior.contact,
+        "contact": posterior.contact if posterior.observations else None,
         "entropy_nats": posterior.entropy_nats if posterior.contact else None,
         "probability": None if first is None else first.probability,
         "T": None if first is None else first.T,

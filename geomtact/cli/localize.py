@@ -10,7 +10,7 @@ import typer
 
 from geomtact.cli.library import CacheDir
 from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit, open_localizer
-from geomtact.cli.shell import NO_CONTACT, check_folder, print_table, tell
+from geomtact.cli.shell import NO_CONTACT, check_folder, posterior_file, print_table, tell
 from geomtact.errors import InputError, UsageError, nearest_name
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def localize(
             help="JSON of where each sensor is in the world: T_world_sensor, a 4x4 for each image, in metres."
         ),
     ] = None,
-    prior: Annotated[Path | None, typer.Option(help="posterior.npz of what is known before.")] = None,
+    prior: Annotated[Path | None, typer.Option(help="posterior.npz of what is known before, or its folder.")] = None,
     effort: Annotated[
         str | None,
         typer.Option(metavar="|".join(Effort), help="How much to compute; balanced by default.", show_default=False),
@@ -110,8 +110,7 @@ def localize(
         "effort": effort,
     }
     check_folder(out)
-    if prior is not None and not prior.is_file():
-        raise InputError(f"--prior {prior}: no such file; give a posterior.npz")
+    prior = prior and posterior_file(prior, "--prior")
     images = images or []
     live = camera is not None or watch
     if live:
@@ -147,7 +146,7 @@ def localize(
 
         # a camera that is not there is told before minutes go into an index
         frames = newest_in(images[0]) if camera is None else camera_frames(camera, values["sensor"])
-        localizer = open_localizer(values, sources, scorer, cache_dir, max_poses)
+        localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior)
         options = {"kind": kind, "prior": prior, "effort": chosen, "seed": seed}
         if not localize_live(localizer, frames, values["background"], options):
             raise typer.Exit(NO_CONTACT)
@@ -158,7 +157,7 @@ def localize(
         if gel is not None:
             # a bad image is told before minutes go into an index
             read_observation(image, gel, kind, values["background"])
-    timing = {"prepare": 0.0}
+    timing, frame = {"prepare": 0.0}, "sensor" if placed is None else "world"
 
     def opened(part: str | None) -> Localizer:
         began = time.perf_counter()
@@ -166,7 +165,7 @@ def localize(
         # in a folder of several, bundled parts have units of their own
         own = {"object": part, "unit": None if len(parts) > 1 and part in catalogue() else values["unit"]}
         on = {
-            gel: open_localizer({**values, **own, "sensor": gel}, told, scorer, cache_dir, max_poses)
+            gel: open_localizer({**values, **own, "sensor": gel}, told, scorer, cache_dir, max_poses, prior, frame)
             for gel in dict.fromkeys(gels)
         }
         timing["prepare"] += 1e3 * (time.perf_counter() - began)

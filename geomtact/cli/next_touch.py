@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.library import CacheDir
-from geomtact.cli.shell import check_folder, print_table
+from geomtact.cli.shell import check_folder, posterior_file, print_table
 from geomtact.errors import GeomtactError, InputError, nearest_name
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def next_touch(
 
     check_folder(out)
     given = None if actions is None else read_actions(actions)
-    known = Posterior.load(posterior / "posterior.npz" if posterior.is_dir() else posterior, cache_dir)
+    known = Posterior.load(posterior_file(posterior), cache_dir)
     ranked = planning.next_touch(known, given, seed=seed)
     note = planning.ambiguity(ranked)
     content = _content(
@@ -60,13 +60,13 @@ def next_touch(
         typer.echo(to_text(content), nl=False)
         return
     typer.echo(f"{known.mesh.name} on {known.sensor.name}, {known.frame} frame; {len(ranked)} actions")
-    headings = ["", "action", "from x, y, z [mm]", "along x, y, z", "nats", "discards", "touches", "cost"]
+    headings = ["", "action", "from x, y, z [mm]", "along x, y, z", "nats", "discards", "meets it", "cost"]
     print_table(
-        headings, [_row(k + 1, a) for k, a in enumerate(ranked[:_FIRST])], ["", "nats", "discards", "touches", "cost"]
+        headings, [_row(k + 1, a) for k, a in enumerate(ranked[:_FIRST])], ["", "nats", "discards", "meets it", "cost"]
     )
     if note is not None:
         typer.echo(note)
-    typer.echo(f"written: {out}/next_touch.json and .png" if out else "for a picture, give --out DIR")
+    typer.echo(f"written: {out}/next_touch.json and .png" if out else "for whole poses and a picture, give --out DIR")
 
 
 def read_actions(path: Path) -> list[Touch | Probe]:
@@ -139,9 +139,10 @@ def _content(
                     "T_world_sensor": action.T_world_sensor,
                     "travel": getattr(action.of, "travel", None),
                     "expected_nats": action.expected_nats,
-                    "expected_discarded": action.expected_discarded,
+                    "expected_discarded": None if action.roughly else action.expected_discarded,
                     "contact": action.contact,
                     "cost": action.cost,
+                    "roughly": action.roughly,
                 }
                 for action in ranked
             ],

@@ -52,11 +52,14 @@ def open_localizer(
     scorer: str | None,
     cache_dir: Path | None,
     max_poses: int | None = None,
+    prior: Path | None = None,
+    frame: str = "sensor",
     given: str | None = None,
 ) -> Localizer:
     """The localizer for resolved options, with a progress bar where its index has to be built first.
 
-    ``given`` is how the object is named on the command line, if not by --object.
+    A ``prior`` of another object, or not in ``frame``, is refused before that. ``given`` is how the object is named on the
+    command line, if not by --object.
     """
     from geomtact.cli.project import require
     from geomtact.geometry.catalogue import catalogue
@@ -69,13 +72,17 @@ def open_localizer(
 
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.geometry.mesh import load_mesh
+    from geomtact.inference.files import heading
     from geomtact.inference.localizer import Localizer
+    from geomtact.inference.prior import check_same
     from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
 
     scorer = scorer or DEFAULT_SCORER
     check_name(scorer)  # a wrong name is told before minutes go into an index
     gel = Sensor.load(sensor)
     mesh = load_mesh(object_name, values["unit"], sensor=gel)
+    if prior is not None:
+        check_same(heading(prior), mesh, frame)
     windows = mesh.diameter / (2 * gel.half_window.max())
     if windows > _MANY_WINDOWS:
         tell(

@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from geomtact.errors import GeomtactError, UsageError
+from geomtact.errors import GeomtactError, InputError, UsageError
 
 USAGE_ERROR, BAD_INPUT, NO_CONTACT = 2, 3, 4
 
@@ -48,6 +48,19 @@ def check_folder(out: Path | None) -> None:
     """
     if out is not None and out.is_file():
         raise UsageError(f"--out {out}: is a file; give a folder")
+
+
+def posterior_file(path: Path, option: str = "") -> Path:
+    """``path``, or the posterior.npz in it where it is a folder that ``localize --out`` wrote.
+
+    Raises
+    ------
+    InputError
+    """
+    found = path / "posterior.npz" if path.is_dir() else path
+    if not found.is_file():
+        raise InputError(f"{option} {path}: no such file; give a posterior.npz, or its folder".strip())
+    return found
 
 
 def tell(text: str) -> None:

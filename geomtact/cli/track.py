@@ -14,7 +14,7 @@ from geomtact.cli.library import CacheDir
 from geomtact.cli.lines import line_of, to_line
 from geomtact.cli.localize import Effort, Kind, _check_name
 from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit, open_localizer
-from geomtact.cli.shell import NO_CONTACT, tell
+from geomtact.cli.shell import NO_CONTACT, posterior_file, tell
 from geomtact.errors import InputError, UsageError
 
 
@@ -33,7 +33,9 @@ def track(
     sensor: SensorName = None,
     kind: Annotated[str, typer.Option(metavar="|".join(Kind), help="What the images are.")] = Kind.auto.value,
     background: Annotated[Path | None, typer.Option(help="Image of the untouched sensor, for readings.")] = None,
-    prior: Annotated[Path | None, typer.Option(help="posterior.npz of what is known before the first frame.")] = None,
+    prior: Annotated[
+        Path | None, typer.Option(help="posterior.npz of what is known before the first frame, or its folder.")
+    ] = None,
     effort: Annotated[
         str | None,
         typer.Option(metavar="|".join(Effort), help="How much to compute; balanced by default.", show_default=False),
@@ -66,8 +68,7 @@ def track(
     from geomtact.cli.project import resolve
 
     _check_name("kind", kind, Kind)
-    if prior is not None and not prior.is_file():
-        raise InputError(f"--prior {prior}: no such file; give a posterior.npz")
+    prior = prior and posterior_file(prior, "--prior")
     if follow and not Path(source).is_dir():
         raise UsageError(f"--follow: expected a folder to watch, got {source}")
     given = {
@@ -81,7 +82,7 @@ def track(
     chosen = values["effort"] or Effort.balanced.value
     _check_name("effort", chosen, Effort, sources.get("effort"))
     frames = all_frames(source, follow, values["sensor"])
-    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses)
+    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior)
 
     from geomtact.inference.motion import UniformBall
     from geomtact.inference.sequence import track as posteriors

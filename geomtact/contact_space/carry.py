@@ -29,6 +29,7 @@ _FAR = 3.0  # standard deviations beyond which nothing of a cell touches
 # share of poses whose height is far from their cell's: where a limb of the object leaves the window, the rest sinks
 _JUMPS = 0.02
 _BESIDE = 0.3  # steps of the grid by which a cell's neighbours share in it: few poses stand for a cell
+UNFELT = 0.1  # share of touching poses at which a sensor may yet show nothing: a contact too small or too shallow
 _SPREAD = 1.2  # of heights over the other sensor, in units of what the steps of both grids come to
 
 
@@ -124,6 +125,10 @@ class Carry:
         self._in_parts(np.flatnonzero(rough), lambda part: work(part, self._draws[:1]))
         self._in_parts(np.flatnonzero(~rough), lambda part: work(part, self._draws))
         return total, touching
+
+    def nothing_felt(self) -> NDArray[np.float32]:
+        """How likely (n,) it is for each place of ``here`` that the other sensor shows no contact."""
+        return 1 - np.float32(1 - UNFELT) * self.reached()
 
     def reached(self) -> NDArray[np.float32]:
         """The share (n,) of each place of ``here`` at which the object would reach the other sensor's membrane, however deep."""

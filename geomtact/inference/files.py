@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from geomtact.sensing.sensor import Sensor
 
 _KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many
 _FORMAT = "geomtact/posterior/2"
+_BROKEN = (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError)
 
 
 def save(posterior: Posterior, path: str | Path) -> None:
@@ -80,6 +82,18 @@ def save(posterior: Posterior, path: str | Path) -> None:
     write_whole(Path(path), write)
 
 
+def heading(path: str | Path) -> tuple[str, str, str]:
+    """The object's name and sha256, and the frame, of a saved posterior, without opening its index.
+
+    Raises
+    ------
+    InputError
+        As of :func:`load`.
+    """
+    data, meta = _read(path, ("object_sha256", "frame", "meta"))
+    return meta["object"], str(data["object_sha256"]), str(data["frame"])
+
+
 def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     """Read a posterior; its index is opened from the cache, or built anew where it is no longer there.
 
@@ -88,16 +102,8 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     InputError
         The file cannot be read, or is no posterior.
     """
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file; give a posterior.npz")
+    data, meta = _read(path)
     try:
-        if not zipfile.is_zipfile(path):  # numpy would take it for a pickle
-            raise ValueError("it is no .npz file, or not a whole one")
-        with np.load(path, allow_pickle=False) as file:
-            data = {name: file[name] for name in file.files}
-        meta = json.loads(str(data["meta"]))
-        if meta["format"] != _FORMAT:
-            raise ValueError(f"format {meta['format']!r}")
         mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"], symmetry=_symmetry(data, meta))
         sensor = Sensor.from_toml(str(data["sensor_toml"]), str(path))
         cells, runs, log_prob = data["row_cell"], data["row_length"], data["row_log_prob"].astype(float)
@@ -109,8 +115,8 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
                 data["refined_cells"], data["refined_T"], data["refined_covariance"], extra, strict=True
             )
         }
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"{path}: not a posterior that geomtact saved ({error}); give a posterior.npz") from None
+    except _BROKEN as error:
+        raise _not_saved(path, error) from None
     settings = meta["settings"]
     max_poses, key = settings.get("max_poses", MAX_POSES), str(data["index_key"])
     index = open_index(mesh, sensor, meta["approach"], max_poses, cache_dir, key=key)
@@ -130,6 +136,27 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         settings=settings,
         warnings=meta["warnings"],
     )
+
+
+def _read(path: str | Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The arrays of ``names``, or all, and what is told in words."""
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file; give a posterior.npz")
+    try:
+        if not zipfile.is_zipfile(path):  # numpy would take it for a pickle
+            raise ValueError("it is no .npz file, or not a whole one")
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: file[name] for name in names or file.files}
+        meta = json.loads(str(data["meta"]))
+        if meta["format"] != _FORMAT:
+            raise ValueError(f"format {meta['format']!r}")
+    except _BROKEN as error:
+        raise _not_saved(path, error) from None
+    return data, meta
+
+
+def _not_saved(path: str | Path, error: Exception) -> InputError:
+    return InputError(f"{path}: not a posterior that geomtact saved ({error}); give a posterior.npz")
 
 
 def _symmetry(data: dict[str, Any], meta: dict[str, Any]) -> Symmetry:

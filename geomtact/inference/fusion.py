@@ -14,7 +14,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from geomtact.errors import NoPoseAgreesError
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
-from geomtact.inference.refine_together import UNFELT, View, refine_together
+from geomtact.inference.refine_together import View, refine_together
 from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, inverse
 
@@ -46,13 +45,15 @@ class Fused:
     cells : (n,) of the index of the first sensor that has contact
     log_prob : (n,) log probability of each, normalised
     first : which sensor that is
-    log_evidence : log of the mean over the prior, on the first sensor's space, of the product of densities, each counted in full
+    weight : (N,) by how much each sensor counts: less than 1 where others say the same
+    log_evidence : log of the mean over the prior, on the first sensor's space, of the product of densities so weighed
     support : (N,) for each sensor, by how many nats the others make its reading likelier than the uniform does; 0 for one
     """
 
     cells: NDArray[np.int64]
     log_prob: NDArray[np.floating]
     first: int
+    weight: Array
     log_evidence: float
     support: Array
 
@@ -105,7 +106,11 @@ def fuse(
         log_prob = np.float32(share[0]) * np.log(density) + (share[1:, None] * logs[1:]).sum(0).astype(np.float32)
     log_prob = log_prob.reshape(-1) + log_prior
     cells = np.flatnonzero(np.isfinite(log_prior))
-    return Fused(cells, normalised(log_prob[cells]), first, float(np.log(total)), support)
+    joint = normalised(log_prob[cells])
+    top = int(joint.argmax())
+    weight = np.zeros(len(order))
+    weight[order] = share
+    return Fused(cells, joint, first, weight, float(log_prob[cells[top]] - joint[top]), support)
 
 
 def fused_posterior(
@@ -114,7 +119,6 @@ def fused_posterior(
     prior: Any,
     modes: int,
     rig: RigStd | None = None,
-    cache_dir: str | Path | None = None,
 ) -> Posterior:
     """The posterior of all sensors together, on the cells of the first that has contact, its leading modes refined.
 
@@ -131,13 +135,13 @@ def fused_posterior(
         As :func:`fuse`.
     """
     if not any(touch.contact for touch in touches):
-        return _nothing_felt(touches, prior, cache_dir)
+        return _nothing_felt(touches, prior)
     first = next(touch for touch in touches if touch.contact)
     timing = {stage: sum(t.timing_ms.get(stage, 0.0) for t in touches) for stage in ("read", "score", "posterior")}
     began = time.perf_counter()
     log_prior = None
     if prior is not None:
-        log_prior = prior_log_mass(first.index, prior, first.T_frame_sensor, first.frame, cache_dir)
+        log_prior = prior_log_mass(first.index, prior, first.T_frame_sensor, first.frame)
     fused = fuse(touches, log_prior, rig)
     timing["fuse"] = 1e3 * (time.perf_counter() - began)
     against = disagreement(fused)
@@ -146,7 +150,7 @@ def fused_posterior(
         cells=fused.cells,
         log_prob=fused.log_prob,
         runs=None,
-        log_evidence=sum(t.log_evidence for t in touches) + fused.log_evidence,
+        log_evidence=float(fused.weight @ [t.log_evidence for t in touches]) + fused.log_evidence,
         observations=first.observations + [o for touch in touches if touch is not first for o in touch.observations],
         settings=first.settings | _said(touches) | {"odd": any(t.settings.get("odd", False) for t in touches)},
         timing_ms=timing,
@@ -167,10 +171,10 @@ def fused_posterior(
     return posterior
 
 
-def _nothing_felt(touches: Sequence[Posterior], prior: Any, cache_dir: str | Path | None) -> Posterior:
+def _nothing_felt(touches: Sequence[Posterior], prior: Any) -> Posterior:
     """The posterior when no sensor feels anything: what was known before, where none is touched."""
     first, others = touches[0], touches[1:]
-    before = prior_log_density(prior, first.mesh, first.frame, cache_dir)
+    before = prior_log_density(prior, first.mesh, first.frame)
 
     def elsewhere(T: Array) -> Array:
         density = before(T) if before is not None else np.zeros(len(T))
@@ -187,7 +191,11 @@ def _nothing_felt(touches: Sequence[Posterior], prior: Any, cache_dir: str | Pat
 
 def _said(touches: Sequence[Posterior]) -> dict[str, Any]:
     """What is told of every sensor."""
-    return {"T_world_sensor": [t.T_frame_sensor.tolist() for t in touches], "touched": [t.contact for t in touches]}
+    return {
+        "T_world_sensor": [t.T_frame_sensor.tolist() for t in touches],
+        "touched": [t.contact for t in touches],
+        "images": [image for t in touches for image in t.settings["images"]],
+    }
 
 
 def _warnings(touches: Sequence[Posterior]) -> list[str]:
@@ -217,7 +225,7 @@ def _seen(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Likelihood (n,) of what ``other`` shows at each place of ``carry.here``, and of its showing any contact, or none."""
     if not other.contact:
-        free = 1 - (1 - UNFELT) * carry.reached()
+        free = carry.nothing_felt()
         return free, free
     return carry.mean(other.densities, doubtful)
 

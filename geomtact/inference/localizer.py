@@ -21,9 +21,10 @@ from geomtact.contact_space.store import default_cache_dir, open_index
 from geomtact.errors import InputError, UsageError, nearest_name
 from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.inference.evidence import counted_once, digest
 from geomtact.inference.fusion import fused_posterior
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import prior_log_density, prior_log_mass
+from geomtact.inference.prior import opened, prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.inference.refine_together import View, refine_together
 from geomtact.planning.next_touch import Action, next_touch
@@ -162,8 +163,10 @@ class Localizer:
         backgrounds = background if isinstance(background, list | tuple) else [background] * len(images)
         if len(backgrounds) != len(images):
             raise UsageError(f"localize: expected one background, or {len(images)}, got {len(backgrounds)}")
+        prior = opened(prior, self.cache_dir)
         if len(images) == 1:
             touch = self.touch(images[0], kind, backgrounds[0], T_frame_sensor[0], frame, prior, effort, seed)
+            touch = counted_once(touch, prior)
             if not touch.contact:
                 return touch
             with _timed(touch.timing_ms, "refine"):
@@ -171,7 +174,7 @@ class Localizer:
                 if contact.height is not None and how.modes:
                     before = None
                     if prior is not None:
-                        before = prior_log_mass(self.index, prior, T_frame_sensor[0], frame, self.cache_dir)
+                        before = prior_log_mass(self.index, prior, T_frame_sensor[0], frame)
                     return refine_together(touch, [View(self.refinery, contact, np.eye(4))], how.modes, seed, before)
                 return self.refinery.refine(touch, contact, how.modes, how.thorough)
         localizers = (self, *self.others) if self.others else (self,) * len(images)
@@ -183,7 +186,8 @@ class Localizer:
             each.touch(shown, kind, empty, T, frame, None, effort, seed)
             for each, shown, empty, T in zip(localizers, images, backgrounds, T_frame_sensor, strict=True)
         ]
-        return fused_posterior(touches, [each.refinery for each in localizers], prior, how.modes, rig, self.cache_dir)
+        refineries = [each.refinery for each in localizers]
+        return counted_once(fused_posterior(touches, refineries, prior, how.modes, rig), prior)
 
     def touch(
         self,
@@ -212,17 +216,22 @@ class Localizer:
             "T_frame_sensor": T_frame_sensor,
             "seed": seed,
             "observations": [observation],
-            "settings": settings | {"kind": observation.kind, "heights": observation.contact.height is not None},
+            "settings": settings
+            | {
+                "kind": observation.kind,
+                "heights": observation.contact.height is not None,
+                "images": [digest(observation.image) if mask.any() else None],
+            },
             "timing_ms": timing,
         }
         if not mask.any():
-            elsewhere = prior_log_density(prior, self.mesh, frame, self.cache_dir)
+            elsewhere = prior_log_density(prior, self.mesh, frame)
             nothing = Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, **common)
             return replace(nothing, elsewhere=elsewhere, warnings=warnings)
         log_prior = None
         with _timed(timing, "score"):
             if prior is not None:
-                log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame, self.cache_dir)
+                log_prior = prior_log_mass(self.index, prior, T_frame_sensor, frame)
             if prior is None and not above:
                 rows = self.scorer.rows(self.index, mask, resolved)
             else:

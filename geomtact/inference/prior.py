@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.contact_space.carry import Carry
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import InputError, UsageError
@@ -80,14 +81,17 @@ class GaussianPrior:
         return GaussianPrior(self.T, self.covariance + spread)
 
 
-def prior_log_mass(
-    index: Index, prior: Any, T_frame_sensor: Array, frame: str, cache_dir: str | Path | None = None
-) -> NDArray[np.floating]:
+def opened(prior: Any, cache_dir: str | Path | None = None) -> Any:
+    """``prior``, read where it is the path of a saved posterior."""
+    return Posterior.load(prior, cache_dir) if isinstance(prior, str | Path) else prior
+
+
+def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) -> NDArray[np.floating]:
     """Log mass (N,) of every cell under ``prior``, normalised; the uniform's without one.
 
     Parameters
     ----------
-    prior : None, a Posterior or the path of one, a pair (poses (N, 4, 4), log masses (N,)) each of which is spread
+    prior : None, a Posterior, a pair (poses (N, 4, 4), log masses (N,)) each of which is spread
         over one grid cell, a :class:`GaussianPrior`, or a function of poses (N, 4, 4) giving the log density relative to the
         uniform. Poses are in ``frame``.
 
@@ -99,8 +103,6 @@ def prior_log_mass(
     uniform = index.log_weight
     if prior is None:
         return uniform
-    if isinstance(prior, str | Path):
-        prior = Posterior.load(prior, cache_dir)
     if isinstance(prior, Posterior):
         density = _of_posterior(index, prior, T_frame_sensor, frame)
     elif callable(prior):
@@ -123,17 +125,15 @@ def prior_log_mass(
     return normalised(out)
 
 
-def prior_log_density(prior: Any, mesh: Mesh, frame: str, cache_dir: str | Path | None = None) -> LogDensity | None:
+def prior_log_density(prior: Any, mesh: Mesh, frame: str) -> LogDensity | None:
     """Log density, not normalised, of ``prior`` at poses (n, 4, 4) in ``frame``, touching or not; None without one.
 
     Of a pair, each pose's mass counts for all poses within the radius of a mode.
     """
     if prior is None:
         return None
-    if isinstance(prior, str | Path):
-        prior = Posterior.load(prior, cache_dir)
     if isinstance(prior, Posterior):
-        _check_same(prior, mesh, frame)
+        check_same(_heading(prior), mesh, frame)
         return prior.log_density
     if callable(prior):
         return lambda T: _checked(prior(T), len(T))
@@ -148,14 +148,25 @@ def prior_log_density(prior: Any, mesh: Mesh, frame: str, cache_dir: str | Path 
     return near
 
 
-def _check_same(prior: Posterior, mesh: Mesh, frame: str) -> None:
-    if prior.mesh.sha256 != mesh.sha256:
-        raise InputError(f"prior: it is for the object {prior.mesh.name!r}, not for {mesh.name!r} as loaded here")
-    if prior.frame != frame:
+def check_same(heading: tuple[str, str, str], mesh: Mesh, frame: str) -> None:
+    """Refuse a posterior, of whose object ``heading`` gives the name and sha256, and its frame, for another object or frame.
+
+    Raises
+    ------
+    InputError
+    """
+    name, sha256, its_frame = heading
+    if sha256 != mesh.sha256:
+        raise InputError(f"prior: it is for the object {name!r}, not for {mesh.name!r} as loaded here")
+    if its_frame != frame:
         raise InputError(
-            f"prior: its frame is {prior.frame!r} but this posterior's is {frame!r}; "
-            "give T_world_sensor to both touches or to neither"
+            f"prior: its frame is {its_frame!r} but this posterior's is {frame!r}; give the sensor's pose in the world "
+            "(--sensor-poses, T_world_sensor in Python) for both or for neither"
         )
+
+
+def _heading(prior: Posterior) -> tuple[str, str, str]:
+    return prior.mesh.name, prior.mesh.sha256, prior.frame
 
 
 def _pair(poses: Any, log_masses: Any) -> tuple[Array, Array]:
@@ -170,14 +181,28 @@ def _pair(poses: Any, log_masses: Any) -> tuple[Array, Array]:
 
 
 def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: str) -> Array:
-    _check_same(prior, index.mesh, frame)
+    check_same(_heading(prior), index.mesh, frame)
     same_place = np.allclose(prior.T_frame_sensor, T_frame_sensor, atol=1e-9)
     if prior.index.key == index.key and same_place:
         if not prior.contact:
             raise InputError("prior: it says that the object does not touch the sensor, but this image shows a contact")
         return prior.cell_log_density(np.arange(len(index)))
-    # the prior's own sensor saw the object at some depth: casting it there decides what was ruled out
-    return _by_chunks(index, lambda T: prior.log_density(T_frame_sensor @ T), settled=True)
+    if same_place:
+        # another grid: the prior's own sensor saw the object at some depth, and casting it there decides what was ruled out
+        return _by_chunks(index, lambda T: prior.log_density(T_frame_sensor @ T), settled=True)
+    return _carried(index, prior, T_frame_sensor)
+
+
+def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
+    """Log density (N,) of a prior that a sensor elsewhere told, in the cells of ``index``: the mean over each, for a cell is
+    wider than the gel is deep, so that its own pose seldom touches there."""
+    carry = Carry(index, prior.index, inverse(prior.T_frame_sensor) @ T_frame_sensor)
+    density = carry.mean(prior.densities)[0] if prior.contact else carry.nothing_felt()
+    with np.errstate(divide="ignore"):
+        out = np.tile(np.log(density.astype(float)), len(index.height))
+    if prior.elsewhere is not None:
+        out += _by_chunks(index, lambda T: prior.elsewhere(T_frame_sensor @ T))
+    return out
 
 
 def _of_poses(index: Index, poses: Any, log_masses: Any, T_frame_sensor: Array) -> Array:

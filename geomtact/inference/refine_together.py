@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.contact_space.carry import UNFELT
 from geomtact.contact_space.index import Index
 from geomtact.inference.posterior import Posterior, Refined
 from geomtact.inference.refine import Refinery
@@ -46,7 +47,6 @@ _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose expla
 # nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 ALIKE, UNLIKE = 4.0, 8.0
 _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
-UNFELT = 0.1  # share of touching poses at which a sensor may yet show nothing: a contact too small or too shallow
 
 
 @dataclass(frozen=True, eq=False)

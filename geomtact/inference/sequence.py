@@ -14,7 +14,7 @@ from geomtact.errors import InputError, UsageError, nearest_name
 from geomtact.inference.filter import FRESH, NOW, Counts, Filter
 from geomtact.inference.motion import Motion, UniformBall
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import prior_log_mass
+from geomtact.inference.prior import opened, prior_log_mass
 from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.se3 import Array, check_transforms
 
@@ -52,7 +52,7 @@ def track(
     motion : of the object from one frame to the next, ``UniformBall()`` by default; the tighter it is, the more the frames before
         tell
     effort, kind, background, seed : as for ``localize``
-    prior : what was known before the first frame (see ``inference.prior``)
+    prior : what was known before the first frame with contact, over the sensor as it stands then (see ``inference.prior``)
     most : cells that are kept from frame to frame at most, which bounds the time a frame takes; all that count by default
     counts : powers of a frame's likelihood, in its own posterior and in those of all later frames; None for the latter lets all
         frames before count by ``filter.MEMORY`` together, so that frames which err alike are not counted twice. (1, 1) is the
@@ -107,17 +107,21 @@ def _tracked(
     settings |= {"counts": list(state.counts), "fresh": state.fresh, "most": state.most}
     for n, image, T in pairs:
         frame, at = ("sensor", np.eye(4)) if T is None else ("world", T)
-        if n == 1 and prior is not None:
-            log_mass = prior_log_mass(index, prior, at, frame, localizer.cache_dir)
-            state.memory = Mixture(np.flatnonzero(np.isfinite(log_mass)), np.exp(log_mass[np.isfinite(log_mass)]), 0.0)
         try:
             seen = localizer.localize(image, T_world_sensor=T, **options)
         except InputError as error:
             if not skip:
-                raise type(error)(f"frame {n}: {error}") from None
+                raise type(error)(
+                    f'frame {n}: {error}; or pass such frames over: --skip-broken, on_error="skip" in Python'
+                ) from None
             told = [f"frame {n} was skipped: {error}"]
             nothing = np.zeros(0, np.int64), np.zeros(0)
             seen = Posterior(index, *nothing, frame, at, contact=False, seed=options["seed"], warnings=told)
+        if prior is not None and (seen.contact or not seen.observations):
+            # the cells are those over the sensor where it stands now
+            log_mass = prior_log_mass(index, opened(prior, localizer.cache_dir), at, frame)
+            state.memory = Mixture(np.flatnonzero(np.isfinite(log_mass)), np.exp(log_mass[np.isfinite(log_mass)]), 0.0)
+            prior = None
         yield state.step(replace(seen, settings=seen.settings | settings))
 
 

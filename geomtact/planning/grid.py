@@ -13,6 +13,7 @@ from geomtact.planning.belief import Belief, check_contact, draw_cells
 from geomtact.se3 import Array, apply, inverse, transform
 
 _SAME_WAY = np.radians(15)
+_POSES = 128  # that tell the region
 
 
 def grid_of_touches(
@@ -40,7 +41,7 @@ def grid_of_touches(
     """
     check_contact(posterior)
     space = posterior.space
-    poses = draw_cells(posterior, 32, np.random.default_rng(seed))[0]
+    poses = draw_cells(posterior, _POSES, np.random.default_rng(seed))[0]
     points = apply(poses, space.mesh.surface_points(64)).reshape(-1, 3)
     long_axis = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][0]
     window = 2 * space.sensor.half_window

@@ -8,7 +8,7 @@ a difference counts only if it tells cells apart, as the localizer could, not if
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,6 +48,7 @@ class Action:
     contact : probability that it touches
     number : among the actions given, from 1
     of : the action itself
+    roughly : whether it was tried at some of the poses alone, as one of many that tell less
     """
 
     T_world_sensor: Array
@@ -57,6 +58,7 @@ class Action:
     contact: float
     number: int
     of: Touch | Probe
+    roughly: bool = False
 
     def __repr__(self) -> str:
         kind = type(self.of).__name__.lower()
@@ -96,7 +98,7 @@ def next_touch(
     if few is T:
         return judged
     closely = _ranked(judge(posterior.space, action.of, T, action.number) for action in judged[:_CLOSELY])
-    return closely + judged[_CLOSELY:]
+    return closely + [replace(action, roughly=True) for action in judged[_CLOSELY:]]
 
 
 def _ranked(judged: Iterable[Action]) -> list[Action]:
@@ -167,7 +169,7 @@ def discarded(likelihood: Array) -> float:
 
 def ambiguity(ranked: Sequence[Action]) -> str | None:
     """Why none of the actions helps, in words; None where one does."""
-    most = max(action.expected_nats for action in ranked[:_CLOSELY])  # others were tried at few poses
+    most = max(action.expected_nats for action in ranked if not action.roughly)
     if most >= LEAST:
         return None
     if max(action.contact for action in ranked) <= LEAST:

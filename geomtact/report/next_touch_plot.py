@@ -78,8 +78,8 @@ def _region(
     """The share of ``poses`` at which the part covers a line of sight, the first sensor, and the ``best`` actions."""
     ends = np.concatenate([_path(posterior, action, poses) for action in best])
     outline = apply(poses, posterior.mesh.surface_points(128)).reshape(-1, 3)
-    window = apply(posterior.T_frame_sensor, _corners(posterior.sensor))
-    corners = np.concatenate([outline, window, ends]) @ R.T
+    windows = apply(_touched_by(posterior), _corners(posterior.sensor))
+    corners = np.concatenate([outline, *windows, ends]) @ R.T
     low, high = corners.min(0)[:2], corners.max(0)[:2]
     middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
     covered = _covered(posterior, poses, R, middle, half)
@@ -87,7 +87,9 @@ def _region(
     extent = tuple(1e3 * np.array([x - half, x + half, y - half, y + half]))
     # the root, so that what is unlikely is seen too
     axes.imshow(np.sqrt(covered), extent=extent, cmap="Greys", vmin=0, vmax=1.3)
-    axes.fill(*_seen(window, R), facecolor="none", edgecolor=FIRST, lw=1.5, label="window of the sensor that touched")
+    for k, window in enumerate(windows):
+        label = None if k else "window of a sensor that touched"
+        axes.fill(*_seen(window, R), facecolor="none", edgecolor=FIRST, lw=1.5, label=label)
     for action, colour in zip(best, _COLOURS, strict=False):
         start, end = _seen(_path(posterior, action, poses), R).T
         kind = "touch" if isinstance(action.of, Touch) else "probe"
@@ -112,6 +114,12 @@ def _region(
     axes.set(title=f"Where the part may be, {name}", xlabel=f"{right} [mm]", ylabel=f"{up} [mm]")
 
 
+def _touched_by(posterior: Posterior) -> Array:
+    """The sensors (n, 4, 4) of which the posterior tells; they are taken to have the first one's window."""
+    several = posterior.settings.get("T_world_sensor")
+    return posterior.T_frame_sensor[None] if several is None else np.asarray(several)
+
+
 def _covered(posterior: Posterior, poses: Array, R: Array, middle: Array, half: float) -> Array:
     """Share (n, n) of ``poses`` (m, 4, 4) at which the part lies on the line of sight through each pixel."""
     # a camera without perspective is a sensor to the caster
@@ -132,7 +140,8 @@ def _path(posterior: Posterior, action: Action, poses: Array) -> Array:
 
 def _bars(axes: Axes, ranked: Sequence[Action]) -> None:
     """Expected information of the best actions and of the last."""
-    some = list(ranked) if len(ranked) <= _BARS else [*ranked[: _BARS - 1], ranked[-1]]
+    known = [action for action in ranked if not action.roughly]
+    some = known if len(known) <= _BARS else [*known[: _BARS - 1], known[-1]]
     place = np.arange(len(some))
     colours = [*_COLOURS, *[_OTHERS] * len(some)][: len(some)]
     axes.barh(place, [a.expected_nats for a in some], color=colours)
@@ -141,11 +150,13 @@ def _bars(axes: Axes, ranked: Sequence[Action]) -> None:
     axes.invert_yaxis()
     for at, action in enumerate(some):
         cost = "" if action.cost == 1 else f", cost {action.cost:g}"
-        text = f" {action.expected_nats:.2f}, touches with {100 * action.contact:.0f} %{cost}"
+        text = f" {action.expected_nats:.2f}, meets it with {100 * action.contact:.0f} %{cost}"
         axes.text(action.expected_nats, at, text, va="center", fontsize=8)
     axes.set_xlim(0, 1.7 * max(0.1, *(a.expected_nats for a in some)))
     axes.spines[["top", "right"]].set_visible(False)
-    title = "Expected information" if len(some) == len(ranked) else f"The best and the last of {len(ranked)} actions"
+    title = "Expected information"
+    if len(some) < len(ranked):
+        title = f"The best of {len(ranked)} actions, and the last of those tried at all poses"
     axes.set(title=title, xlabel="nats about the pose; 0.7 tells two possibilities apart")
 
 
