@@ -16,10 +16,12 @@ from typer.testing import CliRunner
 
 from geomtact import se3
 from geomtact.cli import app
+from geomtact.evaluation.touches import random_touches
 from geomtact.files import write_whole
 from geomtact.geometry.mesh import load_mesh
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
 from geomtact.report.result import plain, result, to_text
+from geomtact.report.shown import Shown, shown_of
 from geomtact.report.summary import MOTIONS, caution, contact_centre, facts, percent, summaries_of, summarise, told
 from geomtact.report.write import write_all
 from geomtact.sensing.cast import Caster
@@ -42,6 +44,11 @@ class FakeIndex:
 
     def __len__(self):
         return 4000
+
+
+def alone(posterior, simulate):
+    """The one sensor's image."""
+    return [Shown(posterior.sensor, posterior.T_frame_sensor, posterior.observations[0], simulate)]
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +96,9 @@ def touch():
 
 def test_all_files_are_whole_and_agree(touch, tmp_path):
     posterior, modes, simulate = touch
-    content = write_all(tmp_path / "new" / "folder", posterior, modes, simulate, {"kind": "auto"}, {"prepare": 1.0})
+    content = write_all(
+        tmp_path / "new" / "folder", posterior, modes, alone(posterior, simulate), {"kind": "auto"}, {"prepare": 1.0}
+    )
     folder = tmp_path / "new" / "folder"
     assert sorted(p.name for p in folder.iterdir()) == ["posterior.npz", "report.html", "report.png", "result.json"]
 
@@ -118,7 +127,7 @@ def test_all_files_are_whole_and_agree(touch, tmp_path):
 
 def test_page_is_self_contained_and_escaped(touch, tmp_path):
     posterior, modes, simulate = touch
-    write_all(tmp_path, posterior, modes, simulate)
+    write_all(tmp_path, posterior, modes, alone(posterior, simulate))
     html = (tmp_path / "report.html").read_text("utf-8")
     assert "a &lt;b&gt;bold&lt;/b&gt; warning" in html
     assert "<b>" not in html
@@ -155,7 +164,7 @@ def test_no_contact_still_makes_a_report(touch, tmp_path):
     seen = posterior.observations[0]
     nothing = SimpleNamespace(mask=np.zeros_like(seen.contact.mask), height=None)
     empty.observations = [SimpleNamespace(contact=nothing, kind="mask", image=np.zeros_like(seen.image))]
-    content = write_all(tmp_path, empty, [], simulate)
+    content = write_all(tmp_path, empty, [], alone(empty, simulate))
     assert content["modes"] == []
     assert content["contact"] is False
     assert "No contact" in (tmp_path / "report.html").read_text()
@@ -290,7 +299,7 @@ def test_a_mode_that_holds_little_is_not_believed(touch, tmp_path):
     weak = [FakeMode(modes[0].T, 0.0003)]
     warned = ["The part is probably not at mode 1, which holds < 0.1 %."]
     assert caution(summaries_of(posterior, weak)) == warned
-    write_all(tmp_path, posterior, weak, simulate, timing_ms={"prepare": 1.23456})
+    write_all(tmp_path, posterior, weak, alone(posterior, simulate), timing_ms={"prepare": 1.23456})
     html = (tmp_path / "report.html").read_text("utf-8")
     assert "mode 1, which holds &lt; 0.1 %" in html
     assert "within the mode" in html
@@ -326,9 +335,31 @@ def test_pictures_open(touch):
     from geomtact.report.figure import draw
 
     posterior, modes, simulate = touch
-    picture = draw(posterior, modes[:2], summaries_of(posterior, modes[:2]), simulate)
+    picture = draw(posterior, modes[:2], summaries_of(posterior, modes[:2]), alone(posterior, simulate))
     sizes = {name: Image.open(io.BytesIO(png)).size for name, png in picture.bands.items()}
     assert sum(height for _, height in sizes.values()) == Image.open(io.BytesIO(picture.whole)).height
+
+
+def test_several_sensors_are_shown_in_their_order(plug, rng):
+    """A row for each, also for one that felt nothing, with what it would show at each mode."""
+    from geomtact.report.figure import draw
+
+    touches = random_touches(plug, 2, 5)
+    T = se3.transform(se3.random_rotations(1, rng)[0], [0.1, 0, 0])
+    sensors = [T @ se3.inverse(touch.T_sensor_object) for touch in touches]
+    far = se3.transform(np.eye(3), [0, 0, 0.5]) @ sensors[0]
+    images = [np.zeros_like(touches[0].mask), *(touch.mask for touch in touches)]
+    posterior = plug.localize(images, "mask", None, np.stack([far, *sensors]))
+    shown = shown_of(posterior, plug)
+    assert [one.name for one in shown] == ["sensor 1", "sensor 2", "sensor 3"]
+    for one, image, at in zip(shown, images, [far, *sensors], strict=True):
+        np.testing.assert_array_equal(one.observation.contact.mask, image)
+        np.testing.assert_array_equal(one.T_frame_sensor, at)
+        assert one.at(T).mask.any() == image.any()
+    modes = posterior.modes(2)
+    several, one = (draw(posterior, modes, summaries_of(posterior, modes), some) for some in (shown, shown[1:2]))
+    tall, short = (Image.open(io.BytesIO(picture.whole)).height for picture in (several, one))
+    assert tall > 2 * short
 
 
 # --- studies

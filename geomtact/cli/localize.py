@@ -205,9 +205,10 @@ def localize(
     told_parts = [asdict(candidate) for candidate in found.candidates] if len(parts) > 1 else None
     timing["modes"] = 1e3 * (time.perf_counter() - localized)
     if out is not None:
+        from geomtact.report.shown import shown_of
         from geomtact.report.write import write_all
 
-        content = write_all(out, posterior, modes, localizer.simulate, settings, timing, told_parts)
+        content = write_all(out, posterior, modes, shown_of(posterior, localizer), settings, timing, told_parts)
     elif as_json:
         from geomtact.report.result import result
 

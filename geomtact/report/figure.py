@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geomtact.report.marginals import Samples, marginals
+from geomtact.report.shown import Shown
 from geomtact.report.summary import ModeSummary, caution, facts, percent
 from geomtact.report.view import View, Viewer
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact
+from geomtact.sensing.sensor import Sensor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +27,8 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 OBSERVED, SIMULATED, FIRST, BARS = "#D55E00", "#56B4E9", "#000000", "#0072B2"
 DPI, WIDTH = 100, 14.0
-_BANDS = {"touch": 3.9, "modes": 2.9, "marginals": 2.9}  # heights in inches, that of the modes without the part
+# Heights in inches; those of the touch and of the modes, without the part, a row for each sensor
+_BANDS = {"touch": 3.9, "modes": 2.9, "marginals": 2.9}
 _COLUMNS = 5
 
 
@@ -38,7 +41,7 @@ class Picture:
 
 
 def draw(
-    posterior: Posterior, modes: Sequence[Mode], summaries: Sequence[ModeSummary], simulate: Callable[[Array], Contact]
+    posterior: Posterior, modes: Sequence[Mode], summaries: Sequence[ModeSummary], shown: Sequence[Shown]
 ) -> Picture:
     """Draw the report.
 
@@ -46,7 +49,7 @@ def draw(
     ----------
     posterior : what was found
     modes, summaries : the modes to show, at most five, and their plain numbers
-    simulate : the contact at a pose T_sensor_object, without noise
+    shown : what each sensor showed
     """
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -56,7 +59,8 @@ def draw(
     names = list(_BANDS) if modes else ["touch"]
     views = _views(posterior, modes) if modes else []
     part = WIDTH / _COLUMNS * max((_tallness(view) for view in views), default=0.0)
-    heights = [_BANDS[name] + (part if name == "modes" else 0.0) for name in names]
+    rows = {"touch": len(shown), "modes": len(shown)}
+    heights = [_BANDS[name] * rows.get(name, 1) + (part if name == "modes" else 0.0) for name in names]
     style: Any = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False}
     with mpl.rc_context(style):
         figure = Figure(figsize=(WIDTH, sum(heights)), dpi=DPI, layout="constrained", facecolor="white")
@@ -64,9 +68,9 @@ def draw(
         bands = dict(
             zip(names, figure.subfigures(len(names), 1, squeeze=False, height_ratios=heights)[:, 0], strict=True)
         )
-        words = _touch(bands["touch"], posterior, summaries)
+        words = _touch(bands["touch"], posterior, summaries, shown)
         if modes:
-            _modes(bands["modes"], posterior, modes, views, part, simulate)
+            _modes(bands["modes"], posterior, modes, views, part, shown)
             _marginals(bands["marginals"], marginals(posterior, np.asarray(modes[0].T)))
         canvas.draw()
         words_start = int(words.get_window_extent().x0)
@@ -78,22 +82,20 @@ def draw(
     return Picture(_png(pixels), {name: _png(band) for name, band in cut.items()})
 
 
-def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummary]) -> Axes:
-    """The image, the contact and a summary in words, whose axes are returned."""
-    image_axes, contact_axes, words = band.subplots(1, 3)
-    for observation in posterior.observations[:1]:
-        image = _displayable(observation.image)
-        touched = posterior.settings.get("touched", [True])
-        first = touched.index(True) if any(touched) else 0
-        of_several = f" of sensor {first + 1} of {len(touched)}" if len(touched) > 1 else ""
-        _in_window(image_axes, posterior, image, f"The image{of_several}")
-        outline(contact_axes, posterior, observation.contact, OBSERVED)
-        shown = np.where(observation.contact.mask, 0.75, 0.97)
-        title = f"The contact ({_area_mm2(observation.contact, posterior):.1f} mm², read as {observation.kind})"
-        _in_window(contact_axes, posterior, shown, title)
+def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummary], shown: Sequence[Shown]) -> Axes:
+    """The images, the contacts and a summary in words, whose axes are returned."""
+    grid = band.add_gridspec(len(shown), 3)
+    for row, one in enumerate(shown):
+        contact, of = one.observation.contact, f", {one.name}" if one.name else ""
+        _in_window(band.add_subplot(grid[row, 0]), one.sensor, _displayable(one.observation.image), f"The image{of}")
+        axes = band.add_subplot(grid[row, 1])
+        outline(axes, one.sensor, contact, OBSERVED)
+        title = f"The contact{of} ({_area_mm2(contact, one.sensor):.1f} mm², read as {one.observation.kind})"
+        _in_window(axes, one.sensor, np.where(contact.mask, 0.75, 0.97), title)
+    words = band.add_subplot(grid[:, 2])
     words.axis("off")
     lines = [part for line in _words(posterior, summaries) for part in (textwrap.wrap(line, 64) or [""])]
-    words.text(0.02, 1, "\n".join(lines[:20]), va="top", fontsize=9, linespacing=1.5)
+    words.text(0.02, 1, "\n".join(lines[: 20 * len(shown)]), va="top", fontsize=9, linespacing=1.5)
     return words
 
 
@@ -103,31 +105,36 @@ def _modes(
     modes: Sequence[Mode],
     views: Sequence[View],
     part: float,
-    simulate: Callable[[Array], Contact],
+    shown: Sequence[Shown],
 ) -> None:
-    """The contact simulated at each mode, and below it the part there, which takes ``part`` inches."""
-    grid = band.subplots(2, _COLUMNS, height_ratios=[_BANDS["modes"], part])
-    for column in range(_COLUMNS):
-        above, below = grid[:, column]
-        if column >= len(modes):
-            above.axis("off")
-            below.axis("off")
-            continue
-        mode, view = modes[column], views[column]
-        contact = simulate(inverse(posterior.T_frame_sensor) @ mode.T)
-        shown = np.ones((*contact.mask.shape, 3))
-        shown[contact.mask] = _rgb(SIMULATED)
-        _in_window(above, posterior, shown, f"mode {column + 1}: {percent(mode.probability)}", small=True)
-        for observation in posterior.observations[:1]:
-            outline(above, posterior, observation.contact, OBSERVED)
+    """The contacts simulated at each mode, a row for each sensor, and below them the part there, which takes ``part`` inches."""
+    grid = band.subplots(len(shown) + 1, _COLUMNS, height_ratios=[_BANDS["modes"]] * len(shown) + [part])
+    for axes in grid[:, len(modes) :].ravel():
+        axes.axis("off")
+    for column, (mode, view) in enumerate(zip(modes, views, strict=True)):
+        for axes, one in zip(grid[:, column], shown, strict=False):
+            contact = one.at(mode.T)
+            there = np.ones((*contact.mask.shape, 3))
+            there[contact.mask] = _rgb(SIMULATED)
+            title = f"mode {column + 1}: {percent(mode.probability)}"
+            _in_window(axes, one.sensor, there, f"{title}, {one.name}" if one.name else title, small=True)
+            outline(axes, one.sensor, one.observation.contact, OBSERVED)
+        below = grid[-1, column]
         below.imshow(view.image, extent=view.extent)
         below.set_ylim(_filled(view))
         below.axis("off")
-        _draw_frame(below, posterior, view.place)
+        _draw_frame(below, posterior.sensor, view.place)
+        below.set_title(_over(posterior, shown))
     above = grid[0, 0]
     above.plot([], [], color=OBSERVED, label="observed outline")
     above.fill_between([], [], color=SIMULATED, label="contact simulated there")
     band.legend(*above.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
+
+
+def _over(posterior: Posterior, shown: Sequence[Shown]) -> str:
+    """Over which of several sensors the part is drawn."""
+    name = next((one.name for one in shown if one.observation is posterior.observations[0]), "")
+    return f"over {name}" if name else ""
 
 
 def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
@@ -174,16 +181,16 @@ def _tallness(view: View) -> float:
     return (high - low) / (view.extent[1] - view.extent[0])
 
 
-def outline(axes: Axes, posterior: Posterior, contact: Contact, colour: str) -> None:
+def outline(axes: Axes, sensor: Sensor, contact: Contact, colour: str) -> None:
     """Draw the border of a contact in millimetres on the membrane."""
     if contact.mask.any():
-        x, y = posterior.sensor.pixel_centres(contact.mask.shape)  # type: ignore[arg-type]
+        x, y = sensor.pixel_centres(contact.mask.shape)  # type: ignore[arg-type]
         axes.contour(1e3 * x, 1e3 * y, np.asarray(contact.mask, float), [0.5], colors=colour, linewidths=1.4)
 
 
-def _in_window(axes: Axes, posterior: Posterior, image: Array, title: str, small: bool = False) -> None:
+def _in_window(axes: Axes, sensor: Sensor, image: Array, title: str, small: bool = False) -> None:
     """Show ``image`` over the window in millimetres: x to the right, y downwards as in the image."""
-    x, y = 1e3 * posterior.sensor.half_window
+    x, y = 1e3 * sensor.half_window
     axes.imshow(image, extent=(-x, x, y, -y), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     axes.set_title(title)
     axes.set_xlabel("x [mm]")
@@ -193,9 +200,9 @@ def _in_window(axes: Axes, posterior: Posterior, image: Array, title: str, small
         spine.set_visible(True)
 
 
-def _draw_frame(axes: Axes, posterior: Posterior, place: Callable[[Any], Array]) -> None:
+def _draw_frame(axes: Axes, sensor: Sensor, place: Callable[[Any], Array]) -> None:
     """The window's border and the sensor's x and y axes, over the picture of the part."""
-    x, y = 1e3 * posterior.sensor.half_window
+    x, y = 1e3 * sensor.half_window
     border = place(np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [-x, -y, 0]]))
     axes.plot(*border.T, color=BARS, lw=0.8)
     for name, tip in (("x", (x, 0, 0)), ("y", (0, y, 0))):
@@ -221,8 +228,8 @@ def _words(posterior: Posterior, summaries: Sequence[ModeSummary]) -> list[str]:
     return lines
 
 
-def _area_mm2(contact: Contact, posterior: Posterior) -> float:
-    window = 4e6 * float(np.prod(posterior.sensor.half_window))
+def _area_mm2(contact: Contact, sensor: Sensor) -> float:
+    window = 4e6 * float(np.prod(sensor.half_window))
     return float(contact.mask.mean()) * window
 
 

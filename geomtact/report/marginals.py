@@ -66,7 +66,7 @@ def marginals(posterior: Posterior, T_first: Array) -> list[Samples]:
     depth_step = posterior.sensor.max_penetration / len(grid.penetrations)
     steps = 1e3 * np.array([grid.step, grid.step, depth_step if ball else grid.step])
     out = [
-        Samples(f"centre {axis} [mm]", at[:, k], weights, float(first[k]), float(steps[k]))
+        Samples(f"centre {axis}, {posterior.frame} frame [mm]", at[:, k], weights, float(first[k]), float(steps[k]))
         for k, axis in enumerate("xyz")
     ]
     if ball:
@@ -77,8 +77,8 @@ def marginals(posterior: Posterior, T_first: Array) -> list[Samples]:
     angle = float(np.degrees(level_step(grid.level)))
     return [
         *out,
-        Samples("turn about z [°]", turn, even, 0.0, angle, -180.0, 180.0),
-        Samples("tilt [°]", tilt, even, 0.0, angle, 0.0, 180.0),
+        Samples("turn about z from mode 1 [°]", turn, even, 0.0, angle, -180.0, 180.0),
+        Samples("tilt from mode 1 [°]", tilt, even, 0.0, angle, 0.0, 180.0),
     ]
 
 

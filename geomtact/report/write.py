@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +11,8 @@ from geomtact.files import write_whole
 from geomtact.report.figure import draw
 from geomtact.report.page import page
 from geomtact.report.result import result, to_text
+from geomtact.report.shown import Shown
 from geomtact.report.summary import caution, facts, summaries_of, table
-from geomtact.se3 import Array
-from geomtact.sensing.contact import Contact
 
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Mode, Posterior
@@ -23,7 +22,7 @@ def write_all(
     folder: Path,
     posterior: Posterior,
     modes: Sequence[Mode],
-    simulate: Callable[[Array], Contact],
+    shown: Sequence[Shown],
     settings: Mapping[str, Any] | None = None,
     timing_ms: Mapping[str, float] | None = None,
     parts: Sequence[Mapping[str, Any]] | None = None,
@@ -34,7 +33,7 @@ def write_all(
     ----------
     folder : where to
     posterior, modes : what was found
-    simulate : the contact at a pose T_sensor_object, without noise
+    shown : what each sensor showed, see ``report.shown``
     settings, timing_ms : added to the posterior's own in result.json
     parts : of which it may be, where there are several
 
@@ -47,7 +46,7 @@ def write_all(
     folder.mkdir(parents=True, exist_ok=True)
     posterior.save(folder / "posterior.npz")
     summaries = summaries_of(posterior, modes)
-    picture = draw(posterior, modes, summaries, simulate)
+    picture = draw(posterior, modes, summaries, shown)
     write_whole(folder / "report.png", lambda path: path.write_bytes(picture.whole))
     timing = {**(timing_ms or {}), "report": 1e3 * (time.perf_counter() - began)}
     content = result(posterior, modes, settings, timing, parts)
