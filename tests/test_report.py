@@ -249,11 +249,9 @@ def test_marginals_hold_the_mass(touch):
     posterior, modes, _ = touch
     found = marginals(posterior, modes[0].T)
     assert [s.label for s in found] == [
-        "centre x [mm]",
-        "centre y [mm]",
-        "centre z [mm]",
-        "turn about z [°]",
-        "tilt [°]",
+        *(f"centre {axis}, sensor frame [mm]" for axis in "xyz"),
+        "turn about z from mode 1 [°]",
+        "tilt from mode 1 [°]",
     ]
     for samples in found:
         assert samples.weights.sum() == pytest.approx(1)
