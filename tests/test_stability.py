@@ -16,7 +16,7 @@ from geomtact.evaluation import stability
 from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.stability import SWEEPS, World, coarser, cut_off, knobbed, larger, scanned
+from geomtact.evaluation.stability import SWEEPS, World, coarser, cut_off, knobbed, larger, opposed, scanned
 from geomtact.evaluation.touches import penetrations
 from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.report.stability_plot import draw_stability
@@ -44,7 +44,7 @@ def test_the_first_level_of_what_may_be_wrong_is_the_localizers_own_world(here):
         assert (SWEEPS[name].rig(SWEEPS[name].levels[0]) == 0).all()
     for sweep in SWEEPS.values():
         assert set(sweep.inside) <= set(sweep.levels)
-        assert [sweep.world is not None, sweep.rig is not None, sweep.slips].count(True) == 1
+        assert [sweep.world is not None, sweep.rig is not None, sweep.slips, sweep.jaw].count(True) == 1
 
 
 def test_outside_the_contact_pose_space_the_error_is_that_of_the_pose_itself(plug, a_touch):
@@ -73,6 +73,19 @@ def test_a_sequence_is_judged_at_its_last_frame(flat_nut, monkeypatch):
         assert replace(answer, warned=False) == replace(
             judged(flat_nut.mesh, made.T_sensor_object[-1], last), warned=False
         )
+
+
+@pytest.mark.parametrize("degrees", [0, 10, 90])
+def test_a_jaw_closes_along_lines_that_are_so_far_apart(plug, a_touch, degrees):
+    """The second sensor looks against the first, but for the angle, along a line through the first one's origin, and feels the
+    part as deep as it is told to."""
+    T, _ = a_touch(plug)
+    second = opposed(T, np.radians(degrees), 0.7, plug.space, 1 * MM)
+    assert second is not None
+    assert second[:3, 2] @ [0, 0, -1] == pytest.approx(np.cos(np.radians(degrees)), abs=1e-9)
+    origin, along = second[:3, 3], second[:3, 2]
+    assert np.linalg.norm(np.cross(origin, along)) < 1e-9
+    assert plug.space.penetration((inverse(second) @ T)[None])[0] == pytest.approx(1 * MM, abs=0.05 * MM)
 
 
 def test_a_larger_part_grows_about_its_centre():
@@ -181,7 +194,7 @@ def test_a_rig_is_off_by_what_is_said_but_for_its_first_sensor(plug, monkeypatch
     monkeypatch.setattr(plug.__class__, "localize", lambda self, *args, **options: localize(*args, **options))
     answers = list(stability.swept(plug, SWEEPS["rig_shift"], 5, 8, 1, "fast"))
     assert answers == [REFUSED] * 8
-    true = [scene.T_world_sensor[:3] for scene in make_scenes(plug, 8, 1, MODERATE, None)]
+    true = [scene.T_world_sensor for scene in make_scenes(plug, 8, 1, MODERATE, None, 3)]
     off = inverse(np.array(true)) @ np.array(told)
     assert off[:, 0] == pytest.approx(np.tile(np.eye(4), (8, 1, 1)))
     assert off[..., :3, :3] == pytest.approx(np.tile(np.eye(3), (8, 3, 1, 1)))

@@ -16,8 +16,8 @@ from geomtact.cli.shell import print_table, tell
 
 SCHEMA = "geomtact/stability/1"
 _NAMES = (
-    "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, kind, detail, rig_shift, rig_turn, slips, "
-    "other_part"
+    "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, kind, detail, rig_shift, rig_turn, jaw, "
+    "slips, other_part"
 )
 
 
@@ -29,7 +29,14 @@ def judge_stability(
         typer.Option("--sweep", help=f"What to make worse; may be repeated; all by default: {_NAMES}."),
     ] = None,
     sensor: study_options.SensorName = "gelslim",
-    touches: Annotated[int, typer.Option("--touches", min=1, help="How many of each part at each level.")] = 200,
+    touches: Annotated[
+        int,
+        typer.Option(
+            "--touches",
+            min=1,
+            help="How many of each part at each level that is promised to hold; a quarter at others.",
+        ),
+    ] = 200,
     effort: study_options.EffortLevel = Effort.balanced,
     seed: study_options.Seed = 1,
     max_poses: MaxPoses = None,
@@ -59,8 +66,9 @@ def judge_stability(
             done = sweeps.setdefault(name, {"title": one.title, "inside": list(one.inside), "levels": []})["levels"]
             judged = {at["level"] for at in done}  # at a level that no touch fulfils there is nothing to keep
             for level in (level for level in one.levels if level not in judged):
-                todo = stability.swept(localizer, one, level, touches, seed, effort)
-                told = study_file.collect([], todo, touches, f"{part}: {one.title} {level:g}", lambda _: None)
+                many = touches if level in one.inside else -(-touches // 4)
+                todo = stability.swept(localizer, one, level, many, seed, effort)
+                told = study_file.collect([], todo, many, f"{part}: {one.title} {level:g}", lambda _: None)
                 if told:
                     figures = stability.summarise(told)
                     done.append({"level": level, "figures": figures, "answers": [asdict(a) for a in told]})

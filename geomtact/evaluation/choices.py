@@ -149,10 +149,8 @@ def prepare(
 def make(kind: str, localizer: Localizer, n: int, seed: int) -> list[Scene]:
     """``n`` scenes of a kind, rigid and elastic in turn, with moderate noise; ``localizer`` is the default's."""
     if kind == "three sensors":
-        scenes = make_scenes(localizer, n, seed, MODERATE, None)
-        return [
-            Scene(s.T_world_object, [t.mask for t in s.touches[:_SENSORS]], s.T_world_sensor[:_SENSORS]) for s in scenes
-        ]
+        scenes = make_scenes(localizer, n, seed, MODERATE, None, _SENSORS)
+        return [Scene(s.T_world_object, [t.mask for t in s.touches], s.T_world_sensor) for s in scenes]
     where: Any = localizer
     if kind == "known side":
         where = SimpleNamespace(space=ContactSpace(localizer.mesh, localizer.sensor, [(upwards(localizer.mesh), 0.0)]))

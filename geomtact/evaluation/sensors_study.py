@@ -60,16 +60,18 @@ class Fused:
     ms: float
 
 
-def make_scenes(localizer: Localizer, n: int, seed: int, noise: Noise, elastic: bool | None) -> list[Scene]:
-    """``n`` scenes of ``SENSORS`` touches, each uniform over the contact pose space, wherever they meet the object.
+def make_scenes(
+    localizer: Localizer, n: int, seed: int, noise: Noise, elastic: bool | None, sensors: int = SENSORS
+) -> list[Scene]:
+    """``n`` scenes of so many ``sensors``, one touch each, uniform over the contact pose space, wherever they meet the object.
 
     ``elastic`` as in ``touches.random_touches``.
     """
     rng = np.random.default_rng([seed, 13])
-    touches = random_touches(localizer, n * SENSORS, seed, elastic, noise)
+    touches = random_touches(localizer, n * sensors, seed, elastic, noise)
     out = []
     for i in range(n):
-        some = touches[i * SENSORS : (i + 1) * SENSORS]
+        some = touches[i * sensors : (i + 1) * sensors]
         T_world_object = transform(random_rotations(1, rng)[0], rng.uniform(-0.3, 0.3, 3))
         T = np.stack([T_world_object @ inverse(touch.T_sensor_object) for touch in some])
         out.append(Scene(T, T_world_object, some))

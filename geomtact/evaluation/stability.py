@@ -20,11 +20,11 @@ from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.pose_error import coverage
 from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.touches import penetrations
+from geomtact.evaluation.touches import counts, penetrations
 from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
-from geomtact.se3 import Array, exp
+from geomtact.se3 import Array, exp, inverse
 from geomtact.sensing.noise import MODERATE, Noise
 from geomtact.sensing.sensor import Sensor
 
@@ -71,6 +71,7 @@ class Sweep:
     world : of one touch at a level; None for sweeps of a rig or a sequence
     rig : (6,) standard deviation by which each sensor of a rig is off at a level [rad, m]
     slips : whether a level is how often the part slips in a sequence of ``_FRAMES`` frames
+    jaw : whether a level is the angle [deg] between the lines along which two sensors come from opposite sides
     """
 
     title: str
@@ -79,6 +80,7 @@ class Sweep:
     world: Callable[[World, float], World] | None = None
     rig: Callable[[float], Array] | None = None
     slips: bool = False
+    jaw: bool = False
 
 
 def larger(mesh: Mesh, percent: float) -> Mesh:
@@ -219,6 +221,7 @@ SWEEPS = {
         (0, 0.5),
         rig=lambda x: np.array([1, 1, 1, 0, 0, 0]) * np.radians(x) / np.sqrt(3),
     ),
+    "jaw": Sweep("two opposed sensors, apart from one line by [deg]", (90, 30, 10, 3, 0), (90, 30, 10, 3, 0), jaw=True),
     "slips": Sweep("slips in twelve frames", (0, 1, 2, 3), (0, 1), slips=True),
     "other_part": Sweep(
         "another part (1 gear, 2 plug, 3 bracket)", (0, 1, 2, 3), (0,), lambda w, x: replace(w, mesh=_other(w.mesh, x))
@@ -227,9 +230,11 @@ SWEEPS = {
 
 
 def swept(localizer: Localizer, sweep: Sweep, level: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """Answers to ``n`` touches, or scenes of three, at a level of a sweep."""
+    """Answers to ``n`` touches, or scenes of several sensors, at a level of a sweep."""
     if sweep.rig is not None:
         yield from _rigs(localizer, sweep.rig(level), n, seed, effort)
+    elif sweep.jaw:
+        yield from _jaws(localizer, np.radians(level), n, seed, effort)
     elif sweep.slips:
         yield from _sequences(localizer, int(level), n, seed, effort)
     else:
@@ -292,16 +297,51 @@ def cut_off(mask: NDArray[np.bool_]) -> float:
 def _rigs(localizer: Localizer, off: Array, n: int, seed: int, effort: str) -> Iterator[Answer]:
     """Scenes of three sensors whose poses are told wrongly, each off at random by ``off`` (6,), but the first."""
     rng = np.random.default_rng([seed, 7])
-    for scene in make_scenes(localizer, n, seed, MODERATE, None):
-        T = scene.T_world_sensor[:_SENSORS].copy()
+    for scene in make_scenes(localizer, n, seed, MODERATE, None, _SENSORS):
+        T = scene.T_world_sensor.copy()
         T[1:] = T[1:] @ np.array([exp(off * rng.normal(size=6)) for _ in T[1:]])
-        masks = [touch.mask for touch in scene.touches[:_SENSORS]]
-        try:
-            posterior = localizer.localize(masks, "mask", T_world_sensor=T, effort=effort, seed=seed)
-        except NoPoseAgreesError:
-            yield REFUSED
-        else:
-            yield judged(localizer.mesh, scene.T_world_object, posterior)
+        yield _together(localizer, scene.T_world_object, T, [touch.mask for touch in scene.touches], effort, seed)
+
+
+def _jaws(localizer: Localizer, angle: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
+    """Two sensors that close on the part from opposite sides, on lines through the first one's window that are ``angle`` [rad]
+    apart: what moves the part along both lines, or about them, either tells alike."""
+    rng, space = np.random.default_rng([seed, 9]), localizer.space
+    least, most = penetrations(space)
+    made = 0
+    for _ in range(_TRIED * n):
+        if made == n:
+            return
+        T, elastic = space.sample(1, rng, (least, most))[0][0], made % 2 == 1
+        second = opposed(T, angle, rng.uniform(0, 2 * np.pi), space, rng.uniform(least, most))
+        if second is None:
+            continue
+        poses = [T, inverse(second) @ T]
+        masks = [felt_mask(space, pose, elastic) for pose in poses]
+        if all(counts(space, mask) for mask in masks):
+            noisy = [spoilt(mask, space, MODERATE, rng) for mask in masks]
+            yield _together(localizer, T, np.stack([np.eye(4), second]), noisy, effort, seed)
+            made += 1
+
+
+def opposed(T: Array, angle: float, way: float, space: ContactSpace, depth: float) -> Array | None:
+    """Where (4, 4), in the first sensor's frame, a second one stops that comes from the other side of an object at ``T`` (4, 4),
+    along a line that leans by ``angle`` [rad] towards the direction ``way`` [rad]; ``depth`` [m] deep. None if it misses."""
+    lean = np.array([-np.sin(way), np.cos(way), 0.0]) * angle
+    facing = exp(np.pad(lean, (0, 3))) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    seen = inverse(facing) @ T
+    seen[2, 3] -= (seen[:3, :3] @ space.mesh.vertices.T + seen[:3, 3:])[2].min()  # the whole object before it
+    settled, touches = space.settle(seen[None], depth)
+    return T @ inverse(settled[0]) if touches[0] else None
+
+
+def _together(localizer: Localizer, T: Array, T_world_sensor: Array, masks: list, effort: str, seed: int) -> Answer:
+    """What several sensors tell of an object at ``T`` (4, 4)."""
+    try:
+        posterior = localizer.localize(masks, "mask", T_world_sensor=T_world_sensor, effort=effort, seed=seed)
+    except NoPoseAgreesError:
+        return REFUSED
+    return judged(localizer.mesh, T, posterior)
 
 
 def _sequences(localizer: Localizer, slips: int, n: int, seed: int, effort: str) -> Iterator[Answer]:
