@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from geomtact.geometry.mesh import Mesh
 from geomtact.se3 import Array, apply
+from geomtact.sensing.scene import scene_of
 from geomtact.sensing.sensor import Sensor
 
 _PART, _WINDOW, _BACKGROUND = np.array([0.72, 0.75, 0.80]), np.array([0.0, 0.45, 0.70]), np.array([1.0, 1.0, 1.0])
@@ -41,14 +42,9 @@ class Viewer:
     """Draws one part at several poses; its ray caster is built once."""
 
     def __init__(self, mesh: Mesh, sensor: Sensor, pixels: int = 300):
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
         self.mesh, self.sensor, self.pixels = mesh, sensor, pixels
-        self._scene = EmbreeScene()
         self._centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
-        corners = (mesh.vertices - self._centre).astype(np.float32)[mesh.faces]
-        TriangleMesh(self._scene, np.ascontiguousarray(corners))
+        self._scene = scene_of((mesh.vertices - self._centre).astype(np.float32)[mesh.faces])
 
     def view(self, T_sensor_object: Array) -> View:
         """The part at ``T_sensor_object`` (4, 4), with the sensor's window; far ends of a long part are cut off."""
@@ -78,15 +74,15 @@ class Viewer:
         R = T[:3, :3]
         origin = ((start - T[:3, 3]) @ R - self._centre).astype(np.float32)
         direction = np.broadcast_to((-back @ R).astype(np.float32), origin.shape)
-        hit = self._scene.run(origin, np.ascontiguousarray(direction), output=True)
-        found = hit["primID"] >= 0
-        normal = self.mesh.normals[np.where(found, hit["primID"], 0)] @ R.T
+        hit = self._scene.hits(origin, np.ascontiguousarray(direction))
+        found = hit.face >= 0
+        normal = self.mesh.normals[np.where(found, hit.face, 0)] @ R.T
         light = 0.35 + 0.5 * np.abs(normal @ back) + 0.15 * np.clip(normal[:, 2], 0, 1)
         image = np.where(found[:, None], light[:, None] * _PART, _BACKGROUND)
         # the window: where the ray meets the plane z = 0
         t = start[:, 2] / back[2]
         on_window = (np.abs((start - t[:, None] * back)[:, :2]) <= self.sensor.half_window).all(1)
-        in_front = on_window & (t < np.where(found, hit["tfar"], np.inf))
+        in_front = on_window & (t < hit.t)
         behind = on_window & ~in_front
         image[in_front] += _WINDOW_OPACITY * (_WINDOW - image[in_front])
         image[behind] += 0.25 * _WINDOW_OPACITY * (_WINDOW - image[behind])

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.contact import Contact
+from geomtact.sensing.scene import scene_of
 from geomtact.sensing.sensor import Sensor
 
 _RAYS_PER_CALL = 1 << 18
@@ -26,21 +27,16 @@ class Caster:
     ----------
     vertices : (V, 3) object frame [m]
     faces : (F, 3) indices into vertices
-    threads : how many poses are cast at once (Embree releases the GIL)
+    threads : how many poses are cast at once (the GIL is released)
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, threads: int = 2):
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
         self.vertices = np.asarray(vertices, float)
         self.threads = threads
-        self._scene = EmbreeScene()
         # Embree works in float32: rays start near the object's centre to keep 1e-8 m
         self._centre = 0.5 * (self.vertices.min(0) + self.vertices.max(0))
         self._radius = float(np.linalg.norm(self.vertices - self._centre, axis=1).max())
-        corners = (self.vertices - self._centre).astype(np.float32)[np.asarray(faces)]
-        TriangleMesh(self._scene, np.ascontiguousarray(corners))
+        self._scene = scene_of((self.vertices - self._centre).astype(np.float32)[np.asarray(faces)])
 
     def contact(self, sensor: Sensor, T_sensor_object: ArrayLike, shape: tuple[int, int] | None = None) -> Contact:
         """The contact at one pose ``T_sensor_object`` (4, 4): what the sensor would see, without noise.
@@ -83,7 +79,7 @@ class Caster:
         x, y = sensor.pixel_centres(shape)
         rays = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
         origin, direction, _ = self._rays(sensor, np.asarray(T, float)[None], rays)
-        return np.asarray(self._scene.run(origin, direction, query="INTERSECT"), np.int64).reshape(len(y), len(x))
+        return self._scene.faces(origin, direction).reshape(len(y), len(x))
 
     def penetration(self, sensor: Sensor, T: ArrayLike) -> Array:
         """Depth of the object's deepest point inside the window (n,) [m]: > 0 below the membrane.
@@ -126,9 +122,9 @@ class Caster:
 
     def _cast(self, sensor: Sensor, T: Array, rays: Array) -> NDArray[np.float32]:
         origin, direction, below = self._rays(sensor, T, rays)
-        t = self._scene.run(origin, direction, query="DISTANCE").reshape(len(T), len(rays)).astype(float)
+        t = self._scene.distances(origin, direction).reshape(len(T), len(rays)).astype(float)
         length = sensor.camera_distance or 1.0
-        missed = t > 1e30
+        missed = np.isinf(t)
         depth = np.subtract(below[:, None], length * t, out=t)
         if sensor.membrane_radius:
             # a camera's rays spread: where they are when they have come so far
@@ -164,9 +160,8 @@ class Caster:
         camera = apply(inverse(T), np.array([[0.0, 0.0, -sensor.camera_distance]]))[:, 0] - self._centre
         # an odd direction, so that no ray runs along a face of a machined part
         direction = np.broadcast_to(np.array([0.41, 0.33, 0.85], np.float32), camera.shape)
-        hit = self._scene.run(camera.astype(np.float32), np.ascontiguousarray(direction), output=True)
-        leaving = (hit["Ng"] * direction).sum(1) > 0
-        return leaving & (hit["primID"] >= 0)
+        hit = self._scene.hits(camera.astype(np.float32), np.ascontiguousarray(direction))
+        return np.asarray(((hit.normal * direction).sum(1) > 0) & (hit.face >= 0))
 
 
 def _combined(R: Array, rays: Array, z: float) -> NDArray[np.float32]:

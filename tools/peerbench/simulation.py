@@ -99,7 +99,7 @@ def depth_ways(mesh: Any, sensor: Any, shape: tuple[int, int], caster: Any, draw
     def embree(item: Any) -> None:
         origin, direction = (np.array_split(each, caster.threads) for each in item[1])
         each = map if caster.threads == 1 else pool.map
-        list(each(lambda o, d: caster._scene.run(o, d, query="DISTANCE"), origin, direction))
+        list(each(lambda o, d: caster._scene.distances(o, d), origin, direction))
 
     def open3d(item: Any) -> None:
         scene.cast_rays(item[2], nthreads=caster.threads)
