@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -72,7 +71,7 @@ class _Open3D:
     def __init__(self, corners: NDArray[np.float32]):
         import open3d as o3d
 
-        self._tensor: Callable[[NDArray], Any] = o3d.core.Tensor
+        self._tensor: Any = o3d.core.Tensor
         self._scene, self._corners = o3d.t.geometry.RaycastingScene(), corners
         faces = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
         self._scene.add_triangles(self._tensor(corners.reshape(-1, 3)), self._tensor(faces))
