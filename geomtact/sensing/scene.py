@@ -71,9 +71,9 @@ class _Open3D:
     def __init__(self, corners: NDArray[np.float32]):
         import open3d as o3d
 
-        self._tensor: Any = o3d.core.Tensor
         self._scene, self._corners = o3d.t.geometry.RaycastingScene(), corners
         faces = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
+        self._tensor = o3d.core.Tensor.from_numpy
         self._scene.add_triangles(self._tensor(corners.reshape(-1, 3)), self._tensor(faces))
 
     def distances(self, origin: Rays, direction: Rays) -> NDArray[np.float32]:
