@@ -86,6 +86,7 @@ def track(
 
     from geomtact.inference.motion import UniformBall
     from geomtact.inference.sequence import track as posteriors
+    from geomtact.report.exchange import tum_line
 
     options: dict[str, Any] = {"kind": kind, "background": values["background"], "prior": prior, "effort": chosen}
     options |= {"motion": UniformBall(1e-3 * motion_mm), "most": most, "on_error": "skip" if skip_broken else "raise"}
@@ -100,7 +101,7 @@ def track(
             touched |= posterior.contact
             typer.echo(to_line(line))
             if line["T"] is not None:
-                lines.append(_tum(n / fps if told is None else told, line))
+                lines.append(tum_line(n / fps if told is None else told, line["T"]))
             if report is not None:
                 from geomtact.report.sequence_page import sequence_frame
 
@@ -122,12 +123,6 @@ def _write(path: Path, text: str) -> None:
     from geomtact.files import write_whole
 
     write_whole(path, lambda temporary: temporary.write_text(text, "utf-8"))
-
-
-def _tum(time: float, line: dict[str, Any]) -> str:
-    """A line of a TUM trajectory: seconds, metres, x y z w."""
-    numbers = [*(1e-3 * line["translation_mm"]), *line["quat_xyzw"]]
-    return " ".join([f"{time:.6f}", *(f"{x:.9f}" for x in numbers)]) + "\n"
 
 
 def _metadata(source: str) -> dict[str, Any]:

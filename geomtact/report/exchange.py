@@ -1,0 +1,130 @@
+"""Poses in the words of other tools: TUM trajectories, BOP results, ROS messages as JSON, and a table for pandas."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geomtact.errors import InputError
+from geomtact.files import write_whole
+from geomtact.se3 import Array, check_transforms, quat_xyzw, transform
+
+if TYPE_CHECKING:
+    from geomtact.inference.posterior import Mode, Posterior
+
+BOP = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+
+
+def to_tum(path: str | Path, times: Iterable[float], T: Any) -> None:
+    """Write poses ``T`` (n, 4, 4) [m] at ``times`` (n,) [s] as lines of ``timestamp tx ty tz qx qy qz qw``."""
+    lines = [tum_line(time, pose) for time, pose in zip(times, check_transforms(T).reshape(-1, 4, 4), strict=True)]
+    write_whole(Path(path), lambda temporary: temporary.write_text("".join(lines), "utf-8"))
+
+
+def tum_line(time: float, T: Array) -> str:
+    """One pose (4, 4) [m] at ``time`` [s], with its line break."""
+    return " ".join([f"{time:.6f}", *(f"{x:.9f}" for x in (*T[:3, 3], *quat_xyzw(T)))]) + "\n"
+
+
+def from_tum(path: str | Path) -> tuple[Array, Array]:
+    """Times (n,) [s] and poses (n, 4, 4) [m] of a TUM file; lines that begin with # are left out.
+
+    Raises
+    ------
+    InputError
+    """
+    rows = [line.split() for line in _text(path).splitlines() if line.strip() and not line.startswith("#")]
+    try:
+        numbers = np.array(rows, float).reshape(len(rows), 8)
+        R = Rotation.from_quat(numbers[:, 4:]).as_matrix() if len(rows) else np.zeros((0, 3, 3))
+    except ValueError:
+        raise InputError(f"{path}: expected lines of timestamp tx ty tz qx qy qz qw, eight numbers each") from None
+    return numbers[:, 0], transform(R, numbers[:, 1:4])
+
+
+def to_bop(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write results as the BOP benchmark reads them (bop.felk.cvut.cz/challenges).
+
+    Each of ``rows`` has ``scene_id``, ``im_id``, ``obj_id``, ``score``, ``T`` (4, 4) [m], and ``time`` [s], -1 where it is not
+    told; the file has R row by row and t in millimetres.
+    """
+    lines = [",".join(BOP)]
+    for row in rows:
+        T = check_transforms(row["T"])
+        R, t = (" ".join(f"{x:.9g}" for x in values) for values in (T[:3, :3].ravel(), 1e3 * T[:3, 3]))
+        head = [str(row[key]) for key in BOP[:3]]
+        lines.append(",".join([*head, f"{row['score']:.9g}", R, t, f"{row.get('time', -1):g}"]))
+    write_whole(Path(path), lambda temporary: temporary.write_text("\n".join(lines) + "\n", "utf-8"))
+
+
+def from_bop(path: str | Path) -> list[dict[str, Any]]:
+    """The rows of a BOP file, as :func:`to_bop` takes them.
+
+    Raises
+    ------
+    InputError
+    """
+    found = csv.DictReader(_text(path).splitlines())
+    if found.fieldnames is None or tuple(found.fieldnames) != BOP:
+        raise InputError(f"{path}: expected the columns {','.join(BOP)}, got {','.join(found.fieldnames or ['none'])}")
+    out = []
+    for number, row in enumerate(found, 2):
+        try:
+            R, t = (np.array(row[key].split(), float) for key in ("R", "t"))
+            T = check_transforms(transform(R.reshape(3, 3), 1e-3 * t.reshape(3)), f"{path}: line {number}")
+            ids = {key: int(row[key]) for key in BOP[:3]}
+            out.append(ids | {"score": float(row["score"]), "time": float(row["time"]), "T": T})
+        except (TypeError, ValueError, AttributeError):
+            raise InputError(f"{path}: line {number}: expected {','.join(BOP)} with nine and three numbers") from None
+    return out
+
+
+def to_ros(mode: Mode, frame_id: str, stamp: float = 0.0) -> dict[str, Any]:
+    """A mode as geometry_msgs/PoseWithCovarianceStamped: metres, quaternion x, y, z, w, and the covariance (36,) row by row of
+    (x, y, z, turns about the fixed axes x, y, z of ``frame_id``); ``stamp`` in seconds.
+
+    A mode's own covariance is of a motion in the object's frame, turns first: T exp(xi^). At the object's origin the motion in
+    the fixed frame is that turned by R.
+    """
+    R, zero = mode.T[:3, :3], np.zeros((3, 3))
+    A = np.block([[zero, R], [R, zero]])
+    x, y, z, w = quat_xyzw(mode.T).tolist()
+    seconds = int(np.floor(stamp))
+    return {
+        "header": {"stamp": {"sec": seconds, "nanosec": round(1e9 * (stamp - seconds))}, "frame_id": frame_id},
+        "pose": {
+            "pose": {
+                "position": dict(zip("xyz", mode.T[:3, 3].tolist(), strict=True)),
+                "orientation": {"x": x, "y": y, "z": z, "w": w},
+            },
+            "covariance": (A @ mode.covariance @ A.T).ravel().tolist(),
+        },
+    }
+
+
+def to_table(modes: Sequence[Mode], posterior: Posterior) -> dict[str, list[Any]]:
+    """Modes as columns, for ``pandas.DataFrame``: lengths in millimetres, quaternions x, y, z, w, and the standard deviations of
+    the object's origin [mm] and of its turn [degrees], each in its least certain direction."""
+    T = np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
+    quat = np.array([quat_xyzw(each) for each in T]).reshape(-1, 4)
+    std = np.sqrt([[np.linalg.eigvalsh(mode.covariance[k : k + 3, k : k + 3])[-1] for k in (3, 0)] for mode in modes])
+    std = std.reshape(-1, 2) * [1e3, np.degrees(1)]
+    columns: dict[str, list[Any]] = {"object": [posterior.mesh.name] * len(T), "frame": [posterior.frame] * len(T)}
+    columns |= {"probability": [mode.probability for mode in modes]}
+    numbers = np.concatenate([1e3 * T[:, :3, 3], quat, std], 1)
+    names = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw", "shift_std_mm", "turn_std_deg")
+    return columns | {name: numbers[:, k].tolist() for k, name in enumerate(names)}
+
+
+def _text(path: str | Path) -> str:
+    try:
+        return Path(path).read_text("utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error})") from None
