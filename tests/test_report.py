@@ -3,7 +3,10 @@
 import io
 import json
 import re
+import shutil
+import subprocess
 from dataclasses import dataclass, field
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -84,6 +87,7 @@ def touch():
         timing_ms={"score": 12.0},
         warnings=["a <b>bold</b> warning"],
         seed=7,
+        space=SimpleNamespace(caster=caster),
         index=FakeIndex(SimpleNamespace(step=5e-4, level=3, penetrations=(0.5e-3, 1.5e-3))),
         T_frame_sensor=np.eye(4),
         save=lambda path: np.savez(path, poses=poses),
@@ -131,7 +135,10 @@ def test_page_is_self_contained_and_escaped(touch, tmp_path):
     html = (tmp_path / "report.html").read_text("utf-8")
     assert "a &lt;b&gt;bold&lt;/b&gt; warning" in html
     assert "<b>" not in html
-    assert not re.search(r"https?:|//", re.sub(r'src="data:[^"]*"', "", html))
+    assert not re.search(r"https?:|//", re.sub(r'src="data:[^"]*"|<script.*?</script>', "", html, flags=re.DOTALL))
+    scripts = re.findall(r"<script[^>]*>", html)
+    assert len(scripts) == 2 and not any("src" in script for script in scripts)
+    assert not re.search(r"https?:|fetch|import|XMLHttp", html.split("<script>")[1])
     parser = _Tags()
     parser.feed(html)
     assert parser.open == []
@@ -149,11 +156,65 @@ class _Tags(HTMLParser):
     def handle_starttag(self, tag, attrs):
         self.images += tag == "img"
         self.rows += tag == "tr"
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "input"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+TRIED = """<script>
+const errors = []; window.onerror = (message) => errors.push(message);
+window.addEventListener("load", () => setTimeout(() => {
+  const canvas = document.querySelector("canvas"), tabs = [...document.querySelectorAll("[role=tab]")];
+  const picture = () => canvas.toDataURL();
+  const chosen = () => tabs.findIndex((tab) => tab.getAttribute("aria-selected") === "true");
+  const key = (target, name) => target.dispatchEvent(new KeyboardEvent("keydown", { key: name, bubbles: true }));
+  const seen = [[chosen(), picture()]];
+  tabs[2].click(); seen.push([chosen(), picture()]);
+  key(tabs[2], "ArrowRight"); seen.push([chosen(), picture()]);
+  key(canvas, "1"); seen.push([chosen(), picture()]);
+  key(canvas, "ArrowLeft"); seen.push([chosen(), picture()]);
+  document.querySelector("input").click(); seen.push([chosen(), picture()]);
+  const pictures = seen.map((each) => each[1]);
+  document.title = JSON.stringify({
+    errors, chosen: seen.map((each) => each[0]), alike: pictures.map((each) => pictures.indexOf(each)) });
+}, 500));
+</script>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with")
+def test_the_page_in_a_browser(touch, tmp_path):
+    """Without a network it opens without an error, draws the part, and changes modes on click and by key: each picture is another
+    one, but that of the first mode comes back as it was."""
+    posterior, modes, simulate = touch
+    write_all(tmp_path, posterior, modes, alone(posterior, simulate))
+    page = tmp_path / "tried.html"
+    page.write_text((tmp_path / "report.html").read_text("utf-8").replace("<head>", "<head>" + TRIED), "utf-8")
+    options = [
+        "--headless",
+        "--no-sandbox",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--window-size=1200,1600",
+    ]
+    options += [f"--user-data-dir={tmp_path / 'browser'}", "--virtual-time-budget=5000"]
+    told = subprocess.run(
+        [CHROMIUM, *options, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=120, check=True
+    ).stdout
+    found = json.loads(unescape(re.search("<title>(.*)</title>", told)[1]))
+    assert found == {"errors": [], "chosen": [0, 2, 3, 0, 0, 0], "alike": [0, 1, 2, 0, 4, 5]}
+    kept = Path(__file__).parents[1] / "out" / "screenshots"
+    kept.mkdir(parents=True, exist_ok=True)
+    report = (tmp_path / "report.html").as_uri()
+    subprocess.run(
+        [CHROMIUM, *options, f"--screenshot={kept / 'report.png'}", report],
+        capture_output=True,
+        timeout=120,
+        check=True,
+    )
+    assert (kept / "report.png").stat().st_size > 20_000
 
 
 def test_no_contact_still_makes_a_report(touch, tmp_path):

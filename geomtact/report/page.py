@@ -6,9 +6,10 @@ import base64
 import json
 from collections.abc import Sequence
 from html import escape
+from importlib.resources import files
 from typing import Any
 
-from geomtact.report.summary import HEADINGS
+from geomtact.report.summary import HEADINGS, percent
 
 _STYLE = """
 :root { color-scheme: light dark; --text: #1b1f24; --back: #ffffff; --line: #d0d7de; --soft: #f6f8fa;
@@ -24,6 +25,11 @@ th, td { text-align: left; padding: .3rem .9rem .3rem 0; border-bottom: 1px soli
 td:last-child { white-space: normal; min-width: 14rem; }
 .warning { color: var(--warn); background: var(--warn-back); border-left: 4px solid; padding: .5rem .8rem; margin: .6rem 0; }
 details { margin: 1rem 0; } summary { cursor: pointer; }
+#scene canvas { width: 100%; height: min(60vh, 34rem); border: 1px solid var(--line); border-radius: 6px; touch-action: none; }
+#scene button { font: inherit; color: inherit; background: var(--soft); border: 1px solid var(--line); border-radius: 6px;
+                padding: .2rem .7rem; margin: 0 .4rem .5rem 0; cursor: pointer; }
+#scene button[aria-selected=true] { color: #ffffff; background: #0072b2; border-color: #0072b2; }
+#scene :focus-visible { outline: 3px solid #e69f00; }
 pre { background: var(--soft); padding: .8rem; overflow-x: auto; font-size: .85rem; border-radius: 6px; }
 """
 
@@ -35,7 +41,11 @@ _AXES = {
 
 
 def page(
-    content: dict[str, Any], rows: Sequence[Sequence[str]], facts: Sequence[str], pictures: dict[str, bytes]
+    content: dict[str, Any],
+    rows: Sequence[Sequence[str]],
+    facts: Sequence[str],
+    pictures: dict[str, bytes],
+    turnable: dict[str, Any] | None = None,
 ) -> str:
     """The text of report.html.
 
@@ -45,6 +55,7 @@ def page(
     rows : the modes as a table, under ``summary.HEADINGS``
     facts : sentences under the title
     pictures : PNGs "touch", "modes" and "marginals"; those that are not there are left out
+    turnable : what the view that can be turned shows, see ``report.turnable``
     """
     name, sensor = escape(content["object"]["name"]), escape(content["sensor"])
     parts = [f"<h1>{name} on {sensor}</h1>"]
@@ -57,6 +68,8 @@ def page(
             "certain direction, within the mode. Tilts are about x and y, turns about z, through the middle of the contact. "
             "The exact matrices are in result.json and below.</p>"
         ]
+    if turnable is not None:
+        parts += _turnable(turnable, [mode["probability"] for mode in content["modes"]])
     parts += _picture("The touch", "the image and the contact found in it", pictures.get("touch"))
     parts += _picture(
         "The modes", "simulated contacts over the observed outline, and the part there", pictures.get("modes")
@@ -88,6 +101,24 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{escape(h)}</th>" for h in headings)
     lines = ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
     return f'<div class="table"><table>\n<tr>{head}</tr>\n' + "\n".join(lines) + "\n</table></div>"
+
+
+def _turnable(content: dict[str, Any], probabilities: Sequence[float]) -> list[str]:
+    tabs = [f'<button role="tab" type="button">mode {k}: {percent(p)}</button>' for k, p in enumerate(probabilities, 1)]
+    script = files("geomtact.report").joinpath("turnable.js").read_text("utf-8")
+    return [
+        "<h2>The part at each mode</h2>",
+        '<section id="scene">',
+        f'<div role="tablist" aria-label="modes">{"".join(tabs)}</div>',
+        '<canvas tabindex="0" role="img"></canvas>',
+        "<p>Over the window (blue) the observed contact's border (orange). Drag to turn, or use the arrow keys on the picture, "
+        "and the wheel once it is chosen; the number keys choose a mode. "
+        '<label><input type="checkbox" checked> Where on the part the first contact may be, from seldom (blue) to most '
+        "likely (yellow)</label></p>",
+        "</section>",
+        f'<script id="scene-data" type="application/json">{json.dumps(content)}</script>',
+        f"<script>\n{script}</script>",
+    ]
 
 
 def _picture(title: str, description: str, png: bytes | None) -> list[str]:

@@ -13,6 +13,7 @@ from geomtact.report.page import page
 from geomtact.report.result import result, to_text
 from geomtact.report.shown import Shown
 from geomtact.report.summary import caution, facts, summaries_of, table
+from geomtact.report.turnable import turnable
 
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Mode, Posterior
@@ -50,7 +51,8 @@ def write_all(
     write_whole(folder / "report.png", lambda path: path.write_bytes(picture.whole))
     timing = {**(timing_ms or {}), "report": 1e3 * (time.perf_counter() - began)}
     content = result(posterior, modes, settings, timing, parts)
-    html = page(content, table(summaries), [*facts(posterior), *caution(summaries)], picture.bands)
+    view = turnable(posterior, modes, shown) if modes else None
+    html = page(content, table(summaries), [*facts(posterior), *caution(summaries)], picture.bands, view)
     write_whole(folder / "report.html", lambda path: path.write_text(html, "utf-8"))
     write_whole(folder / "result.json", lambda path: path.write_text(to_text(content), "utf-8"))
     return content

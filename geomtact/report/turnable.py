@@ -1,0 +1,109 @@
+"""What the page's 3D view shows: the part at each mode, the sensors' windows, and where the part may have been touched."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.report.shown import Shown
+from geomtact.se3 import Array, apply, inverse
+
+if TYPE_CHECKING:
+    from geomtact.inference.posterior import Mode, Posterior
+
+_FACES = 20_000  # that are drawn; finer meshes are made coarser
+_POINTS, _POSES, _SHAPE = 4000, 200, (24, 32)  # of the surface, of the posterior, and rays of each
+_NEAR = 0.02  # of the object's diameter, over which a touch spreads
+
+
+def turnable(posterior: Posterior, modes: Sequence[Mode], shown: Sequence[Shown]) -> dict[str, Any]:
+    """The content of the view, ready for JSON: arrays as base64 of little-endian numbers, lengths in millimetres, all but the
+    part's own points in the first sensor's frame."""
+    T_sensor_frame = inverse(posterior.T_frame_sensor)
+    T = np.array([_mm(T_sensor_frame @ mode.T) for mode in modes])
+    vertices, faces = _drawn(posterior)
+    points, weights = touched(posterior)
+    windows, outlines = [], []
+    for one in shown:
+        T_first = _mm(T_sensor_frame @ one.T_frame_sensor)
+        x, y = 1e3 * one.sensor.half_window
+        windows.append(apply(T_first, [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]))
+        outlines += [apply(T_first, line) for line in _outlines(one)]
+    # a sensor that felt nothing may stand far away
+    near = [window for window, one in zip(windows, shown, strict=True) if one.observation.contact.mask.any()]
+    seen = np.concatenate([*near, apply(T[0], vertices)])
+    middle = 0.5 * (seen.min(0) + seen.max(0))
+    reach = float(np.linalg.norm(seen - middle, axis=1).max())
+    return {
+        "vertices": _packed(vertices, np.float32),
+        "faces": _packed(faces, np.uint32),
+        "points": _packed(points, np.float32),
+        "weights": _packed(weights, np.float32),
+        "modes": T.round(6).tolist(),
+        "windows": [window.round(3).tolist() for window in windows],
+        "outlines": [line.round(3).tolist() for line in outlines],
+        "middle": middle.round(3).tolist(),
+        "radius": round(1.05 * reach, 3),
+        "reach": round(reach, 3),
+    }
+
+
+def touched(posterior: Posterior, seed: int = 0) -> tuple[Array, Array]:
+    """Points (n, 3) of the object's surface [mm] and how likely each lies in the first sensor's contact (n,), relative to the
+    likeliest."""
+    from scipy.spatial import cKDTree
+
+    mesh, sensor, rng = posterior.mesh, posterior.sensor, np.random.default_rng(seed)
+    p = np.exp(np.asarray(posterior.log_prob, float))
+    rows = rng.choice(len(p), _POSES, p=p / p.sum())
+    T = inverse(posterior.T_frame_sensor) @ posterior.poses_of(rows)
+    depth = posterior.space.caster.depths(sensor, T, _SHAPE)
+    x, y = sensor.pixel_centres(_SHAPE)
+    points = mesh.surface_points(_POINTS, seed=seed)
+    tree, weight = cKDTree(points), np.zeros(_POINTS)
+    for pose, below in zip(T, depth, strict=True):
+        row, column = np.nonzero(below > 0)
+        if len(row):
+            met = apply(inverse(pose), np.column_stack([x[column], y[row], -below[row, column]]))
+            near = tree.query_ball_point(met, _NEAR * mesh.diameter)
+            weight[np.unique(np.concatenate(near).astype(int))] += 1
+    return 1e3 * points, weight / max(weight.max(), 1)
+
+
+def _drawn(posterior: Posterior) -> tuple[Array, NDArray[np.integer]]:
+    """Vertices (v, 3) [mm] and faces (f, 3) of the mesh, few enough to be drawn."""
+    import open3d as o3d
+
+    mesh = posterior.mesh
+    vertices, faces = mesh.vertices, np.asarray(mesh.faces)
+    if len(faces) > _FACES:
+        full = o3d.geometry.TriangleMesh(
+            o3d.utility.Vector3dVector(vertices.copy()), o3d.utility.Vector3iVector(faces.astype(np.int32))
+        )
+        few = full.simplify_quadric_decimation(_FACES)
+        vertices, faces = np.asarray(few.vertices), np.asarray(few.triangles)
+    return 1e3 * vertices, faces
+
+
+def _outlines(one: Shown) -> list[Array]:
+    """The borders (n, 3) of the observed contact on the membrane's plane [mm]."""
+    mask = np.asarray(one.observation.contact.mask, np.uint8)
+    x, y = (1e3 * values for values in one.sensor.pixel_centres(mask.shape))  # type: ignore[arg-type]
+    found, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    lines = [line[:, 0] for line in found if len(line) > 2]
+    return [np.column_stack([x[line[:, 0]], y[line[:, 1]], np.zeros(len(line))]) for line in lines]
+
+
+def _mm(T: Array) -> Array:
+    out = np.array(T, float)
+    out[:3, 3] *= 1e3
+    return out
+
+
+def _packed(array: ArrayLike, kind: Any) -> str:
+    return base64.b64encode(np.ascontiguousarray(array, np.dtype(kind).newbyteorder("<")).tobytes()).decode("ascii")
