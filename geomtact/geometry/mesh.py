@@ -227,6 +227,8 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
         scene = trimesh.load_scene(str(path), process=False)
         mesh = scene.to_mesh()
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+        if vertices.shape[1] != 3:
+            raise ValueError(f"vertices of {vertices.shape[1]} numbers")
     except Exception as error:  # noqa: BLE001 -- a parser fails on bad bytes in more ways than can be listed
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise MeshError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); export the mesh again") from None
