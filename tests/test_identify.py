@@ -13,7 +13,10 @@ import trimesh
 from geomtact import InputError, Localizer, Mesh, UsageError
 from geomtact.cli.parts import parts_of
 from geomtact.errors import NoPoseAgreesError
+from geomtact.evaluation.identification import Told, identify_scenes, summarise
 from geomtact.inference.identify import identify
+from geomtact.report.studies import draw
+from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
 
 
@@ -160,3 +163,33 @@ def test_the_command_line_tells_the_part(drawer, tmp_path):
     assert "log evidence" in done.stdout
     refused = subprocess.run([*run, "--prior", "out/posterior.npz"], cwd=tmp_path, capture_output=True, text=True)
     assert refused.returncode == 2 and "several parts go with images alone" in " ".join(refused.stderr.split())
+
+
+def test_the_study_tells_what_identify_does(drawer):
+    told = list(identify_scenes(drawer[1], drawer, 2, 3, MODERATE, "fast", first=1))
+    assert [[each.touches for each in some] for some in told] == [[1, 2, 3]]
+    assert all(each.scene == 1 and set(each.log_evidence) == {"rod", "ball", "block"} for each in told[0])
+    assert told[0][0].log_evidence["ball"] > told[0][0].log_evidence["rod"]
+
+
+def test_figures_of_the_study_follow_from_what_was_told():
+    def told(touches, a, b, unlike_a, unlike_b):
+        return Told(0, touches, {"a": a, "b": b}, {"a": unlike_a, "b": unlike_b})
+
+    of_a = [told(1, 0.0, -9.0, False, True), told(2, 0.0, -9.0, True, True), told(3, -np.inf, -np.inf, True, True)]
+    of_b = [told(1, 5.0, 0.0, False, False), told(2, 0.0, 0.1, True, False), told(3, -9.0, 0.0, True, False)]
+    one, two, three = summarise({"a": of_a, "b": of_b})
+    assert (one["right"][0], one["foreign"][0], one["alarmed"][0], one["sure_and_wrong"]) == (0.5, 0.5, 0, 0.5)
+    assert (two["right"][0], two["foreign"][0], two["alarmed"][0], two["sure_and_wrong"]) == (1, 1, 0.5, 0)
+    assert (three["foreign"][0], three["alarmed"][0]) == (1, 0.5)
+    assert three["right"][1] < three["right"][0] <= three["right"][2] and three["n"] == 2
+    content = {"schema": "geomtact/identification/1", "figures": [one, two, three]}
+    content["parts"] = {
+        name: {
+            "outcomes": [
+                [{"log_evidence": {k: e if np.isfinite(e) else None for k, e in t.log_evidence.items()}} for t in some]
+            ]
+        }
+        for name, some in (("a", of_a), ("b", of_b))
+    }
+    assert draw(content).startswith(b"\x89PNG")

@@ -14,6 +14,7 @@ import typer
 
 from geomtact.cli import study_file, study_options
 from geomtact.cli.evaluate_choices import judge_choices
+from geomtact.cli.evaluate_identify import judge_identification
 from geomtact.cli.evaluate_kitting import judge_kitting
 from geomtact.cli.evaluate_next_touch import judge_next_touch
 from geomtact.cli.evaluate_plot import plot_study
@@ -172,6 +173,7 @@ evaluate.command("thesis")(one_line_errors(judge_thesis_table))
 evaluate.command("touches")(one_line_errors(judge_touches))
 evaluate.command("readings")(one_line_errors(judge_readings))
 evaluate.command("triplets")(one_line_errors(judge_triplets))
+evaluate.command("identify")(one_line_errors(judge_identification))
 evaluate.command("track")(one_line_errors(judge_track))
 evaluate.command("next-touch")(one_line_errors(judge_next_touch))
 evaluate.command("kitting")(one_line_errors(judge_kitting))

@@ -77,15 +77,17 @@ def coverage(levels: ArrayLike, nominal: Sequence[float], confidence: float = 0.
     nominal : masses in (0, 1)
     confidence : of the binomial intervals (Clopper and Pearson 1934)
     """
+    levels = np.asarray(levels, float)
+    return [Coverage(float(mass), *share_with_interval(levels <= mass, confidence)) for mass in nominal]
+
+
+def share_with_interval(which: ArrayLike, confidence: float = 0.95) -> list[float]:
+    """The share of ``which`` (n,) that holds, and its binomial interval (Clopper and Pearson 1934)."""
     from scipy.stats import binomtest
 
-    levels = np.asarray(levels, float)
-    out = []
-    for mass in nominal:
-        hits = int((levels <= mass).sum())
-        interval = binomtest(hits, len(levels)).proportion_ci(confidence, "exact")
-        out.append(Coverage(float(mass), hits / len(levels), float(interval.low), float(interval.high)))
-    return out
+    hits, n = int(np.sum(which)), np.size(which)
+    interval = binomtest(hits, n).proportion_ci(confidence, "exact")
+    return [hits / n, float(interval.low), float(interval.high)]
 
 
 def _poses(T: ArrayLike) -> Array:

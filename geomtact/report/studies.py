@@ -11,6 +11,7 @@ from geomtact.errors import InputError, UsageError, nearest_name
 # by the study's schema: its pictures by name, each drawn by a function of a module beside this one; the first is the default
 PICTURES = {
     "geomtact/choices/1": {"costs": "choices_plot.draw_costs", "modelled": "choices_plot.draw_modelled"},
+    "geomtact/identification/1": {"identification": "identification_plot.draw_identification"},
     "geomtact/kitting/1": {"kitting": "kitting_plot.draw_kitting"},
     "geomtact/next-touch-study/1": {"touches": "next_touch_study_plot.draw_touches_until_sure"},
     "geomtact/registration/2": {"registration": "registration_plot.draw_registration"},

@@ -1,0 +1,106 @@
+"""``geomtact evaluate identify``: which of several parts is touched, and is it one of them at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import typer
+
+from geomtact.cli import study_file, study_options
+from geomtact.cli.library import CacheDir
+from geomtact.cli.localize import Effort
+from geomtact.cli.prepare import MaxPoses, Unit
+from geomtact.cli.shell import print_table, tell
+from geomtact.cli.simulate import NoiseName
+
+SCHEMA = "geomtact/identification/1"
+
+
+def judge_identification(
+    parts: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="OBJECT...", help="Parts or mesh files; all bundled ones by default.", show_default=False
+        ),
+    ] = None,
+    unit: Unit = None,
+    sensor: study_options.SensorName = "gelslim",
+    scenes: Annotated[
+        int, typer.Option("--scenes", min=1, help="How many of each part, of one to three touches.")
+    ] = 20,
+    noise: study_options.NoiseLevel = NoiseName.moderate,
+    effort: study_options.EffortLevel = Effort.balanced,
+    seed: study_options.Seed = 1,
+    max_poses: MaxPoses = None,
+    out: study_options.Out = None,
+    plot: study_options.Plot = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Judge which part it is: touches of each of several parts, localized on all of them, and on all but the right one.
+
+    Prints how often the right part is the most probable, how often a part that is not among them is said to be foreign, and how
+    often one that is; and writes them and every evidence to --out.
+    """
+    from geomtact.evaluation import identification, study
+    from geomtact.geometry.catalogue import catalogue
+
+    content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
+    everyone = list(study_options.localizers(parts or list(catalogue()), unit, sensor, cache_dir, max_poses))
+    for own in everyone:
+        settings = study.describe(own) | {
+            "among": {each.mesh.name: each.mesh.sha256 for each in everyone},
+            "scenes": scenes,
+            "noise": {"name": noise.value, **asdict(strength)},
+            "effort": effort.value,
+            "seed": seed,
+        }
+        name = own.mesh.name
+        done = study_file.earlier(content["parts"].get(name), settings)
+
+        def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
+            study_file.keep(out, content, name, settings=settings, outcomes=outcomes)
+
+        if len(done) < scenes:
+            more = identification.identify_scenes(own, everyone, scenes, seed, strength, effort, first=len(done))
+            rows = ([asdict(told) for told in some] for some in more)
+            done = study_file.collect(done, rows, scenes, f"identifying {name}", keep)
+        keep(done)
+        tell(f"{name}: done")
+    told = {
+        name: [_told(each) for some in part["outcomes"] for each in some] for name, part in content["parts"].items()
+    }
+    content["figures"] = identification.summarise(told)
+    study_file.save(out, content)
+    _print(content["figures"])
+    study_file.plot(content, plot)
+
+
+def _told(written: Mapping[str, Any]) -> Any:
+    """An outcome as written, null standing for an evidence that JSON has no number for."""
+    from geomtact.evaluation.identification import Told
+
+    evidence = {name: -float("inf") if e is None else e for name, e in written["log_evidence"].items()}
+    return Told(**{**written, "log_evidence": evidence})
+
+
+def _print(figures: Sequence[Mapping[str, Any]]) -> None:
+    def percent(three: Sequence[float]) -> str:
+        return "{:.0f} ({:.0f}-{:.0f}) %".format(*(100 * share for share in three))
+
+    headings = ["touches", "scenes", "right", "P(right)", "sure and wrong", "foreign found", "known called foreign"]
+    rows = [
+        [
+            str(f["touches"]),
+            str(f["n"]),
+            percent(f["right"]),
+            f"{f['probability_median']:.2f}",
+            f"{100 * f['sure_and_wrong']:.0f} %",
+            percent(f["foreign"]),
+            percent(f["alarmed"]),
+        ]
+        for f in figures
+    ]
+    typer.echo("Shares of scenes, with 95 % intervals; P(right) is the median; sure is more than 95 %")
+    print_table(headings, rows, headings)

@@ -1,0 +1,91 @@
+"""Which part is it? judged: scenes of one to three touches of each of several parts, localized on all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from geomtact.errors import GeomtactError
+from geomtact.evaluation.pose_error import share_with_interval
+from geomtact.evaluation.sensors_study import Scene, make_scenes
+from geomtact.inference.identify import identify
+from geomtact.inference.localizer import Localizer
+from geomtact.sensing.noise import Noise
+
+MOST = 3  # touches
+
+
+@dataclass(frozen=True)
+class Told:
+    """What was told of one scene.
+
+    Attributes
+    ----------
+    scene, touches : which of the part's scenes, and from how many of its touches
+    log_evidence : by part's name; -inf where no pose agrees with all touches
+    unlike : by part's name, whether what is shown was said to be unlike it
+    """
+
+    scene: int
+    touches: int
+    log_evidence: dict[str, float]
+    unlike: dict[str, bool]
+
+
+def identify_scenes(
+    own: Localizer, all_parts: Sequence[Localizer], n: int, seed: int, noise: Noise, effort: str, first: int = 0
+) -> Iterator[list[Told]]:
+    """Scenes ``first`` to ``n`` of the part of ``own``, rigid and elastic in turn, each from one to three touches."""
+    for number, scene in enumerate(make_scenes(own, n, seed, noise, None, MOST)[first:], first):
+        yield [_told(all_parts, scene, number, touches, seed, effort) for touches in range(1, MOST + 1)]
+
+
+def _told(parts: Sequence[Localizer], scene: Scene, number: int, touches: int, seed: int, effort: str) -> Told:
+    images = [touch.mask for touch in scene.touches[:touches]]
+    options: dict[str, Any] = {
+        "kind": "mask",
+        "T_world_sensor": scene.T_world_sensor[:touches],
+        "effort": effort,
+        "seed": seed,
+    }
+    evidence, unlike = {}, {}
+    for part in parts:
+        try:
+            (told,) = identify([part], images, **options).candidates
+            evidence[part.mesh.name], unlike[part.mesh.name] = told.log_evidence, told.unlike
+        except GeomtactError:
+            evidence[part.mesh.name], unlike[part.mesh.name] = -np.inf, True
+    return Told(number, touches, evidence, unlike)
+
+
+def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:
+    """Figures for each number of touches over all parts, ``told`` by the name of the true one.
+
+    ``right``: the share of scenes whose part is the most probable; ``probability_median``, what it is given. ``foreign``: the
+    share that is said to be unlike all parts where the true one is not among them; ``alarmed``, where it is. With 95 % intervals.
+    """
+    out = []
+    for touches in range(1, MOST + 1):
+        cases = [(name, each) for name, some in told.items() for each in some if each.touches == touches]
+        probability = np.array([_posterior(each)[name] for name, each in cases])
+        right = [max(each.log_evidence, key=each.log_evidence.__getitem__) == name for name, each in cases]
+        foreign = [all(unlike for part, unlike in each.unlike.items() if part != name) for name, each in cases]
+        alarmed = [all(each.unlike.values()) for _, each in cases]
+        figures: dict[str, Any] = {"touches": touches, "n": len(cases)}
+        for key, which in (("right", right), ("foreign", foreign), ("alarmed", alarmed)):
+            figures[key] = share_with_interval(which)
+        figures["probability_median"] = float(np.median(probability))
+        sure = [max(_posterior(each).values()) > 0.95 for _, each in cases]
+        figures["sure_and_wrong"] = float(np.mean(np.array(sure) & ~np.array(right)))
+        out.append(figures)
+    return out
+
+
+def _posterior(each: Told) -> dict[str, float]:
+    logs = np.array(list(each.log_evidence.values()))
+    if not np.isfinite(logs).any():
+        return dict.fromkeys(each.log_evidence, 1 / len(logs))
+    return dict(zip(each.log_evidence, np.exp(logs - np.logaddexp.reduce(logs)).tolist(), strict=True))
