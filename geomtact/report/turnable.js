@@ -84,7 +84,8 @@
     canvas.width = Math.round(canvas.clientWidth * ratio);
     canvas.height = Math.round(canvas.clientHeight * ratio);
     gl.viewport(0, 0, canvas.width, canvas.height);
-    gl.clearColor(1, 1, 1, 1);
+    const page = getComputedStyle(document.body).backgroundColor.match(/[\d.]+/g).map((x) => x / 255);
+    gl.clearColor(page[0], page[1], page[2], 1);
     gl.depthMask(true); // or the depths of the last picture stay
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
@@ -176,6 +177,7 @@
     },
     { passive: false },
   );
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   new ResizeObserver(draw).observe(canvas);
   choose(0);
 })();
