@@ -89,7 +89,9 @@ def generators(symmetry: Symmetry) -> list[tuple[np.ndarray, int]]:
         rotvecs, key=lambda v: (round(float(np.linalg.norm(v)), 6), *np.round(-np.abs(v), 6), *np.round(-v, 6))
     ):
         angle = float(np.linalg.norm(vector))
-        trial = [*chosen, (np.round(vector / angle, 9) + 0.0, round(2 * np.pi / angle))]
+        axis = np.round(vector / angle, 9)
+        axis *= np.sign(axis[np.flatnonzero(axis)[0]])  # either way round it generates the same turns
+        trial = [*chosen, (axis + 0.0, round(2 * np.pi / angle))]
         larger = len(group_of([2 * np.pi / n * a for a, n in trial], symmetry.centre))
         if larger > size:
             chosen, size = trial, larger
