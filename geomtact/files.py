@@ -7,6 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 
+def write_text(path: Path, text: str) -> None:
+    """``text`` as UTF-8, whole or not at all."""
+    write_whole(path, lambda temporary: temporary.write_text(text, "utf-8"))
+
+
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` make a file under a temporary name beside ``path``, then rename it: a killed run leaves no half file."""
     temporary = path.with_name(f".{os.getpid()}-{path.name}")

@@ -8,7 +8,7 @@ import open3d as o3d
 import pytest
 from typer.testing import CliRunner
 
-from geomtact import load_mesh
+from geomtact import Sensor, load_mesh
 from geomtact.cli import app, evaluate_stability, study_file, study_options
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import NoPoseAgreesError
@@ -16,7 +16,7 @@ from geomtact.evaluation import stability
 from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.stability import SWEEPS, World, coarser, cut_off, knobbed, larger, opposed, scanned
+from geomtact.evaluation.stability import SWEEPS, World, cut_off, knobbed, larger, opposed, scanned
 from geomtact.evaluation.touches import penetrations
 from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.report.stability_plot import draw_stability
@@ -107,7 +107,8 @@ def test_a_scanned_part_is_off_by_what_is_said():
 
 def test_a_coarser_part_keeps_so_many_faces():
     mesh = load_mesh("connector_plug")
-    assert len(coarser(mesh, 30).faces) == pytest.approx(0.3 * len(mesh.faces), rel=0.05)
+    here = World(mesh, Sensor.load("gelslim"), MODERATE, (3e-4, 1e-3))
+    assert len(SWEEPS["faces"].world(here, 30).mesh.faces) == pytest.approx(0.3 * len(mesh.faces), rel=0.05)
 
 
 def test_pixels_that_are_larger_than_said_show_a_smaller_contact(here, plug):

@@ -154,12 +154,12 @@ def _content(
 
 
 def _write(out: Path, posterior: Posterior, ranked: Sequence[Action], content: Mapping[str, Any], seed: int) -> None:
-    from geomtact.files import write_whole
+    from geomtact.files import write_text, write_whole
     from geomtact.report.next_touch_plot import draw_next_touch
     from geomtact.report.result import to_text
 
     out.mkdir(parents=True, exist_ok=True)
-    write_whole(out / "next_touch.json", lambda path: path.write_text(to_text(content), "utf-8"))
+    write_text(out / "next_touch.json", to_text(content))
     picture = draw_next_touch(posterior, ranked, seed)
     write_whole(out / "next_touch.png", lambda path: path.write_bytes(picture))
 

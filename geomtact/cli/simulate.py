@@ -149,11 +149,11 @@ def _touch_at(scene: _Scene, T: Array, seed: int, elastic: bool, noise: Noise) -
 
 def _write(stem: Path, mask: Any, truth: dict, metadata: dict) -> None:
     """Write STEM.png, with ``metadata`` as text entries, and STEM.json."""
-    from geomtact.files import write_whole
+    from geomtact.files import write_text
     from geomtact.report.result import plain, to_text
     from geomtact.sensing.image_file import write_image
 
     metadata = {**metadata, "T_sensor_object": truth["T_sensor_object"]}
     write_image(stem.with_name(stem.name + ".png"), mask, metadata)
     text = to_text(plain(truth))
-    write_whole(stem.with_name(stem.name + ".json"), lambda path: path.write_text(text, "utf-8"))
+    write_text(stem.with_name(stem.name + ".json"), text)

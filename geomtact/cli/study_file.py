@@ -93,7 +93,7 @@ def keep(out: Path | None, content: dict[str, Any], part: str, **entry: Any) -> 
 
 def save(out: Path | None, content: dict[str, Any]) -> None:
     """Write ``content``, with the versions of what made it, if there is a file to write."""
-    from geomtact.files import write_whole
+    from geomtact.files import write_text
     from geomtact.report.result import to_text
     from geomtact.versions import versions
 
@@ -101,7 +101,7 @@ def save(out: Path | None, content: dict[str, Any]) -> None:
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         text = to_text(content)
-        write_whole(out, lambda path: path.write_text(text, "utf-8"))
+        write_text(out, text)
 
 
 def plot(content: Mapping[str, Any], path: Path | None, which: str | None = None) -> None:

@@ -16,6 +16,7 @@ from geomtact.cli.localize import Effort, Kind, _check_name
 from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit, open_localizer
 from geomtact.cli.shell import NO_CONTACT, posterior_file, tell
 from geomtact.errors import InputError, UsageError
+from geomtact.files import write_text
 
 
 def track(
@@ -109,20 +110,14 @@ def track(
     except KeyboardInterrupt:
         tell("stopped")
     if tum is not None:
-        _write(tum, "".join(lines))
+        write_text(tum, "".join(lines))
     if report is not None and shown:
         from geomtact.report.sequence_page import sequence_page
 
-        _write(report, sequence_page(localizer.mesh.name, localizer.sensor.name, shown))
+        write_text(report, sequence_page(localizer.mesh.name, localizer.sensor.name, shown))
     if not touched:
         tell("no contact found in any image; give a --background, or say what they are with --kind")
         raise typer.Exit(NO_CONTACT)
-
-
-def _write(path: Path, text: str) -> None:
-    from geomtact.files import write_whole
-
-    write_whole(path, lambda temporary: temporary.write_text(text, "utf-8"))
 
 
 def _metadata(source: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from geomtact.errors import GeomtactError
+from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.pose_error import share_with_interval
 from geomtact.evaluation.sensors_study import Scene, make_scenes
 from geomtact.inference.identify import identify
@@ -51,14 +51,13 @@ def _told(parts: Sequence[Localizer], scene: Scene, number: int, touches: int, s
         "effort": effort,
         "seed": seed,
     }
-    evidence, unlike = {}, {}
-    for part in parts:
-        try:
-            (told,) = identify([part], images, **options).candidates
-            evidence[part.mesh.name], unlike[part.mesh.name] = told.log_evidence, told.unlike
-        except GeomtactError:
-            evidence[part.mesh.name], unlike[part.mesh.name] = -np.inf, True
-    return Told(number, touches, evidence, unlike)
+    names = [part.mesh.name for part in parts]
+    try:
+        found = {each.name: each for each in identify(parts, images, **options).candidates}
+    except NoPoseAgreesError:  # of no part
+        return Told(number, touches, dict.fromkeys(names, -np.inf), dict.fromkeys(names, True))
+    evidence = {name: found[name].log_evidence for name in names}
+    return Told(number, touches, evidence, {name: found[name].unlike for name in names})
 
 
 def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:
@@ -76,7 +75,7 @@ def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:
         alarmed = [all(each.unlike.values()) for _, each in cases]
         figures: dict[str, Any] = {"touches": touches, "n": len(cases)}
         for key, which in (("right", right), ("foreign", foreign), ("alarmed", alarmed)):
-            figures[key] = share_with_interval(which)
+            figures[key] = share_with_interval(sum(which), len(which))
         figures["probability_median"] = float(np.median(probability))
         sure = [max(_posterior(each).values()) > 0.95 for _, each in cases]
         figures["sure_and_wrong"] = float(np.mean(np.array(sure) & ~np.array(right)))

@@ -17,7 +17,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.errors import InputError
 from geomtact.evaluation.fixture import Fixture
-from geomtact.evaluation.touches import counts, penetrations
+from geomtact.evaluation.touches import closed_on, counts, penetrations
 from geomtact.geometry.approach import facing
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
@@ -27,7 +27,7 @@ from geomtact.inference.refine_together import View
 from geomtact.planning.belief import draw_cells
 from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.next_touch import judge
-from geomtact.se3 import Array, apply, exp, inverse, transform
+from geomtact.se3 import Array, exp, inverse, transform
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.noise import MODERATE, Noise
 
@@ -103,11 +103,7 @@ def close_jaw(
     T_world_sensor : (2, 4, 4)
     touches : (2,) bool, whether each finger meets the part
     """
-    start = T_world_jaw @ np.stack([np.eye(4), _OPPOSITE])
-    T = inverse(start) @ T_world_part
-    T[:, 2, 3] -= apply(T, space.mesh.vertices)[..., 2].min(1)  # the whole part before the finger
-    T, touches = space.settle(T, pressed)
-    return T_world_part @ inverse(T), touches
+    return closed_on(space, T_world_part, T_world_jaw @ np.stack([np.eye(4), _OPPOSITE]), pressed)
 
 
 def first_grasp(mesh: Mesh, rng: np.random.Generator) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.fixture import Fixture
 from geomtact.evaluation.kitting import SURE, draw_part, kit
+from geomtact.evaluation.pose_error import share_with_interval
 from geomtact.inference.localizer import Localizer
 from geomtact.se3 import inverse
 from geomtact.sensing.noise import Noise
@@ -64,8 +65,6 @@ def run_cell(localizer: Localizer, runs: int, seed: int, noise: Noise, first: in
 def summarise(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     """For each clearance and number of touches allowed: the shares placed ``right``, placed ``wrong`` and ``refused``, and
     the 95 % interval of the first (Clopper and Pearson 1934). Below ``GOAL`` of every ``THOROUGH``-th part alone."""
-    from scipy.stats import binomtest
-
     out = []
     for k, clearance in enumerate(CLEARANCES):
         some = [o for o in outcomes if clearance >= GOAL or o.run % THOROUGH == 0]
@@ -73,7 +72,6 @@ def summarise(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
             placed = [(o, o.placed(allowed, k)) for o in some]
             fits = [o.needed_mm[i][k] <= 1e3 * clearance for o, i in placed if i is not None]
             right, n = sum(fits), len(some)
-            interval = binomtest(right, n).proportion_ci(0.95, "exact") if n else None
             out.append(
                 {
                     "clearance_mm": 1e3 * clearance,
@@ -82,7 +80,7 @@ def summarise(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
                     "right": right,
                     "wrong": len(fits) - right,
                     "refused": n - len(fits),
-                    "interval": [interval.low, interval.high] if interval else [0.0, 1.0],
+                    "interval": share_with_interval(right, n)[1:] if n else [0.0, 1.0],
                 }
             )
     return out

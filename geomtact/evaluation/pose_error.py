@@ -78,14 +78,16 @@ def coverage(levels: ArrayLike, nominal: Sequence[float], confidence: float = 0.
     confidence : of the binomial intervals (Clopper and Pearson 1934)
     """
     levels = np.asarray(levels, float)
-    return [Coverage(float(mass), *share_with_interval(levels <= mass, confidence)) for mass in nominal]
+    return [
+        Coverage(float(mass), *share_with_interval(int((levels <= mass).sum()), len(levels), confidence))
+        for mass in nominal
+    ]
 
 
-def share_with_interval(which: ArrayLike, confidence: float = 0.95) -> list[float]:
-    """The share of ``which`` (n,) that holds, and its binomial interval (Clopper and Pearson 1934)."""
+def share_with_interval(hits: int, n: int, confidence: float = 0.95) -> list[float]:
+    """The share of ``hits`` in ``n``, and its binomial interval (Clopper and Pearson 1934)."""
     from scipy.stats import binomtest
 
-    hits, n = int(np.sum(which)), np.size(which)
     interval = binomtest(hits, n).proportion_ci(confidence, "exact")
     return [hits / n, float(interval.low), float(interval.high)]
 

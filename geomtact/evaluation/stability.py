@@ -20,9 +20,9 @@ from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.pose_error import coverage
 from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.touches import counts, penetrations
+from geomtact.evaluation.touches import closed_on, counts, penetrations
 from geomtact.evaluation.trajectories import random_trajectory
-from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh import Mesh, coarser
 from geomtact.inference.localizer import Localizer
 from geomtact.se3 import Array, exp, inverse
 from geomtact.sensing.noise import MODERATE, Noise
@@ -103,18 +103,6 @@ def scanned(mesh: Mesh, rms: float, seed: int = 0) -> Mesh:
     return replace(mesh, vertices=fine.vertices + off[:, None] * fine.vertex_normals, faces=fine.faces)
 
 
-def coarser(mesh: Mesh, percent: float) -> Mesh:
-    """The mesh with so many of its faces kept."""
-    import open3d as o3d
-
-    if percent >= 100:
-        return mesh
-    vertices, faces = o3d.utility.Vector3dVector(mesh.vertices.copy()), o3d.utility.Vector3iVector(mesh.faces.copy())
-    full = o3d.geometry.TriangleMesh(vertices, faces)
-    some = full.simplify_quadric_decimation(max(4, int(len(mesh.faces) * percent / 100)))
-    return replace(mesh, vertices=np.asarray(some.vertices), faces=np.asarray(some.triangles))
-
-
 def knobbed(mesh: Mesh, radius: float, seed: int = 0) -> Mesh:
     """The mesh with ``_KNOBS`` balls of ``radius`` [m] sunk by half into its surface, at random."""
     import trimesh
@@ -177,7 +165,10 @@ SWEEPS = {
         lambda w, x: replace(w, mesh=scanned(w.mesh, 1e-3 * x)),
     ),
     "faces": Sweep(
-        "faces kept of the mesh [%]", (100, 30, 10, 3), (100, 30), lambda w, x: replace(w, mesh=coarser(w.mesh, x))
+        "faces kept of the mesh [%]",
+        (100, 30, 10, 3),
+        (100, 30),
+        lambda w, x: replace(w, mesh=coarser(w.mesh, max(4, int(len(w.mesh.faces) * x / 100)))),
     ),
     "threshold": Sweep(
         "gel feels nothing shallower than [mm]",
@@ -329,10 +320,8 @@ def opposed(T: Array, angle: float, way: float, space: ContactSpace, depth: floa
     along a line that leans by ``angle`` [rad] towards the direction ``way`` [rad]; ``depth`` [m] deep. None if it misses."""
     lean = np.array([-np.sin(way), np.cos(way), 0.0]) * angle
     facing = exp(np.pad(lean, (0, 3))) @ np.diag([1.0, -1.0, -1.0, 1.0])
-    seen = inverse(facing) @ T
-    seen[2, 3] -= (seen[:3, :3] @ space.mesh.vertices.T + seen[:3, 3:])[2].min()  # the whole object before it
-    settled, touches = space.settle(seen[None], depth)
-    return T @ inverse(settled[0]) if touches[0] else None
+    stops, touches = closed_on(space, T, facing[None], depth)
+    return stops[0] if touches[0] else None
 
 
 def _together(localizer: Localizer, T: Array, T_world_sensor: Array, masks: list, effort: str, seed: int) -> Answer:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
 from geomtact.errors import InputError
 from geomtact.evaluation.contact_class import contact_class
-from geomtact.se3 import Array
+from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.noise import MODERATE, Noise
 
 PENETRATION = (0.3e-3, 1.5e-3)
@@ -35,6 +35,22 @@ def penetrations(space: ContactSpace) -> tuple[float, float]:
     """Least and largest penetration [m] of touches on a sensor, whose gel may be thinner."""
     high = min(PENETRATION[1], space.sensor.max_penetration)
     return min(PENETRATION[0], high / 2), high
+
+
+def closed_on(
+    space: ContactSpace, T_world_object: Array, T_world_sensor: Array, pressed: ArrayLike
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Where sensors stop (n, 4, 4) that come along their own z from clear of an object, and which of them meet it (n,).
+
+    Parameters
+    ----------
+    T_world_sensor : (n, 4, 4), anywhere along the lines on which they come
+    pressed : how deep the object presses into each [m]
+    """
+    T = inverse(T_world_sensor) @ T_world_object
+    T[:, 2, 3] -= apply(T, space.mesh.vertices)[..., 2].min(1)  # the whole object before the sensor
+    T, touches = space.settle(T, pressed)
+    return T_world_object @ inverse(T), touches
 
 
 def counts(space: ContactSpace, mask: NDArray[np.bool_]) -> bool:

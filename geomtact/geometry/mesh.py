@@ -143,6 +143,20 @@ class Mesh:
         return replace(self, symmetry=find_symmetry(self.vertices, self.faces, tolerance))
 
 
+def coarser(mesh: Mesh, faces: int) -> Mesh:
+    """The mesh with no more than so many ``faces``, by quadric decimation; itself where it has no more."""
+    if len(mesh.faces) <= faces:
+        return mesh
+    import open3d as o3d
+
+    vertices, triangles = (
+        o3d.utility.Vector3dVector(mesh.vertices.copy()),
+        o3d.utility.Vector3iVector(mesh.faces.copy()),
+    )
+    some = o3d.geometry.TriangleMesh(vertices, triangles).simplify_quadric_decimation(faces)
+    return replace(mesh, vertices=np.asarray(some.vertices), faces=np.asarray(some.triangles))
+
+
 def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _SensorLike | None = None) -> Mesh:
     """Load a part by catalogue name or from an STL, OBJ, PLY, OFF, GLB or glTF file. The object frame is the file's.
 

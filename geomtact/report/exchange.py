@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomtact.errors import InputError
-from geomtact.files import write_whole
+from geomtact.files import write_text
 from geomtact.se3 import Array, check_transforms, quat_xyzw, transform
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ BOP = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 def to_tum(path: str | Path, times: Iterable[float], T: Any) -> None:
     """Write poses ``T`` (n, 4, 4) [m] at ``times`` (n,) [s] as lines of ``timestamp tx ty tz qx qy qz qw``."""
     lines = [tum_line(time, pose) for time, pose in zip(times, check_transforms(T).reshape(-1, 4, 4), strict=True)]
-    write_whole(Path(path), lambda temporary: temporary.write_text("".join(lines), "utf-8"))
+    write_text(Path(path), "".join(lines))
 
 
 def tum_line(time: float, T: Array) -> str:
@@ -59,7 +59,7 @@ def to_bop(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
         R, t = (" ".join(f"{x:.9g}" for x in values) for values in (T[:3, :3].ravel(), 1e3 * T[:3, 3]))
         head = [str(row[key]) for key in BOP[:3]]
         lines.append(",".join([*head, f"{row['score']:.9g}", R, t, f"{row.get('time', -1):g}"]))
-    write_whole(Path(path), lambda temporary: temporary.write_text("\n".join(lines) + "\n", "utf-8"))
+    write_text(Path(path), "\n".join(lines) + "\n")
 
 
 def from_bop(path: str | Path) -> list[dict[str, Any]]:

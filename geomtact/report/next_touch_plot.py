@@ -78,7 +78,9 @@ def _region(
     """The share of ``poses`` at which the part covers a line of sight, the first sensor, and the ``best`` actions."""
     ends = np.concatenate([_path(posterior, action, poses) for action in best])
     outline = apply(poses, posterior.mesh.surface_points(128)).reshape(-1, 3)
-    windows = apply(_touched_by(posterior), _corners(posterior.sensor))
+    # of all sensors that touched, each taken to have the first one's window
+    placed = np.asarray(posterior.settings.get("T_world_sensor", [posterior.T_frame_sensor]))
+    windows = apply(placed, _corners(posterior.sensor))
     corners = np.concatenate([outline, *windows, ends]) @ R.T
     low, high = corners.min(0)[:2], corners.max(0)[:2]
     middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
@@ -112,12 +114,6 @@ def _region(
             bbox={"boxstyle": "circle,pad=0.15", "fc": "white", "ec": colour},
         )
     axes.set(title=f"Where the part may be, {name}", xlabel=f"{right} [mm]", ylabel=f"{up} [mm]")
-
-
-def _touched_by(posterior: Posterior) -> Array:
-    """The sensors (n, 4, 4) of which the posterior tells; they are taken to have the first one's window."""
-    several = posterior.settings.get("T_world_sensor")
-    return posterior.T_frame_sensor[None] if several is None else np.asarray(several)
 
 
 def _covered(posterior: Posterior, poses: Array, R: Array, middle: Array, half: float) -> Array:

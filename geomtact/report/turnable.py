@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from geomtact.geometry.mesh import coarser
 from geomtact.report.shown import Shown
 from geomtact.se3 import Array, apply, inverse
 
@@ -26,7 +27,8 @@ def turnable(posterior: Posterior, modes: Sequence[Mode], shown: Sequence[Shown]
     part's own points in the first sensor's frame."""
     T_sensor_frame = inverse(posterior.T_frame_sensor)
     T = np.array([_mm(T_sensor_frame @ mode.T) for mode in modes])
-    vertices, faces = _drawn(posterior)
+    mesh = coarser(posterior.mesh, _FACES)
+    vertices = 1e3 * mesh.vertices
     points, weights = touched(posterior)
     windows, outlines = [], []
     for one in shown:
@@ -41,7 +43,7 @@ def turnable(posterior: Posterior, modes: Sequence[Mode], shown: Sequence[Shown]
     reach = float(np.linalg.norm(seen - middle, axis=1).max())
     return {
         "vertices": _packed(vertices, np.float32),
-        "faces": _packed(faces, np.uint32),
+        "faces": _packed(mesh.faces, np.uint32),
         "points": _packed(points, np.float32),
         "weights": _packed(weights, np.float32),
         "modes": T.round(6).tolist(),
@@ -73,21 +75,6 @@ def touched(posterior: Posterior, seed: int = 0) -> tuple[Array, Array]:
             near = tree.query_ball_point(met, _NEAR * mesh.diameter)
             weight[np.unique(np.concatenate(near).astype(int))] += 1
     return 1e3 * points, weight / max(weight.max(), 1)
-
-
-def _drawn(posterior: Posterior) -> tuple[Array, NDArray[np.integer]]:
-    """Vertices (v, 3) [mm] and faces (f, 3) of the mesh, few enough to be drawn."""
-    import open3d as o3d
-
-    mesh = posterior.mesh
-    vertices, faces = mesh.vertices, np.asarray(mesh.faces)
-    if len(faces) > _FACES:
-        full = o3d.geometry.TriangleMesh(
-            o3d.utility.Vector3dVector(vertices.copy()), o3d.utility.Vector3iVector(faces.astype(np.int32))
-        )
-        few = full.simplify_quadric_decimation(_FACES)
-        vertices, faces = np.asarray(few.vertices), np.asarray(few.triangles)
-    return 1e3 * vertices, faces
 
 
 def _outlines(one: Shown) -> list[Array]:

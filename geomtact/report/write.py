@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from geomtact.files import write_whole
+from geomtact.files import write_text, write_whole
 from geomtact.report.figure import draw
 from geomtact.report.page import page
 from geomtact.report.result import result, to_text
@@ -53,6 +53,6 @@ def write_all(
     content = result(posterior, modes, settings, timing, parts)
     view = turnable(posterior, modes, shown) if modes else None
     html = page(content, table(summaries), [*facts(posterior), *caution(summaries)], picture.bands, view)
-    write_whole(folder / "report.html", lambda path: path.write_text(html, "utf-8"))
-    write_whole(folder / "result.json", lambda path: path.write_text(to_text(content), "utf-8"))
+    write_text(folder / "report.html", html)
+    write_text(folder / "result.json", to_text(content))
     return content

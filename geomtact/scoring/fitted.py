@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import MeshError
-from geomtact.files import write_whole
+from geomtact.files import write_text, write_whole
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import Calibration, Touches, calibrate, simulate_touches
 from geomtact.scoring.cascade import Cascade, Rows
@@ -151,7 +151,7 @@ def fitted_scorer(
         raise MeshError(_all_alike(index, touches, data["calibration"]["gain"]))
     if path is not None:
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
-            write_whole(path, lambda temporary: temporary.write_text(json.dumps(data), "utf-8"))
+            write_text(path, json.dumps(data))
     return _from_json(name, data, known, index)
 
 

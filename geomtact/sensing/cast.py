@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.contact import Contact
-from geomtact.sensing.scene import scene_of
+from geomtact.sensing.scene import MISSED, scene_of
 from geomtact.sensing.sensor import Sensor
 
 _RAYS_PER_CALL = 1 << 18
@@ -124,7 +124,7 @@ class Caster:
         origin, direction, below = self._rays(sensor, T, rays)
         t = self._scene.distances(origin, direction).reshape(len(T), len(rays)).astype(float)
         length = sensor.camera_distance or 1.0
-        missed = np.isinf(t)
+        missed = t > MISSED
         depth = np.subtract(below[:, None], length * t, out=t)
         if sensor.membrane_radius:
             # a camera's rays spread: where they are when they have come so far

@@ -104,8 +104,9 @@ def _pressure(depth: Array32, pitch: tuple[float, float], thickness: float = np.
         step = np.vdot(inside, direction) / max(float(np.vdot(sunk, direction)), 1e-30)
         pressure = np.maximum(pressure - step * direction, 0)
         again = may_touch & (pressure == 0) & (gap < 0)
-        previous = 0.0 if again.any() else square
+        previous = square
         if again.any():
+            previous = 0.0
             pressure[again] = np.maximum(-step * _displacement(np.where(again, gap, 0), inverse)[again], 0)
     return (pressure[:h, :w] * scale).astype(np.float32)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Rays = NDArray[np.float32]
-_MISSED = 1e30  # from which a distance is none
+MISSED = 1e30  # beyond which a distance is none
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,10 @@ class Hits:
 
 
 class Scene(Protocol):
-    """Rays (m, 3) from ``origin`` along ``direction``, single precision, which may be cast by several threads at once."""
+    """Rays (m, 3) from ``origin`` along ``direction``, single precision, which may be cast by several threads at once.
+
+    A distance is beyond ``MISSED``, and a face -1, where nothing is met.
+    """
 
     def distances(self, origin: Rays, direction: Rays) -> NDArray[np.float32]: ...
     def faces(self, origin: Rays, direction: Rays) -> NDArray[np.int64]: ...
@@ -54,9 +57,7 @@ class _Embree:
         TriangleMesh(self._scene, corners)
 
     def distances(self, origin: Rays, direction: Rays) -> NDArray[np.float32]:
-        t = self._scene.run(origin, direction, query="DISTANCE")
-        t[t > _MISSED] = np.inf
-        return np.asarray(t)
+        return np.asarray(self._scene.run(origin, direction, query="DISTANCE"))
 
     def faces(self, origin: Rays, direction: Rays) -> NDArray[np.int64]:
         return np.asarray(self._scene.run(origin, direction, query="INTERSECT"), np.int64)

@@ -14,7 +14,7 @@ from torch import nn
 from torch.optim import Optimizer
 
 from geomtact.errors import InputError
-from geomtact.files import write_whole
+from geomtact.files import write_text, write_whole
 from geomtact.geometry.mesh import Mesh
 from geomtact.sensing.sensor import Sensor
 
@@ -51,7 +51,7 @@ def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
             )
         return
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(path, lambda temporary: temporary.write_text(json.dumps(wanted, indent=1) + "\n", "utf-8"))
+    write_text(path, json.dumps(wanted, indent=1) + "\n")
 
 
 def save_state(
