@@ -7,7 +7,6 @@ own pose seldom touches there, though a part of the cell does. So each cell coun
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -145,11 +144,11 @@ class Carry:
         self._in_parts(np.arange(len(self._within_reach[0])), work)
         return out
 
-    def _in_parts(self, rows: NDArray[np.int64], work: Callable[[NDArray[np.int64]], None]) -> None:
-        """Do ``work`` on ``rows`` (m,) of :attr:`_within_reach`, some at a time."""
-        parts = [rows[i : i + _CHUNK] for i in range(0, len(rows), _CHUNK)]
-        with ThreadPoolExecutor(2 if len(parts) > 1 else 1) as pool:
-            list(pool.map(work, parts))
+    @staticmethod
+    def _in_parts(rows: NDArray[np.int64], work: Callable[[NDArray[np.int64]], None]) -> None:
+        """Do ``work`` on ``rows`` (m,) of :attr:`_within_reach`, as many at a time as a processor keeps at hand."""
+        for i in range(0, len(rows), _CHUNK):
+            work(rows[i : i + _CHUNK])
 
     def _placed(self, part: NDArray[np.int64], rotation_there: NDArray[np.int32], shift: NDArray[np.float32]) -> Placed:
         """Those of the rows ``part`` of :attr:`_within_reach` that lie over the other sensor.

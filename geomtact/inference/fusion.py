@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -84,12 +85,14 @@ def fuse(
     touched = prior.sum(0, dtype=float)
     felt = np.einsum("pn,pn->n", prior, density).astype(float)
     doubtful = felt < _DOUBTFUL * touched
-    seen, uniform = [], []
-    for i in others:
-        T_other_first = inverse(posteriors[i].T_frame_sensor) @ base.T_frame_sensor
-        both = _seen(Carry(index, posteriors[i].index, T_other_first, rig or RigStd()), posteriors[i], doubtful)
-        seen.append(both[0].astype(float))
-        uniform.append(both[1])
+
+    def told_by(other: Posterior) -> tuple[Array, Array]:
+        T_other_first = inverse(other.T_frame_sensor) @ base.T_frame_sensor
+        return _seen(Carry(index, other.index, T_other_first, rig or RigStd()), other, doubtful)
+
+    with ThreadPoolExecutor(2) as pool:  # whole sensors, for parts of one would wait for each other
+        told = list(pool.map(told_by, [posteriors[i] for i in others]))
+    seen, uniform = [each[0].astype(float) for each in told], [each[1] for each in told]
     total = float(_product(felt, seen).sum())
     without = [_product(touched, seen), *(_product(felt, seen, i) for i in range(len(seen)))]
     order = [first, *others]
