@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Annotated, Any
 
@@ -14,7 +14,7 @@ from geomtact.cli.localize import Effort
 from geomtact.cli.prepare import MaxPoses, Unit
 from geomtact.cli.shell import print_table, tell
 
-SCHEMA = "geomtact/stability/1"
+SCHEMA = "geomtact/stability/2"
 _NAMES = (
     "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, kind, detail, rig_shift, rig_turn, jaw, "
     "slips, other_part"
@@ -50,6 +50,7 @@ def judge_stability(
     """
     from geomtact.errors import UsageError, nearest_name
     from geomtact.evaluation import stability, study
+    from geomtact.report.result import plain
 
     names = sweep or list(stability.SWEEPS)
     for name in names:
@@ -71,10 +72,43 @@ def judge_stability(
                 told = study_file.collect([], todo, many, f"{part}: {one.title} {level:g}", lambda _: None)
                 if told:
                     figures = stability.summarise(told)
-                    done.append({"level": level, "figures": figures, "answers": [asdict(a) for a in told]})
+                    done.append({"level": level, "figures": figures, "answers": _columns(told)})
                 study_file.keep(out, content, part, settings=settings, sweeps=sweeps)
         _print(part, {name: sweeps[name] for name in names})
+    content["together"] = plain(_together(list(content["parts"].values())))
+    study_file.save(out, content)
+    if len(content["parts"]) > 1:
+        _print("all parts", {name: content["together"][name] for name in names})
     study_file.plot(content, plot)
+
+
+def _together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The sweeps of all parts, the answers of each level taken together."""
+    from geomtact.evaluation import stability
+
+    out: dict[str, Any] = {}
+    for name in dict.fromkeys(name for part in parts for name in part["sweeps"]):
+        held = [part["sweeps"][name] for part in parts if name in part["sweeps"]]
+        answers: dict[float, list] = {level: [] for level in stability.SWEEPS[name].levels}
+        for at in (at for sweep in held for at in sweep["levels"]):
+            answers[at["level"]] += _answers(at["answers"])
+        levels = [{"level": x, "figures": stability.summarise(some)} for x, some in answers.items() if some]
+        out[name] = {"title": held[0]["title"], "inside": held[0]["inside"], "levels": levels}
+    return out
+
+
+def _columns(answers: Sequence[Any]) -> dict[str, list]:
+    """Answers as they are written, a list for each field."""
+    rows = [asdict(each) for each in answers]
+    return {key: [row[key] if isinstance(row[key], bool) else round(row[key], 4) for row in rows] for key in rows[0]}
+
+
+def _answers(columns: Mapping[str, Sequence[Any]]) -> list[Any]:
+    """The answers that were written as ``columns``."""
+    from geomtact.evaluation.answer import Answer
+
+    rows = zip(*columns.values(), strict=True)
+    return [Answer(**study_file.numbers(dict(zip(columns, row, strict=True)))) for row in rows]
 
 
 def _print(part: str, sweeps: Mapping[str, Any]) -> None:

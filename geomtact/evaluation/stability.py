@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,8 @@ class Sweep:
 
 def larger(mesh: Mesh, percent: float) -> Mesh:
     """The mesh grown by so much about its centre."""
+    if percent == 0:
+        return mesh
     return replace(mesh, vertices=mesh.centre + (1 + percent / 100) * (mesh.vertices - mesh.centre))
 
 
@@ -232,12 +235,26 @@ def swept(localizer: Localizer, sweep: Sweep, level: float, n: int, seed: int, e
         assert sweep.world is not None
         here = World(localizer.mesh, localizer.sensor, MODERATE, penetrations(localizer.space))
         there = sweep.world(here, level)
-        for T, mask in touches(there, n, seed):
-            posterior = localizer.localize(mask, "mask", effort=effort, seed=seed)
-            answer = judged(localizer.mesh, T, posterior, _knowable(localizer.space, T))
-            if there.mesh.name != localizer.mesh.name:  # wherever it is said to be, it is not
-                answer = replace(answer, gain=-np.inf, level=1.0, mssd_mm=np.inf)
-            yield answer
+        if there == here:
+            yield from _as_prepared(localizer, here, n, seed, effort)
+        else:
+            yield from _alone(localizer, there, n, seed, effort)
+
+
+@lru_cache(maxsize=1)
+def _as_prepared(localizer: Localizer, here: World, n: int, seed: int, effort: str) -> list[Answer]:
+    """Answers where all is as it was prepared, which is where most sweeps begin."""
+    return list(_alone(localizer, here, n, seed, effort))
+
+
+def _alone(localizer: Localizer, there: World, n: int, seed: int, effort: str) -> Iterator[Answer]:
+    """Answers to single touches of another world than the localizer was prepared for."""
+    for T, mask in touches(there, n, seed):
+        posterior = localizer.localize(mask, "mask", effort=effort, seed=seed)
+        answer = judged(localizer.mesh, T, posterior, _knowable(localizer.space, T))
+        if there.mesh.name != localizer.mesh.name:  # wherever it is said to be, it is not
+            answer = replace(answer, gain=-np.inf, level=1.0, mssd_mm=np.inf)
+        yield answer
 
 
 def _knowable(space: ContactSpace, T: Array) -> Array:

@@ -86,7 +86,7 @@ def fuse(
     felt = np.einsum("pn,pn->n", prior, density).astype(float)
     doubtful = felt < _DOUBTFUL * touched
 
-    def told_by(other: Posterior) -> tuple[Array, Array]:
+    def told_by(other: Posterior) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         T_other_first = inverse(other.T_frame_sensor) @ base.T_frame_sensor
         return _seen(Carry(index, other.index, T_other_first, rig or RigStd()), other, doubtful)
 

@@ -9,20 +9,23 @@ from typing import Any
 from geomtact.report.canvas import COLOURS, png
 
 _ACROSS = 4
+_TOGETHER = "all parts"
 
 
 def draw_stability(content: Mapping[str, Any]) -> bytes:
-    """A PNG: for each sweep the information told and claimed; and below how many truths the 90 % region holds, with 99 %
-    intervals, and how many answers are wrong while nothing says so.
+    """A PNG: for each sweep the information told and claimed; and below how many truths the 90 % region holds, with the 99 %
+    intervals of all parts together, and how many answers are wrong while nothing says so.
 
-    What is promised lies on a light ground. Parts are told apart by colour.
+    What is promised lies on a light ground. Parts are told apart by colour; all together are black.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    parts = content["parts"]
-    colours = dict(zip(parts, cycle(COLOURS), strict=False))
-    names = list(dict.fromkeys(name for part in parts.values() for name in part["sweeps"]))
+    sweeps = {part: told["sweeps"] for part, told in content["parts"].items()}
+    colours = dict(zip(sweeps, cycle(COLOURS), strict=False))
+    names = list(dict.fromkeys(name for some in sweeps.values() for name in some))
+    if len(sweeps) > 1:
+        sweeps[_TOGETHER], colours[_TOGETHER] = content["together"], "black"
     across = min(_ACROSS, max(1, len(names)))
     down = -(-len(names) // across)
     figure = Figure(figsize=(4.2 * across, 4.4 * down + 0.4), dpi=100, layout="constrained", facecolor="white")
@@ -33,7 +36,7 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
     for number, name in enumerate(names):
         row, column = divmod(number, across)
         pair = grid[2 * row, column], grid[2 * row + 1, column]
-        _draw(pair, [(colours[p], part["sweeps"][name]) for p, part in parts.items() if name in part["sweeps"]])
+        _draw(pair, [(colours[p], some[name]) for p, some in sweeps.items() if name in some])
     handles: list[Any] = [figure.axes[0].plot([], [], "o-", color=c, label=p)[0] for p, c in colours.items()]
     styles = (
         ("o-", "above: told, below: truths in the 90 % region"),
@@ -47,7 +50,10 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
 
 
 def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
-    """One sweep of each part, with its colour, into the two axes of ``pair``. A part may lack levels that others have."""
+    """One sweep of each part, with its colour, into the two axes of ``pair``, the last with intervals.
+
+    A part may lack levels that others have.
+    """
     nats, shares = pair
     sweep = max((each for _, each in parts), key=lambda each: len(each["levels"]))
     levels = list(dict.fromkeys(at["level"] for each in (sweep, *(e for _, e in parts)) for at in each["levels"]))
@@ -58,7 +64,16 @@ def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -
         nats.plot(here, [f["claimed_mean"] for f in figures], "--", color=colour)
         held = [f["coverage"][1] for f in figures]
         beyond = [[100 * (c["share"] - c["low"]) for c in held], [100 * (c["high"] - c["share"]) for c in held]]
-        shares.errorbar(here, [100 * c["share"] for c in held], beyond, fmt="o-", color=colour, ms=4, elinewidth=0.8)
+        last = each is parts[-1][1]
+        shares.errorbar(
+            here,
+            [100 * c["share"] for c in held],
+            beyond if last else None,
+            fmt="o-",
+            color=colour,
+            ms=4,
+            elinewidth=0.8,
+        )
         shares.plot(here, [100 * f["silent"] for f in figures], ":", color=colour)
     for axes in pair:
         axes.set_visible(True)

@@ -16,7 +16,7 @@ PICTURES = {
     "geomtact/next-touch-study/1": {"touches": "next_touch_study_plot.draw_touches_until_sure"},
     "geomtact/registration/2": {"registration": "registration_plot.draw_registration"},
     "geomtact/scores/2": {"scores": "score_plot.draw_scores"},
-    "geomtact/stability/1": {"stability": "stability_plot.draw_stability"},
+    "geomtact/stability/2": {"stability": "stability_plot.draw_stability"},
     "geomtact/thesis-table/1": {"errors": "thesis_plot.draw_thesis"},
     "geomtact/touches/1": {"touches": "touches_plot.draw_touches"},
     "geomtact/track/1": {"track": "track_plot.draw_track"},
