@@ -61,6 +61,7 @@ def test_help_and_lists(geomtact):
         "next-touch",
         "track",
         "calibrate",
+        "view",
     }
     assert {c.name or c.callback.__name__ for c in app.registered_commands} == commands
     assert all(name in geomtact("--help").stdout for name in {*commands, "evaluate"})

@@ -14,6 +14,7 @@ from geomtact.cli.shell import one_line_errors
 from geomtact.cli.simulate import simulate
 from geomtact.cli.track import track
 from geomtact.cli.train import train
+from geomtact.cli.view import view
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -21,7 +22,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Localize a known part from the shape of one tactile contact: the whole distribution of its pose.",
 )
-for command in (localize, track, prepare, train, simulate, calibrate, sensors, objects, cache):
+for command in (localize, track, view, prepare, train, simulate, calibrate, sensors, objects, cache):
     app.command()(one_line_errors(command))
 app.command("next-touch")(one_line_errors(next_touch))
 app.add_typer(evaluate, name="evaluate")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,46 +18,59 @@ from geomtact.cli.shell import NO_CONTACT, posterior_file, tell
 from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text
 
+if TYPE_CHECKING:
+    from geomtact.inference.localizer import Localizer
+    from geomtact.inference.posterior import Posterior
+
+
+Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="DIR|VIDEO|CAMERA|-",
+        help="Folder of images, video, a camera's number, or - for paths from standard input.",
+    ),
+]
+ObjectName = Annotated[str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")]
+KindName = Annotated[str, typer.Option(metavar="|".join(Kind), help="What the images are.")]
+Background = Annotated[Path | None, typer.Option(help="Image of the untouched sensor, for readings.")]
+EffortName = Annotated[
+    str | None,
+    typer.Option(metavar="|".join(Effort), help="How much to compute; balanced by default.", show_default=False),
+]
+MotionMm = Annotated[
+    float, typer.Option(min=0.001, help="How far the part moves between frames at most, mean over its points.")
+]
+Follow = Annotated[bool, typer.Option("--follow", help="Wait for more images in the folder, until Ctrl-C.")]
+SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Go on after an image that cannot be read.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
+MOTION_MM = 8.0  # the thesis's
+UNTOUCHED = "no contact found in any image; give a --background, or say what they are with --kind"
+
 
 def track(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="DIR|VIDEO|CAMERA|-",
-            help="Folder of images, video, a camera's number, or - for paths from standard input.",
-        ),
-    ],
-    object_name: Annotated[
-        str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")
-    ] = None,
+    source: Source,
+    object_name: ObjectName = None,
     unit: Unit = None,
     sensor: SensorName = None,
-    kind: Annotated[str, typer.Option(metavar="|".join(Kind), help="What the images are.")] = Kind.auto.value,
-    background: Annotated[Path | None, typer.Option(help="Image of the untouched sensor, for readings.")] = None,
+    kind: KindName = Kind.auto.value,
+    background: Background = None,
     prior: Annotated[
         Path | None, typer.Option(help="posterior.npz of what is known before the first frame, or its folder.")
     ] = None,
-    effort: Annotated[
-        str | None,
-        typer.Option(metavar="|".join(Effort), help="How much to compute; balanced by default.", show_default=False),
-    ] = None,
+    effort: EffortName = None,
     scorer: ScorerName = None,
-    motion_mm: Annotated[
-        float, typer.Option(min=0.001, help="How far the part moves between frames at most, mean over its points.")
-    ] = 8.0,
+    motion_mm: MotionMm = MOTION_MM,
     most: Annotated[
         int | None, typer.Option(min=1, help="Cells kept between frames at most, for speed; all that count by default.")
     ] = None,
-    follow: Annotated[bool, typer.Option("--follow", help="Wait for more images in the folder, until Ctrl-C.")] = False,
-    skip_broken: Annotated[
-        bool, typer.Option("--skip-broken", help="Go on after an image that cannot be read.")
-    ] = False,
+    follow: Follow = False,
+    skip_broken: SkipBroken = False,
     tum: Annotated[
         Path | None, typer.Option(help="Write the first modes as a TUM trajectory: timestamp tx ty tz qx qy qz qw.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Write one HTML file that plays the sequence.")] = None,
     fps: Annotated[float, typer.Option(min=1e-6, help="Images a second, for the timestamps of a folder.")] = 1.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    seed: Seed = 0,
     max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
 ) -> None:
@@ -66,43 +79,22 @@ def track(
     What is not given is taken from the nearest geomtact.toml (this folder or above), then from the first image's metadata.
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in any image.
     """
-    from geomtact.cli.project import resolve
+    given = given_of(object_name, unit, sensor, background, effort)
+    options: dict[str, Any] = {"kind": kind, "prior": prior, "most": most, "skip_broken": skip_broken, "seed": seed}
+    localizer, posteriors = open_track(source, given, follow, motion_mm, scorer, max_poses, cache_dir, **options)
 
-    _check_name("kind", kind, Kind)
-    prior = prior and posterior_file(prior, "--prior")
-    if follow and not Path(source).is_dir():
-        raise UsageError(f"--follow: expected a folder to watch, got {source}")
-    given = {
-        "object": object_name,
-        "unit": unit,
-        "sensor": sensor,
-        "background": None if background is None else str(background),
-        "effort": effort,
-    }
-    values, sources = resolve(given, _metadata(source))
-    chosen = values["effort"] or Effort.balanced.value
-    _check_name("effort", chosen, Effort, sources.get("effort"))
-    frames = all_frames(source, follow, values["sensor"])
-    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior)
-
-    from geomtact.inference.motion import UniformBall
-    from geomtact.inference.sequence import track as posteriors
     from geomtact.report.exchange import tum_line
 
-    options: dict[str, Any] = {"kind": kind, "background": values["background"], "prior": prior, "effort": chosen}
-    options |= {"motion": UniformBall(1e-3 * motion_mm), "most": most, "on_error": "skip" if skip_broken else "raise"}
-    times: deque[float | None] = deque()
     lines: list[str] = []
     shown: list[dict[str, Any]] = []
     touched = False
     try:
-        for n, posterior in enumerate(posteriors(localizer, _images(frames, times), seed=seed, **options), 1):
-            told = times.popleft()
+        for n, (at, posterior) in enumerate(posteriors, 1):
             line = line_of(n, posterior) | {"surprise_nats": posterior.settings["surprise_nats"]}
             touched |= posterior.contact
             typer.echo(to_line(line))
             if line["T"] is not None:
-                lines.append(tum_line(n / fps if told is None else told, line["T"]))
+                lines.append(tum_line(n / fps if at is None else at, line["T"]))
             if report is not None:
                 from geomtact.report.sequence_page import sequence_frame
 
@@ -116,8 +108,59 @@ def track(
 
         write_text(report, sequence_page(localizer.mesh.name, localizer.sensor.name, shown))
     if not touched:
-        tell("no contact found in any image; give a --background, or say what they are with --kind")
+        tell(UNTOUCHED)
         raise typer.Exit(NO_CONTACT)
+
+
+def given_of(
+    object_name: str | None, unit: str | None, sensor: str | None, background: Path | None, effort: str | None
+) -> dict[str, str | None]:
+    """What the command line gives, as ``project.resolve`` takes it."""
+    return {
+        "object": object_name,
+        "unit": unit,
+        "sensor": sensor,
+        "background": None if background is None else str(background),
+        "effort": effort,
+    }
+
+
+def open_track(
+    source: str,
+    given: dict[str, str | None],
+    follow: bool,
+    motion_mm: float,
+    scorer: str | None,
+    max_poses: int | None,
+    cache_dir: Path | None,
+    *,
+    kind: str,
+    skip_broken: bool,
+    seed: int,
+    prior: Path | None = None,
+    most: int | None = None,
+) -> tuple[Localizer, Iterator[tuple[float | None, Posterior]]]:
+    """The localizer, and the time, if the source tells one, and the posterior of each frame; parameters as of :func:`track`."""
+    from geomtact.cli.project import resolve
+
+    _check_name("kind", kind, Kind)
+    prior = prior and posterior_file(prior, "--prior")
+    if follow and not Path(source).is_dir():
+        raise UsageError(f"--follow: expected a folder to watch, got {source}")
+    values, sources = resolve(given, _metadata(source))
+    effort = values["effort"] or Effort.balanced.value
+    _check_name("effort", effort, Effort, sources.get("effort"))
+    frames = all_frames(source, follow, values["sensor"])
+    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior)
+
+    from geomtact.inference.motion import UniformBall
+    from geomtact.inference.sequence import track as followed
+
+    options: dict[str, Any] = {"kind": kind, "background": values["background"], "prior": prior, "effort": effort}
+    options |= {"motion": UniformBall(1e-3 * motion_mm), "most": most, "on_error": "skip" if skip_broken else "raise"}
+    times: deque[float | None] = deque()
+    told = followed(localizer, _images(frames, times), seed=seed, **options)
+    return localizer, ((times.popleft(), posterior) for posterior in told)
 
 
 def _metadata(source: str) -> dict[str, Any]:

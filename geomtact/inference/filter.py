@@ -25,10 +25,10 @@ from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.moments import moments, without_specks
 
-# chosen on trajectories, most of them of the pin, that ``evaluate track`` does not judge (docs/tracking.md)
-NOW = 0.8  # power of a frame's likelihood in its own posterior
-MEMORY = 0.4  # power that the likelihoods of all frames before have together
-NEWEST = 0.3  # share of it that the newest of them has, at most
+# chosen on trajectories that ``evaluate track`` does not judge (docs/tracking.md)
+NOW = 0.85  # power of a frame's likelihood in its own posterior
+MEMORY = 0.6  # power that the likelihoods of all frames before have together
+NEWEST = 0.15  # share of it that the newest of them has, at most
 FRESH = 0.01
 _ANEW = 0.5  # share of the uniform distribution after a slip, or after contact was lost
 _SLIP = -2.0  # nats by which what was known may make a frame less likely than chance does

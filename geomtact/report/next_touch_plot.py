@@ -80,7 +80,7 @@ def _region(
     outline = apply(poses, posterior.mesh.surface_points(128)).reshape(-1, 3)
     # of all sensors that touched, each taken to have the first one's window
     placed = np.asarray(posterior.settings.get("T_world_sensor", [posterior.T_frame_sensor]))
-    windows = apply(placed, _corners(posterior.sensor))
+    windows = apply(placed, posterior.sensor.corners)
     corners = np.concatenate([outline, *windows, ends]) @ R.T
     low, high = corners.min(0)[:2], corners.max(0)[:2]
     middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
@@ -98,9 +98,7 @@ def _region(
         label = f"{kind} {action.number}, where it stops"
         if isinstance(action.of, Touch):
             there = transform(action.T_world_sensor[:3, :3], _path(posterior, action, poses)[1])
-            axes.fill(
-                *_seen(apply(there, _corners(posterior.sensor)), R), color=colour, alpha=0.45, lw=1.5, label=label
-            )
+            axes.fill(*_seen(apply(there, posterior.sensor.corners), R), color=colour, alpha=0.45, lw=1.5, label=label)
         arrow = {"arrowstyle": "-|>", "color": colour, "lw": 1.6, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", end, start, arrowprops=arrow)
         axes.text(
@@ -169,12 +167,6 @@ def _shown(grid: NDArray, posterior: Posterior, touch: Touch, poses: Array) -> N
         went = 1e3 * float((there[:3, 3] - touch.T_world_sensor[:3, 3]) @ touch.T_world_sensor[:3, 2])
         axes.set(title=f"stops after {went:.1f} mm" if mask.any() else "no contact", xlabel="x [mm]")
     grid[0].set_ylabel("y [mm], downwards")
-
-
-def _corners(sensor: Sensor) -> Array:
-    """Corners (4, 3) of the window, sensor frame [m]."""
-    x, y = sensor.half_window
-    return np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
 
 
 def _seen(points: Array, R: Array) -> Array:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from geomtact.geometry.mesh import coarser
 from geomtact.report.shown import Shown
 from geomtact.se3 import Array, apply, inverse
+from geomtact.sensing.sensor import Sensor
 
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Mode, Posterior
@@ -33,9 +34,8 @@ def turnable(posterior: Posterior, modes: Sequence[Mode], shown: Sequence[Shown]
     windows, outlines = [], []
     for one in shown:
         T_first = _mm(T_sensor_frame @ one.T_frame_sensor)
-        x, y = 1e3 * one.sensor.half_window
-        windows.append(apply(T_first, [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]))
-        outlines += [apply(T_first, line) for line in _outlines(one)]
+        windows.append(apply(T_first, 1e3 * one.sensor.corners))
+        outlines += [apply(T_first, 1e3 * line) for line in outlines_of(one.observation.contact.mask, one.sensor)]
     # a sensor that felt nothing may stand far away
     near = [window for window, one in zip(windows, shown, strict=True) if one.observation.contact.mask.any()]
     seen = np.concatenate([*near, apply(T[0], vertices)])
@@ -77,11 +77,10 @@ def touched(posterior: Posterior, seed: int = 0) -> tuple[Array, Array]:
     return 1e3 * points, weight / max(weight.max(), 1)
 
 
-def _outlines(one: Shown) -> list[Array]:
-    """The borders (n, 3) of the observed contact on the membrane's plane [mm]."""
-    mask = np.asarray(one.observation.contact.mask, np.uint8)
-    x, y = (1e3 * values for values in one.sensor.pixel_centres(mask.shape))  # type: ignore[arg-type]
-    found, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+def outlines_of(mask: ArrayLike, sensor: Sensor) -> list[Array]:
+    """The borders (n, 3) of a contact (H, W), on the plane z = 0 of the sensor frame [m]."""
+    x, y = sensor.pixel_centres(np.shape(mask))  # type: ignore[arg-type]
+    found, _ = cv2.findContours(np.asarray(mask, np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     lines = [line[:, 0] for line in found if len(line) > 2]
     return [np.column_stack([x[line[:, 0]], y[line[:, 1]], np.zeros(len(line))]) for line in lines]
 

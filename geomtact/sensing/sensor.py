@@ -218,6 +218,12 @@ class Sensor:
         """Half width and half height (2,) of the window on the membrane [m]."""
         return 0.5 * np.asarray(self.image_size_px) * np.asarray(self.pixel_pitch)
 
+    @property
+    def corners(self) -> Array:
+        """Corners (4, 3) of the window, one after the other [m]."""
+        x, y = self.half_window
+        return np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
+
     def pixel_area(self, shape: tuple[int, ...]) -> float:
         """Area [m^2] of a pixel of a grid (h, w) over the window."""
         return float(4 * self.half_window.prod() / np.prod(shape))

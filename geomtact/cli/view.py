@@ -1,0 +1,80 @@
+"""``geomtact view``: a part followed through a sequence of images, shown live in the browser."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated
+
+import typer
+
+from geomtact.cli.library import CacheDir
+from geomtact.cli.localize import Kind
+from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit
+from geomtact.cli.shell import NO_CONTACT, tell
+from geomtact.cli.track import (
+    MOTION_MM,
+    UNTOUCHED,
+    Background,
+    EffortName,
+    Follow,
+    KindName,
+    MotionMm,
+    ObjectName,
+    Seed,
+    SkipBroken,
+    Source,
+    given_of,
+    open_track,
+)
+
+
+def view(
+    source: Source,
+    object_name: ObjectName = None,
+    unit: Unit = None,
+    sensor: SensorName = None,
+    kind: KindName = Kind.auto.value,
+    background: Background = None,
+    effort: EffortName = None,
+    scorer: ScorerName = None,
+    motion_mm: MotionMm = MOTION_MM,
+    follow: Follow = False,
+    skip_broken: SkipBroken = False,
+    host: Annotated[
+        str, typer.Option(help="Address to serve the page at; 0.0.0.0 lets other machines look.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port; the next free one, if it is taken.")] = 8080,
+    stay: Annotated[bool, typer.Option(help="Go on serving the page after the last image, until Ctrl-C.")] = True,
+    seed: Seed = 0,
+    max_poses: MaxPoses = None,
+    cache_dir: CacheDir = None,
+) -> None:
+    """Follow a part as 'geomtact track' does, and show in the browser where it may be, live.
+
+    The page shows the sensor, the contact, the part at its most probable pose and, faintly, at poses drawn from the posterior.
+    It needs viser: pip install 'geomtact[viz]'. Exit status as of 'geomtact track'.
+    """
+    given = given_of(object_name, unit, sensor, background, effort)
+    localizer, posteriors = open_track(
+        source, given, follow, motion_mm, scorer, max_poses, cache_dir, kind=kind, skip_broken=skip_broken, seed=seed
+    )
+
+    from geomtact.report.viewer import Viewer
+
+    viewer, touched = Viewer(localizer.mesh, host, port), False
+    typer.echo(viewer.url)
+    try:
+        for n, (_, posterior) in enumerate(posteriors, 1):
+            viewer.show(n, posterior)
+            touched |= posterior.contact
+        if stay:
+            tell("all images shown; the page is served until Ctrl-C")
+        while stay:
+            time.sleep(1)
+    except KeyboardInterrupt:
+        tell("stopped")
+    finally:
+        viewer.stop()
+    if not touched:
+        tell(UNTOUCHED)
+        raise typer.Exit(NO_CONTACT)

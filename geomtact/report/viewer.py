@@ -1,0 +1,110 @@
+"""A live view in the browser: the sensor, what it feels, and where the part may be (extra ``viz``)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from geomtact.errors import UsageError
+from geomtact.geometry.mesh import Mesh, coarser
+from geomtact.report.canvas import COLOURS
+from geomtact.report.turnable import outlines_of
+from geomtact.se3 import Array, apply
+
+if TYPE_CHECKING:
+    from geomtact.inference.posterior import Posterior
+
+_FACES = 3_000  # of the part, that are drawn so often
+_POSES = 60  # of the posterior, that are drawn through one another
+_FAINT = 0.06  # opacity of each
+_CM = 100.0  # a unit of the scene is a centimetre
+_LINES = 1.5  # pixels
+_WINDOW, _CONTACT = (110, 110, 110), (20, 20, 20)
+
+
+class Viewer:
+    """A page that shows the last posterior it was given: the part at poses drawn from it, and at its first mode.
+
+    Parameters
+    ----------
+    mesh : of the part
+    host, port : where the page is served; the next free port, if this one is taken
+
+    Raises
+    ------
+    UsageError
+        Viser is not installed.
+    """
+
+    def __init__(self, mesh: Mesh, host: str = "127.0.0.1", port: int = 8080) -> None:
+        try:
+            import viser
+        except ImportError:
+            raise UsageError("the viewer needs viser; install it with: pip install 'geomtact[viz]'") from None
+        self._server = viser.ViserServer(host=host, port=port, label=f"geomtact: {mesh.name}", verbose=False)
+        self.url = f"http://{host}:{self._server.get_port()}"
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._told = self._server.gui.add_markdown("")
+        self._image = self._server.gui.add_image(np.zeros((1, 1, 3), np.uint8), label="image")
+        mesh = coarser(mesh, _FACES)
+        shape = _CM * mesh.vertices, np.asarray(mesh.faces)
+        colours = [np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) for colour in COLOURS[:2]]
+        scene = self._server.scene
+        at = np.tile([1.0, 0, 0, 0], (_POSES, 1)), np.zeros((_POSES, 3))
+        self._drawn = scene.add_batched_meshes_simple("/drawn", *shape, *at, batched_colors=colours[0], opacity=_FAINT)
+        self._mode = scene.add_mesh_simple("/mode", *shape, color=colours[1], opacity=0.8)
+        self._eye = mesh.diameter * np.array([0.4, -1.4, 0.8])  # in the sensor frame, for browsers that come
+        self._rng = np.random.default_rng(0)
+
+    def show(self, number: int, posterior: Posterior) -> None:
+        """Show frame ``number``'s posterior."""
+        contact, sensor, T = posterior.contact, posterior.sensor, posterior.T_frame_sensor
+        scene, camera = self._server.scene, self._server.initial_camera
+        camera.position, camera.look_at = _CM * apply(T, self._eye)[0], _CM * T[:3, 3]
+        scene.add_line_segments(
+            "/sensor", _around(_CM * apply(T, sensor.corners)), _WINDOW, thickness=_LINES, thickness_units="screen"
+        )
+        lines = [np.zeros((0, 2, 3))]
+        if posterior.observations:
+            seen = posterior.observation
+            lines += [_around(_CM * apply(T, line)) for line in outlines_of(seen.contact.mask, sensor)]
+            self._image.image = _picture(seen.image)
+        scene.add_line_segments(
+            "/contact", np.concatenate(lines), _CONTACT, thickness=2 * _LINES, thickness_units="screen"
+        )
+        modes = posterior.modes(1) if contact else []
+        self._drawn.visible = self._mode.visible = bool(modes)
+        told = "no contact"
+        if modes:
+            some, first = posterior.sample(_POSES, self._rng), modes[0]
+            self._drawn.batched_wxyzs = _wxyz(some)
+            self._drawn.batched_positions = np.float32(_CM) * some[:, :3, 3].astype(np.float32)
+            self._mode.wxyz, self._mode.position = _wxyz(first.T), _CM * first.T[:3, 3]
+            told = f"first mode {100 * first.probability:.2g} %, entropy {posterior.entropy_nats:.1f} nats"
+        self._told.content = "\n\n".join([f"**{posterior.mesh.name}, frame {number}**", told, *posterior.warnings])
+
+    def stop(self) -> None:
+        """Serve the page no longer."""
+        self._server.stop()
+
+
+def _wxyz(T: Array) -> NDArray[np.float32]:
+    """Unit quaternions (..., 4), w first, of ``T`` (..., 4, 4)."""
+    return np.asarray(Rotation.from_matrix(T[..., :3, :3]).as_quat(scalar_first=True), np.float32)
+
+
+def _around(line: Array) -> Array:
+    """The segments (n, 2, 3) of the closed ``line`` (n, 3)."""
+    return np.stack([line, np.roll(line, -1, 0)], 1)
+
+
+def _picture(image: ArrayLike) -> NDArray[np.uint8]:
+    """An image as it was given, (H, W) or (H, W, 3), for the page."""
+    values = np.asarray(image)
+    if values.dtype != np.uint8:  # a mask, or depths
+        values = values.astype(float)
+        values = np.asarray(255 * (values - values.min()) / max(float(np.ptp(values)), 1e-12), np.uint8)
+    return values if values.ndim == 3 else np.repeat(values[..., None], 3, 2)
