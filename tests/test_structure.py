@@ -23,7 +23,7 @@ STAGES = [
     ["planning"],
     ["inference"],
     ["training"],
-    ["evaluation", "report"],
+    ["batch", "evaluation", "report"],
     ["cli"],
 ]
 HEIGHT = {name: k for k, names in enumerate(STAGES) for name in names}

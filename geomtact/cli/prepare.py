@@ -9,6 +9,7 @@ import typer
 
 from geomtact.cli.library import CacheDir
 from geomtact.cli.shell import progress_bar, tell
+from geomtact.errors import InputError
 
 if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
@@ -26,24 +27,90 @@ SensorName = Annotated[str | None, typer.Option("--sensor", help="Name (see 'geo
 
 
 def prepare(
-    object_name: Annotated[
-        str | None, typer.Argument(metavar="OBJECT", help="Part (see 'geomtact objects') or mesh file.")
+    objects: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="OBJECT...", help="Part (see 'geomtact objects') or mesh file; or several."),
     ] = None,
     unit: Unit = None,
     sensor: SensorName = None,
     scorer: ScorerName = None,
     max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(min=1, help="Parts prepared at a time; one for each core by default.", show_default=False),
+    ] = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Prepare on the machines of a Ray cluster; auto for this machine's."),
+    ] = None,
 ) -> None:
-    """Build the index of a part on a sensor and cache it, so that 'localize' starts at once."""
+    """Build the index of a part on a sensor and cache it, so that 'localize' starts at once. Of several parts, those that are
+    ready are passed over, and those that cannot be used are named at the end.
+    """
     import time
 
     from geomtact.cli.project import resolve
 
-    values, sources = resolve({"object": object_name, "unit": unit, "sensor": sensor})
+    several = objects is not None and (len(objects) > 1 or ray is not None or jobs is not None)
+    values, sources = resolve({"object": objects[0] if objects else None, "unit": unit, "sensor": sensor})
     began = time.perf_counter()
-    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, given="OBJECT")
-    typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
+    if several:
+        _prepare_all(objects or [], values, sources, scorer, max_poses, cache_dir, jobs, ray)
+    else:
+        localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, given="OBJECT")
+        typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
+
+
+def _prepare_all(
+    objects: list[str],
+    values: dict,
+    sources: dict,
+    scorer: str | None,
+    max_poses: int | None,
+    cache_dir: Path | None,
+    jobs: int | None,
+    ray: str | None,
+) -> None:
+    """Prepare several parts at a time.
+
+    Raises
+    ------
+    InputError
+        Some of them cannot be used; the others are ready.
+    """
+    import os
+
+    from geomtact.batch import prepare_part, run_all
+    from geomtact.cli.project import require
+    from geomtact.contact_space.resolution import MAX_POSES
+    from geomtact.geometry.catalogue import catalogue
+    from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
+    from geomtact.sensing.sensor import Sensor, bundled_sensors
+
+    sensor = require(values, "sensor", bundled_sensors(), "a TOML file")
+    for key, source in sources.items():
+        tell(f"{key}: {values[key]} (from {source})")
+    scorer = scorer or DEFAULT_SCORER
+    check_name(scorer)
+    name = Sensor.load(sensor).name
+    folder = None if cache_dir is None else cache_dir.absolute()
+    how = (sensor, scorer, max_poses or MAX_POSES, folder)
+    bundled = catalogue()  # which have units of their own
+    tasks = [
+        (each, None, *how) if each in bundled else (os.path.abspath(each), values["unit"], *how) for each in objects
+    ]
+    jobs = min(jobs or os.cpu_count() or 1, len(tasks))
+    wrong = []
+    for count, (number, error) in enumerate(run_all(prepare_part, tasks, jobs, ray), 1):
+        told = "ready" if error is None else f"not prepared: {' '.join(str(error).split())}"
+        typer.echo(f"[{count} of {len(tasks)}] {objects[number]} on {name}: {told}")
+        if error is not None:
+            wrong.append(objects[number])
+    if wrong:
+        raise InputError(
+            f"{len(wrong)} of {len(tasks)} parts are not prepared, for the reasons above: {', '.join(wrong)}"
+        )
 
 
 def open_localizer(

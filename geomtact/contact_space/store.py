@@ -11,7 +11,6 @@ import json
 import os
 import shutil
 import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -96,7 +95,8 @@ def open_index(
                 arrays = build(mesh, sensor, approach, resolution, progress)
                 index = Index(mesh, sensor, approach, resolution, key, **arrays)
                 _write(folder, index)
-                bound_cache(DEFAULT_LIMIT, folder, keep=key)
+                if cache_dir is None:
+                    bound_cache(DEFAULT_LIMIT, folder, keep=key)
     except OSError as error:
         raise CacheError(
             f"cache folder {folder}: cannot be written ({error.strerror or error}); "
@@ -177,7 +177,6 @@ def _write(folder: Path, index: Index) -> None:
             "axis": None if symmetry.axis is None else symmetry.axis.tolist(),
             "centre": symmetry.centre.tolist(),
         },
-        "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
     }
     building = Path(tempfile.mkdtemp(prefix=f"building-{index.key}-", dir=folder))
     try:

@@ -1,0 +1,143 @@
+"""Many independent tasks over the cores of one machine, or over a cluster by Ray (extra ``cluster``).
+
+A task is a call that makes files from files and finds those that are there already. So it may be done twice, and a process that
+is killed loses its own task alone, which is then done anew.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+from geomtact.errors import GeomtactError, UsageError
+
+Task = TypeVar("Task")
+_TRIES = 3  # of a task whose process dies
+_AHEAD = 4  # tasks handed to a cluster for each of its cores
+_ANSWERS = 5.0  # s within which a cluster does
+_DIED = "its process died, three times; there may be too little memory for it: give fewer --jobs"
+
+
+def prepare_part(
+    mesh: str, unit: str | None, sensor: str, scorer: str, max_poses: int, cache_dir: str | Path | None
+) -> None:
+    """Prepare a part as ``Localizer.prepare`` does, by one core, and leave it in the cache."""
+    import torch
+
+    from geomtact.inference.localizer import Localizer
+
+    torch.set_num_threads(1)
+    Localizer.prepare(mesh, unit, sensor, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir)
+
+
+def run_all(
+    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int = 1, ray: str | None = None
+) -> Iterator[tuple[int, GeomtactError | None]]:
+    """Call ``work(*task)`` for each task: yields its number as soon as it is done, and what was wrong with it, if anything was.
+
+    Parameters
+    ----------
+    work : a function of a module, whose results are files
+    jobs : processes on this machine
+    ray : address of a Ray cluster, "auto" for the one that this machine belongs to; its machines need the same geomtact, and
+        the files at the same paths
+
+    Raises
+    ------
+    UsageError
+        Ray is not installed, or there is no cluster at the address.
+    """
+    if ray is not None:
+        yield from _by_ray(work, tasks, ray)
+    elif jobs == 1:
+        for number, task in enumerate(tasks):
+            yield number, _done(work, task)
+    else:
+        yield from _by_processes(work, tasks, jobs)
+
+
+def _done(work: Callable[..., Any], task: tuple[Any, ...]) -> GeomtactError | None:
+    """Do a task; what was wrong with it."""
+    try:
+        work(*task)
+    except GeomtactError as error:
+        return error
+    return None
+
+
+def _by_processes(
+    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int
+) -> Iterator[tuple[int, GeomtactError | None]]:
+    waiting, tries = list(range(len(tasks)))[::-1], [0] * len(tasks)
+    while waiting:
+        # a pool that has lost a process does nothing more: the tasks that it was at begin anew in another
+        with _one_thread_each(), ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+            running: dict[Future, int] = {}
+            whole = True
+            while running or (waiting and whole):
+                while waiting and whole and len(running) < jobs:
+                    number = waiting.pop()
+                    tries[number] += 1
+                    running[pool.submit(_done, work, tasks[number])] = number
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    number = running.pop(future)
+                    try:
+                        yield number, future.result()
+                    except BrokenProcessPool:
+                        whole = False
+                        if tries[number] < _TRIES:
+                            waiting.append(number)
+                        else:
+                            yield number, GeomtactError(_DIED)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes that begin here have one thread each for linear algebra."""
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = before
+
+
+def _by_ray(
+    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], address: str
+) -> Iterator[tuple[int, GeomtactError | None]]:
+    try:
+        import ray
+    except ImportError:
+        raise UsageError("--ray needs Ray; install it with: pip install 'geomtact[cluster]'") from None
+    try:
+        if ":" in address.removeprefix("ray://"):  # Ray itself would try for minutes
+            host, port = address.removeprefix("ray://").rsplit(":", 1)
+            socket.create_connection((host, int(port)), timeout=_ANSWERS).close()
+        ray.init(address=address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise UsageError(
+            f"--ray: no cluster at {address!r} ({str(error).splitlines()[0]}); start one with 'ray start --head', or give auto"
+        ) from None
+    remote = ray.remote(num_cpus=1, max_retries=_TRIES - 1)(_done)
+    waiting, running = list(range(len(tasks)))[::-1], dict[Any, int]()
+    while waiting or running:
+        while waiting and len(running) < _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1))):
+            number = waiting.pop()
+            running[remote.remote(work, tasks[number])] = number
+        (future, *_), _ = ray.wait(list(running), num_returns=1)
+        number = running.pop(future)
+        try:
+            yield number, ray.get(future)
+        except (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError):
+            yield number, GeomtactError(_DIED)

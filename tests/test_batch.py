@@ -1,0 +1,129 @@
+"""Laws of many tasks: the files are the same however they are made, and a process that is killed loses its own task alone."""
+
+import hashlib
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from geomtact.batch import prepare_part, run_all
+from geomtact.cli import app
+from geomtact.errors import InputError, UsageError
+
+PARTS = ("ball", "hex_nut")
+
+
+def written(folder: Path) -> dict:
+    """The hash of every file of a cache."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def tasks(folder: Path) -> list:
+    return [(name, None, "gelsight-mini", "moments", 1000, folder) for name in PARTS]
+
+
+def note(folder: Path, name: str, once: str) -> None:
+    """Writes a file; refuses "bad", and kills its own process where it is the first to do ``once``, or always."""
+    if name == "bad":
+        raise InputError("bad: no such part")
+    first = folder / "killed"
+    if name == once and not first.exists():
+        first.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if name == "deadly":
+        os.kill(os.getpid(), signal.SIGKILL)
+    (folder / name).write_text(name)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """What one process after the other writes."""
+    folder = tmp_path_factory.mktemp("alone")
+    assert [number for number, error in run_all(prepare_part, tasks(folder)) if error is None] == [0, 1]
+    return written(folder)
+
+
+def test_two_processes_write_the_same_bytes_as_one(alone, tmp_path):
+    assert sorted(run_all(prepare_part, tasks(tmp_path), 2)) == [(0, None), (1, None)]
+    assert written(tmp_path) == alone and len(alone) > 3 * len(PARTS)
+
+
+def test_what_is_there_is_not_made_again(tmp_path):
+    (only,) = tasks(tmp_path)[:1]
+    list(run_all(prepare_part, [only]))
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")}
+    list(run_all(prepare_part, [only]))
+    assert before and before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")}
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_task_that_cannot_be_done_is_named_and_the_others_are_done(tmp_path, jobs):
+    told = dict(run_all(note, [(tmp_path, name, "") for name in ("a", "bad", "b")], jobs))
+    assert told[0] is None and told[2] is None
+    assert str(told[1]) == "bad: no such part"
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
+
+
+def test_a_killed_process_loses_its_own_task_which_is_done_anew(tmp_path):
+    names = [f"task {i}" for i in range(6)]
+    told = dict(run_all(note, [(tmp_path, name, "task 2") for name in names], 2))
+    assert told == dict.fromkeys(range(6))
+    assert {path.name for path in tmp_path.iterdir()} == {*names, "killed"}
+
+
+def test_a_task_that_kills_every_process_is_given_up(tmp_path):
+    told = dict(run_all(note, [(tmp_path, name, "") for name in ("deadly", "a", "b")], 1 + 1))
+    assert "died, three times" in str(told[0])
+    assert (tmp_path / "b").exists()
+
+
+def test_two_nodes_of_which_one_is_killed_write_the_same_bytes_as_one_process(alone, tmp_path):
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    try:
+        other = cluster.add_node(num_cpus=1)
+        cluster.wait_for_nodes()
+        kill = threading.Timer(3.0, cluster.remove_node, [other])  # while each node is at a part
+        kill.start()
+        assert dict(run_all(prepare_part, tasks(tmp_path), ray=cluster.address)) == {0: None, 1: None}
+        kill.join()
+        assert sum(node["Alive"] for node in ray.nodes()) == 1
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    assert written(tmp_path) == alone
+
+
+def test_an_address_without_a_cluster_is_said():
+    pytest.importorskip("ray")
+    with pytest.raises(UsageError, match="ray start --head"):
+        list(run_all(note, [("", "a", "")], ray="127.0.0.1:1"))
+
+
+def test_the_command_prepares_several_parts_and_names_those_that_it_cannot(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken.stl").write_text("no mesh")
+    words = [
+        "prepare",
+        "ball",
+        "broken.stl",
+        "hex_nut",
+        "--sensor",
+        "gelsight-mini",
+        "--scorer",
+        "moments",
+        "--max-poses",
+        "3000",
+    ]
+    done = CliRunner().invoke(app, [*words, "--unit", "mm", "--jobs", "1", "--cache-dir", "cache"])
+    assert done.exit_code == 3, done.output
+    assert "[1 of 3] ball on gelsight-mini: ready" in done.output
+    assert "broken.stl on gelsight-mini: not prepared" in done.output
+    assert "[3 of 3] hex_nut on gelsight-mini: ready" in done.output
+    assert "1 of 3 parts are not prepared" in done.output
