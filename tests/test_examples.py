@@ -1,0 +1,43 @@
+"""The examples run as they stand, in an empty folder, and come to what their pages say of them."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+
+
+@pytest.fixture
+def example(tmp_path, cache_dir):
+    def run(name, *words):
+        environment = {**os.environ, "GEOMTACT_CACHE": str(cache_dir)}
+        command = [sys.executable, str(EXAMPLES / name), *words]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def test_touch_until_sure(example):
+    last = [line for line in example("touch_until_sure.py").splitlines() if "mm off the truth" in line][-1]
+    held, off = float(last.split("holds ")[1].split(" %")[0]), float(last.split("it is ")[1].split(" mm")[0])
+    assert held >= 90 and off < 5
+
+
+def test_the_pencils_ends_tell_most(example, tmp_path):
+    """A touch of its middle tells nothing of which way round it lies; one of its ends does."""
+    said = example("pencil.py").splitlines()
+    ranked = [line[:24].strip() for line in said if "discards" in line]
+    assert len(ranked) == 7 and "end" in ranked[0] and ranked[0] != "finger in the middle"
+    assert (tmp_path / "out" / "pencil" / "next_touch.png").stat().st_size > 10_000
+
+
+def test_a_gripper_that_reads_its_width(example):
+    said = example("gripper.py", "--part", "connector_plug", "--max-poses", "20000")
+    assert float(re.search(r"the truth: (\S+) nats", said)[1]) > 0
+    assert re.search(r"the jaw is \d+\.\d mm open", said)
