@@ -76,27 +76,40 @@ def _done(work: Callable[..., Any], task: tuple[Any, ...]) -> GeomtactError | No
 def _by_processes(
     work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int
 ) -> Iterator[tuple[int, GeomtactError | None]]:
-    waiting, tries = list(range(len(tasks)))[::-1], [0] * len(tasks)
+    waiting, lost = list(range(len(tasks)))[::-1], list[int]()
     while waiting:
-        # a pool that has lost a process does nothing more: the tasks that it was at begin anew in another
-        with _one_thread_each(), ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-            running: dict[Future, int] = {}
-            whole = True
-            while running or (waiting and whole):
-                while waiting and whole and len(running) < jobs:
-                    number = waiting.pop()
-                    tries[number] += 1
-                    running[pool.submit(_done, work, tasks[number])] = number
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    number = running.pop(future)
-                    try:
-                        yield number, future.result()
-                    except BrokenProcessPool:
-                        whole = False
-                        if tries[number] < _TRIES:
-                            waiting.append(number)
-                        else:
-                            yield number, GeomtactError(_DIED)
+        yield from _in_a_pool(work, tasks, waiting, jobs, lost)
+    for number in lost:  # each alone, so that none dies by another's fault
+        for _ in range(_TRIES - 1):
+            lost_again: list[int] = []
+            yield from _in_a_pool(work, tasks, [number], 1, lost_again)
+            if not lost_again:
+                break
+        else:
+            yield number, GeomtactError(_DIED)
+
+
+def _in_a_pool(
+    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], waiting: list[int], jobs: int, lost: list[int]
+) -> Iterator[tuple[int, GeomtactError | None]]:
+    """Do the tasks ``waiting``, from the last, until one's process dies: it and those under way then are added to ``lost``."""
+    with _one_thread_each(), ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        running: dict[Future, int] = {}
+        whole = True
+        while running or (waiting and whole):
+            while waiting and whole and len(running) < jobs:
+                try:
+                    running[pool.submit(_done, work, tasks[waiting[-1]])] = waiting[-1]
+                    waiting.pop()
+                except BrokenProcessPool:
+                    whole = False
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                number = running.pop(future)
+                try:
+                    yield number, future.result()
+                except BrokenProcessPool:
+                    whole = False
+                    lost.append(number)
 
 
 @contextmanager

@@ -54,6 +54,16 @@ def make_localizer(cache_dir):
     return make
 
 
+@pytest.fixture(scope="module")
+def few_touches():
+    """Scores are fitted on few touches in what a module prepares."""
+    from geomtact.scoring import fitted
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitted, "TOUCHES", 120)
+        yield
+
+
 @pytest.fixture(scope="session")
 def curved_sensor():
     from geomtact import Sensor

@@ -1,6 +1,7 @@
 """Laws of many tasks: the files are the same however they are made, and a process that is killed loses its own task alone."""
 
 import hashlib
+import json
 import os
 import signal
 import threading
@@ -75,10 +76,37 @@ def test_a_killed_process_loses_its_own_task_which_is_done_anew(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {*names, "killed"}
 
 
-def test_a_task_that_kills_every_process_is_given_up(tmp_path):
-    told = dict(run_all(note, [(tmp_path, name, "") for name in ("deadly", "a", "b")], 1 + 1))
-    assert "died, three times" in str(told[0])
-    assert (tmp_path / "b").exists()
+def test_a_task_that_kills_every_process_is_given_up_alone(tmp_path):
+    told = dict(run_all(note, [(tmp_path, name, "") for name in ("deadly", "a", "b")], 2))
+    assert "died, three times" in str(told.pop(0))
+    assert told == {1: None, 2: None}
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
+
+
+def test_a_study_of_parts_apart_finds_what_it_finds_of_one_after_the_other(few_touches, tmp_path, cache_dir):
+    """Also where some are judged already."""
+
+    def judge(out: Path, parts: tuple, *words: str) -> dict:
+        options = ["--touches", "1", "--sweep", "noise", "--max-poses", "3000", "--cache-dir", str(cache_dir)]
+        done = CliRunner().invoke(app, ["evaluate", "stability", *parts, *options, "--out", str(out), *words])
+        assert done.exit_code == 0, done.output
+        return json.loads(out.read_text())
+
+    apart, one_after_the_other = tmp_path / "apart.json", tmp_path / "one.json"
+    expected = judge(one_after_the_other, PARTS)
+    judge(apart, PARTS[:1])
+    assert judge(apart, PARTS, "--jobs", "2") == expected
+    assert {path.name for path in tmp_path.iterdir()} == {"apart.json", "one.json"}
+
+
+def test_a_study_apart_keeps_what_it_could_judge_and_names_the_rest(few_touches, tmp_path, cache_dir):
+    out = tmp_path / "study.json"
+    words = ["evaluate", "stability", PARTS[0], "pim", "--touches", "1", "--sweep", "noise", "--max-poses", "3000"]
+    done = CliRunner().invoke(app, [*words, "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)])
+    assert done.exit_code == 3 and "1 of 2 parts are not judged" in done.output and "pim: not judged" in done.output
+    assert list(json.loads(out.read_text())["parts"]) == [PARTS[0]]
+    without = CliRunner().invoke(app, [*words, "--jobs", "2"])
+    assert without.exit_code == 2 and "--out" in without.output
 
 
 def test_two_nodes_of_which_one_is_killed_write_the_same_bytes_as_one_process(alone, tmp_path):
@@ -106,7 +134,7 @@ def test_an_address_without_a_cluster_is_said():
         list(run_all(note, [("", "a", "")], ray="127.0.0.1:1"))
 
 
-def test_the_command_prepares_several_parts_and_names_those_that_it_cannot(tmp_path, monkeypatch):
+def test_the_command_prepares_several_parts_and_names_those_that_it_cannot(few_touches, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "broken.stl").write_text("no mesh")
     words = [
@@ -123,7 +151,22 @@ def test_the_command_prepares_several_parts_and_names_those_that_it_cannot(tmp_p
     ]
     done = CliRunner().invoke(app, [*words, "--unit", "mm", "--jobs", "1", "--cache-dir", "cache"])
     assert done.exit_code == 3, done.output
-    assert "[1 of 3] ball on gelsight-mini: ready" in done.output
+    assert "[1 of 3] ball on gelsight-mini: prepared" in done.output
     assert "broken.stl on gelsight-mini: not prepared" in done.output
-    assert "[3 of 3] hex_nut on gelsight-mini: ready" in done.output
+    assert "[3 of 3] hex_nut on gelsight-mini: prepared" in done.output
     assert "1 of 3 parts are not prepared" in done.output
+
+
+def test_several_parts_are_trained_for_each_into_a_folder(tmp_path):
+    words = ["train", "--object", "ball,hex_nut", "--architecture", "resnet50", "--pairs", "32", "--side", "32"]
+    done = CliRunner().invoke(app, [*words, "--jobs", "1", "--out", str(tmp_path / "weights")])
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in (tmp_path / "weights").glob("*.safetensors")} == {
+        f"{name}.safetensors" for name in PARTS
+    }
+    for wrong, said in (
+        ([*words, "--out", "one.safetensors"], "--out one.safetensors: expected a folder for the weights of 2 parts"),
+        ([*words[:1], "--object", "ball", *words[3:], "--jobs", "2"], "--jobs and --ray train for several parts"),
+    ):
+        refused = CliRunner().invoke(app, wrong)
+        assert refused.exit_code == 2 and said in refused.output, refused.output

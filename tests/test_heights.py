@@ -168,7 +168,7 @@ def test_simulated_readings_are_localized_as_they_come(tmp_path):
     assert read_observation(image, "gelsight-mini", background=background).contact.mask.any()
 
 
-def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp_path):
+def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp_path, cache_dir):
     """Every sixth press that lies wholly in the window; the calibration saw presses of the other ball alone."""
     folder = data_folder / "gelslam_gsmini_balls"
     sensors = calibrations(data_folder)
@@ -181,7 +181,7 @@ def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp
     inside = [row["file"] for row in circles_of(CIRCLES) if row["inside"] == "1"][::6]
     some = tmp_path / "some.csv"
     some.write_text("\n".join(line for line in lines if line.startswith("file") or line.split(",")[0] in inside))
-    pressed = list(localize_balls(data_folder, some, sensors, tmp_path))
+    pressed = list(localize_balls(data_folder, some, sensors, cache_dir))
     assert len(pressed) == 5
     assert np.mean([p.nats > 0 for p in pressed]) >= 0.8
     assert np.median([p.off_mm for p in pressed]) < 0.3

@@ -1,16 +1,16 @@
 """Which part is it: probabilities of parts by their evidence."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from typer.testing import CliRunner
 
 from geomtact import InputError, Localizer, Mesh, UsageError
+from geomtact.cli import app
 from geomtact.cli.parts import parts_of
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.identification import Told, identify_scenes, summarise
@@ -21,7 +21,7 @@ from geomtact.sensing.reading import write_image
 
 
 @pytest.fixture(scope="module")
-def drawer(tmp_path_factory):
+def drawer(tmp_path_factory, few_touches):
     """Three parts unlike each other."""
     folder = tmp_path_factory.mktemp("cache")
 
@@ -148,21 +148,22 @@ def test_parts_by_a_folder_and_by_names(tmp_path):
     assert parts_of(str(odd)) == [str(odd)], "a file's name may hold a comma"
 
 
-def test_the_command_line_tells_the_part(drawer, tmp_path):
+def test_the_command_line_tells_the_part(drawer, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "parts").mkdir()
     for localizer in drawer[:2]:
         mesh = localizer.mesh
         trimesh.Trimesh(1e3 * mesh.vertices, mesh.faces).export(tmp_path / "parts" / f"{mesh.name}.stl")
     write_image(tmp_path / "touch.png", touches(drawer[1], seed=2)[0])
-    run = [sys.executable, "-m", "geomtact", "localize", "touch.png", "--object", "parts", "--unit", "mm"]
-    run += ["--sensor", "gelslim", "--max-poses", "1500", "--scorer", "moments", "--effort", "fast", "--cache-dir", "c"]
-    done = subprocess.run([*run, "--out", "out"], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    run = ["localize", "touch.png", "--object", "parts", "--unit", "mm", "--sensor", "gelslim"]
+    run += ["--max-poses", "1500", "--scorer", "moments", "--effort", "fast", "--cache-dir", "c"]
+    done = CliRunner().invoke(app, [*run, "--out", "out"])
+    assert done.exit_code == 0, done.output
     said = json.loads((tmp_path / "out" / "result.json").read_text())
     assert said["object"]["name"] == "ball" and [part["name"] for part in said["parts"]] == ["ball", "rod"]
     assert "log evidence" in done.stdout
-    refused = subprocess.run([*run, "--prior", "out/posterior.npz"], cwd=tmp_path, capture_output=True, text=True)
-    assert refused.returncode == 2 and "several parts go with images alone" in " ".join(refused.stderr.split())
+    refused = CliRunner().invoke(app, [*run, "--prior", "out/posterior.npz"])
+    assert refused.exit_code == 2 and "several parts go with images alone" in " ".join(refused.output.split())
 
 
 def test_the_study_tells_what_identify_does(drawer):

@@ -343,7 +343,7 @@ def test_millimetre_stl_and_metre_glb_give_one_posterior(make_localizer, tmp_pat
     metres.vertices = metres.vertices / 1000
     metres.export(tmp_path / "part.glb")
     sensor = Sensor("small", (64, 48), (0.3 * MM, 0.3 * MM), 0.0, 2 * MM)
-    options = {"max_poses": 4000, "touches": (40, 20)}
+    options = {"max_poses": 4000, "touches": 60}
     a = make_localizer(tmp_path / "part.stl", sensor, unit="mm", **options)
     b = make_localizer(tmp_path / "part.glb", sensor, **options)
     assert a.mesh.symmetry.kind == b.mesh.symmetry.kind == "discrete"

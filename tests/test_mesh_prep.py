@@ -301,7 +301,7 @@ def apart(a, b, mask):
     return 1e3 * PoseDistance(a.mesh).mean(one, other[None])[0]
 
 
-def test_the_same_part_in_any_format_and_unit_is_localized_alike(tmp_path, rng):
+def test_the_same_part_in_any_format_and_unit_is_localized_alike(few_touches, tmp_path, rng):
     part = load_mesh("bracket")
     for file, scale in {"mm.stl": 1e3, "metre.glb": 1.0, "inch.obj": 1 / 25.4e-3}.items():
         trimesh.Trimesh(scale * part.vertices, part.faces, process=False).export(tmp_path / file)
@@ -315,7 +315,7 @@ def test_the_same_part_in_any_format_and_unit_is_localized_alike(tmp_path, rng):
         assert apart(stl, inch, stl.simulate(T).mask) < 0.01
 
 
-def test_a_curved_step_file_is_localized_within_its_tessellation(tmp_path):
+def test_a_curved_step_file_is_localized_within_its_tessellation(few_touches, tmp_path):
     (tmp_path / "round.step").write_text(cylinder_step(8.0, 30.0))
     fine = trimesh.creation.cylinder(8.0, 30.0, sections=1024)
     fine.export(tmp_path / "fine.stl")

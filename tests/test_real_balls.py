@@ -56,12 +56,12 @@ class Press:
 
 
 @pytest.fixture(scope="module")
-def balls(data_folder, tmp_path_factory):
-    cache, out = tmp_path_factory.mktemp("cache"), {}
+def balls(data_folder, cache_dir):
+    out = {}
     for diameter in DIAMETERS:
         ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5 * float(diameter) * MM)
         mesh = Mesh(ball.vertices, ball.faces, f"ball of {diameter} mm", "m")
-        out[diameter] = Localizer.prepare(mesh, sensor="gelsight-mini", cache_dir=cache)
+        out[diameter] = Localizer.prepare(mesh, sensor="gelsight-mini", cache_dir=cache_dir)
     return out
 
 

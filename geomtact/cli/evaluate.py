@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
+from geomtact.cli.apart import by_part
 from geomtact.cli.evaluate_choices import judge_choices
 from geomtact.cli.evaluate_identify import judge_identification
 from geomtact.cli.evaluate_kitting import judge_kitting
@@ -166,17 +167,17 @@ def _print(figures: dict[tuple[str, str], dict[str, Any]]) -> None:
 
 evaluate = typer.Typer(no_args_is_help=True, help="Judge the answers on touches with known poses: one study a command.")
 evaluate.command("samples")(one_line_errors(judge_samples))
-evaluate.command("localize")(one_line_errors(judge_localize))
+evaluate.command("localize")(one_line_errors(by_part(judge_localize)))
 evaluate.command("scores")(one_line_errors(judge_scores))
 evaluate.command("registration")(one_line_errors(judge_registration))
-evaluate.command("thesis")(one_line_errors(judge_thesis_table))
-evaluate.command("touches")(one_line_errors(judge_touches))
+evaluate.command("thesis")(one_line_errors(by_part(judge_thesis_table)))
+evaluate.command("touches")(one_line_errors(by_part(judge_touches)))
 evaluate.command("readings")(one_line_errors(judge_readings))
 evaluate.command("triplets")(one_line_errors(judge_triplets))
 evaluate.command("identify")(one_line_errors(judge_identification))
-evaluate.command("track")(one_line_errors(judge_track))
-evaluate.command("next-touch")(one_line_errors(judge_next_touch))
-evaluate.command("kitting")(one_line_errors(judge_kitting))
-evaluate.command("stability")(one_line_errors(judge_stability))
-evaluate.command("choices")(one_line_errors(judge_choices))
+evaluate.command("track")(one_line_errors(by_part(judge_track)))
+evaluate.command("next-touch")(one_line_errors(by_part(judge_next_touch)))
+evaluate.command("kitting")(one_line_errors(by_part(judge_kitting)))
+evaluate.command("stability")(one_line_errors(by_part(judge_stability)))
+evaluate.command("choices")(one_line_errors(by_part(judge_choices)))
 evaluate.command("plot")(one_line_errors(plot_study))

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from geomtact.cli.apart import Jobs, Ray, do_all
 from geomtact.cli.library import CacheDir
 from geomtact.cli.shell import progress_bar, tell
-from geomtact.errors import InputError
 
 if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
@@ -36,17 +36,11 @@ def prepare(
     scorer: ScorerName = None,
     max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(min=1, help="Parts prepared at a time; one for each core by default.", show_default=False),
-    ] = None,
-    ray: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Prepare on the machines of a Ray cluster; auto for this machine's."),
-    ] = None,
+    jobs: Jobs = None,
+    ray: Ray = None,
 ) -> None:
-    """Build the index of a part on a sensor and cache it, so that 'localize' starts at once. Of several parts, those that are
-    ready are passed over, and those that cannot be used are named at the end.
+    """Build the index of a part on a sensor and cache it, so that 'localize' starts at once. Of several parts one is prepared for
+    each core at a time; those that are ready are passed over, and those that cannot be used are named at the end.
     """
     import time
 
@@ -81,7 +75,7 @@ def _prepare_all(
     """
     import os
 
-    from geomtact.batch import prepare_part, run_all
+    from geomtact.batch import prepare_part
     from geomtact.cli.project import require
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.geometry.catalogue import catalogue
@@ -100,17 +94,7 @@ def _prepare_all(
     tasks = [
         (each, None, *how) if each in bundled else (os.path.abspath(each), values["unit"], *how) for each in objects
     ]
-    jobs = min(jobs or os.cpu_count() or 1, len(tasks))
-    wrong = []
-    for count, (number, error) in enumerate(run_all(prepare_part, tasks, jobs, ray), 1):
-        told = "ready" if error is None else f"not prepared: {' '.join(str(error).split())}"
-        typer.echo(f"[{count} of {len(tasks)}] {objects[number]} on {name}: {told}")
-        if error is not None:
-            wrong.append(objects[number])
-    if wrong:
-        raise InputError(
-            f"{len(wrong)} of {len(tasks)} parts are not prepared, for the reasons above: {', '.join(wrong)}"
-        )
+    do_all(prepare_part, tasks, [f"{each} on {name}" for each in objects], "prepared", jobs, ray)
 
 
 def open_localizer(

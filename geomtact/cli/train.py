@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from geomtact.cli.apart import Jobs, Ray, do_all, quietly
+from geomtact.cli.parts import parts_of
 from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import progress_bar, tell
 from geomtact.errors import InputError, UsageError
@@ -17,11 +20,16 @@ _TUNING_RATE = 3e-4  # a step of fine-tuning must not undo what many parts taugh
 
 
 def train(
-    out: Annotated[Path, typer.Option(help="Weights file to write; the card and curves go beside it.")] = Path(
-        "encoder.safetensors"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Weights file to write, a folder for several; the card and curves go beside it.")
+    ] = Path("encoder.safetensors"),
     object_name: Annotated[
-        str | None, typer.Option("--object", metavar="OBJECT", help="Fine-tune for this part or mesh file.")
+        str | None,
+        typer.Option(
+            "--object",
+            metavar="OBJECT",
+            help="Fine-tune for this part or mesh file; for each of several by a folder, or names with commas.",
+        ),
     ] = None,
     unit: Unit = None,
     sensor: Annotated[str, typer.Option(help="Of the part: name or TOML file.")] = "gelslim",
@@ -43,12 +51,22 @@ def train(
     work: Annotated[
         Path | None, typer.Option(help="Folder for scenes and state; by default one named after --out.")
     ] = None,
+    jobs: Jobs = None,
+    ray: Ray = None,
 ) -> None:
     """Train the encoder that compares contacts. A stopped run goes on where it was.
 
-    Without --object it learns from procedural parts and serves every part. With --object, the shared encoder is
-    fine-tuned on simulated touches of that part. Use the result as Localizer.prepare(..., scorer="FILE.safetensors").
+    Without --object it learns from procedural parts and serves every part. With --object, the shared encoder is fine-tuned on
+    simulated touches of that part, or of each of several, one for each core at a time. Use the result as
+    Localizer.prepare(..., scorer="FILE.safetensors").
     """
+    options = dict(locals())
+    parts = parts_of(object_name)
+    if len(parts) > 1:
+        _train_each([str(part) for part in parts], options)
+        return
+    if jobs is not None or ray is not None:
+        raise UsageError("--jobs and --ray train for several parts: give them with --object, with commas between them")
     if out.suffix != ".safetensors":
         raise UsageError(f"--out {out}: expected a name that ends in .safetensors")
     from geomtact.scoring.encoder import ARCHITECTURE, THESIS, WEIGHTS
@@ -108,6 +126,28 @@ def train(
     write_encoder(out, network, curve, settings, made, data)
     tell(f"{curve.validation[-1]:.2f} nats on scenes that it never saw")
     typer.echo(f"written: {out}, {out.with_suffix('.json').name} and {out.with_suffix('.png').name}")
+
+
+def _train_each(parts: list[str], options: dict[str, Any]) -> None:
+    """For each of several parts, weights of its own in the folder ``out``."""
+    from geomtact.cli.shell import check_folder
+    from geomtact.geometry.catalogue import catalogue
+
+    jobs, ray = options.pop("jobs"), options.pop("ray")
+    folder: Path = options["out"]
+    if folder.suffix:
+        raise UsageError(f"--out {folder}: expected a folder for the weights of {len(parts)} parts")
+    if options["work"] is not None:
+        raise UsageError("--work: with several parts each has its own, beside its weights; leave it out")
+    check_folder(folder)
+    folder = folder.absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    bundled = catalogue()  # which have units of their own
+    tasks = []
+    for part in parts:
+        own = {"object_name": part, "unit": None} if part in bundled else {"object_name": os.path.abspath(part)}
+        tasks.append((train, options | own | {"out": folder / f"{Path(part).stem}.safetensors"}))
+    do_all(quietly, tasks, parts, "trained", jobs, ray)
 
 
 def _sha256(path: Path | None) -> str | None:

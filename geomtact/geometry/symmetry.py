@@ -94,10 +94,10 @@ def find_symmetry(vertices: ArrayLike, faces: ArrayLike, tolerance: float = 5e-5
     turns = [_turns(axis, np.array([2 * np.pi / n]))[0] for axis in axes for n in range(MAX_ORDER, 1, -1)]
     group = np.eye(3)[None]
     for R in turns + rotations:  # the axes of inertia first: they are the more exact
-        if _is_in(R, group) or not body.holds(R[None]):
+        if _are_in(R[None], group)[0] or not body.holds(R[None]):
             continue
         larger = _closure(np.concatenate([group, R[None]]))
-        if larger is not None and body.holds(np.stack([S for S in larger if not _is_in(S, group)])):
+        if larger is not None and body.holds(larger[~_are_in(larger, group)]):
             group = larger
     kind = "discrete" if len(group) > 1 else "none"
     return Symmetry(kind, about(group, body.centre), None, body.centre)
@@ -207,23 +207,23 @@ def _turns(axis: Array, angles: Array) -> Array:
     return Rotation.from_rotvec(np.asarray(angles)[:, None] * axis).as_matrix()
 
 
-def _is_in(R: Array, group: Array) -> bool:
-    """Whether ``R`` (3, 3) is one of ``group`` (G, 3, 3)."""
-    cosine = (np.einsum("ij,gij->g", R, group) - 1) / 2
-    return bool(cosine.max() > np.cos(_SAME))
+def _are_in(R: Array, group: Array) -> NDArray[np.bool_]:
+    """Which of ``R`` (m, 3, 3) are among ``group`` (G, 3, 3)."""
+    cosine = (R.reshape(-1, 9) @ group.reshape(-1, 9).T - 1) / 2
+    return np.asarray((cosine > np.cos(_SAME)).any(1))
 
 
 def _closure(generators: Array) -> Array | None:
     """The group (G, 3, 3) that rotations generate, identity first; None if it is larger than _MAX_GROUP."""
-    group = [np.eye(3)]
-    for element in group:  # grows while it is walked
-        for R in generators:
-            product = element @ R
-            if not _is_in(product, np.stack(group)):
-                group.append(product)
-        if len(group) > _MAX_GROUP:
-            return None
-    return _polished(np.stack(group))
+    group, walked = np.eye(3)[None], 0
+    while walked < len(group) <= _MAX_GROUP:
+        products = group[walked] @ generators
+        new = products[~_are_in(products, group)]
+        while len(new):
+            group = np.concatenate([group, new[:1]])
+            new = new[~_are_in(new, new[:1])]
+        walked += 1
+    return _polished(group) if len(group) <= _MAX_GROUP else None
 
 
 def _polished(group: Array) -> Array:

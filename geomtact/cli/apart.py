@@ -1,0 +1,127 @@
+"""Several parts, each by a process of its own or by the machines of a Ray cluster."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from geomtact.cli import study_file
+from geomtact.cli.shell import tell
+
+Jobs = Annotated[
+    int | None,
+    typer.Option(min=1, help="How many parts are worked on at a time, each by one core.", show_default=False),
+]
+Ray = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Work on the machines of a Ray cluster; auto for the one this belongs to."),
+]
+Command = Callable[..., None]
+
+
+def do_all(
+    work: Command,
+    tasks: Sequence[tuple[Any, ...]],
+    names: Sequence[str],
+    done: str,
+    jobs: int | None = None,
+    ray: str | None = None,
+) -> None:
+    """Do ``tasks`` as ``geomtact.batch.run_all`` does, and tell by its name of each that is ``done``, or why it is not.
+
+    Raises
+    ------
+    InputError
+        Some are not; the others are.
+    """
+    from geomtact.batch import run_all
+    from geomtact.errors import InputError
+
+    wrong = []
+    together = run_all(work, tasks, min(jobs or os.cpu_count() or 1, len(tasks)), ray)
+    for count, (number, error) in enumerate(together, 1):
+        told = done if error is None else f"not {done}: {' '.join(str(error).split())}"
+        tell(f"[{count} of {len(tasks)}] {names[number]}: {told}")
+        if error is not None:
+            wrong.append(names[number])
+    if wrong:
+        raise InputError(
+            f"{len(wrong)} of {len(tasks)} parts are not {done}, for the reasons above: {', '.join(wrong)}"
+        )
+
+
+def quietly(command: Command, options: Mapping[str, Any]) -> None:
+    """Do a command by one core and without a word: a task of :func:`do_all`."""
+    from contextlib import redirect_stderr, redirect_stdout
+
+    import torch
+
+    torch.set_num_threads(1)
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        command(**options)
+
+
+def by_part(judge: Command) -> Command:
+    """The study ``judge``, which takes ``parts`` and ``out``, with the options --jobs and --ray.
+
+    Of each part a task makes a file of its own by the same options; what these hold goes into ``--out``, from where the study
+    goes on as one that was stopped after its last part.
+    """
+
+    @functools.wraps(judge)
+    def run(jobs: int | None = None, ray: str | None = None, **options: Any) -> None:
+        if jobs is not None or ray is not None:
+            _judge_apart(judge, options, jobs, ray)
+        judge(**options)
+
+    parameters = dict(inspect.signature(judge, eval_str=True).parameters)
+    for name, kind in (("jobs", Jobs), ("ray", Ray)):
+        parameters[name] = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+    # by these typer finds the options
+    run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+    run.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
+    return run
+
+
+def _judge_apart(judge: Command, options: Mapping[str, Any], jobs: int | None, ray: str | None) -> None:
+    """Put what each part's task finds into ``out``.
+
+    Raises
+    ------
+    UsageError
+        There is no ``out``.
+    InputError
+        Some parts cannot be judged; what was found of the others is in ``out``.
+    """
+    from geomtact.errors import UsageError
+    from geomtact.evaluation.study import THESIS_PARTS
+
+    out: Path | None = options["out"]
+    if out is None:
+        raise UsageError("--jobs and --ray need --out, the file in which what is found of the parts comes together")
+    schema = judge.__globals__["SCHEMA"]
+    content, parts = study_file.load(out, schema), [str(part) for part in options["parts"] or THESIS_PARTS]
+    before = dict(content["parts"])
+    folder = out.absolute().with_name(f"{out.stem}.parts")
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / f"{Path(part).stem}.json" for part in parts]
+    for file in files:
+        if before and not file.exists():
+            shutil.copyfile(out, file)
+    same = dict(options) | {name: None for name in options if name.startswith("plot")}
+    tasks = [(judge, same | {"parts": [part], "out": file}) for part, file in zip(parts, files, strict=True)]
+    try:
+        do_all(quietly, tasks, parts, "judged", jobs, ray)
+    finally:
+        for file in files:  # in the order of the parts, whichever was done first
+            found = study_file.load(file, schema)["parts"]
+            content["parts"] |= {name: entry for name, entry in found.items() if entry != before.get(name)}
+        study_file.save(out, content)
+    shutil.rmtree(folder)
