@@ -15,26 +15,25 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from geomtact.errors import GeomtactError, UsageError
 
-Task = TypeVar("Task")
+if TYPE_CHECKING:
+    from geomtact.sensing.sensor import Sensor
+
 _TRIES = 3  # of a task whose process dies
 _AHEAD = 4  # tasks handed to a cluster for each of its cores
 _ANSWERS = 5.0  # s within which a cluster does
-_DIED = "its process died, three times; there may be too little memory for it: give fewer --jobs"
+_DIED = "its process died, three times, the last two alone; there may be too little memory for it"
 
 
 def prepare_part(
-    mesh: str, unit: str | None, sensor: str, scorer: str, max_poses: int, cache_dir: str | Path | None
+    mesh: str, unit: str | None, sensor: str | Sensor, scorer: str, max_poses: int, cache_dir: str | Path | None
 ) -> None:
-    """Prepare a part as ``Localizer.prepare`` does, by one core, and leave it in the cache."""
-    import torch
-
+    """Prepare a part as ``Localizer.prepare`` does, and leave it in the cache."""
     from geomtact.inference.localizer import Localizer
 
-    torch.set_num_threads(1)
     Localizer.prepare(mesh, unit, sensor, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir)
 
 
@@ -59,7 +58,9 @@ def run_all(
         yield from _by_ray(work, tasks, ray)
     elif jobs == 1:
         for number, task in enumerate(tasks):
-            yield number, _done(work, task)
+            with _one_thread():
+                wrong = _done(work, task)
+            yield number, wrong
     else:
         yield from _by_processes(work, tasks, jobs)
 
@@ -70,7 +71,22 @@ def _done(work: Callable[..., Any], task: tuple[Any, ...]) -> GeomtactError | No
         work(*task)
     except GeomtactError as error:
         return error
+    except Exception as error:  # noqa: BLE001 too little memory, a full disk: of this task, not of the others
+        return GeomtactError(f"{type(error).__name__}: {error}")
     return None
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """This process computes with one thread, as all others do: the files are the same to the last bit."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _by_processes(
@@ -152,5 +168,5 @@ def _by_ray(
         number = running.pop(future)
         try:
             yield number, ray.get(future)
-        except (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError):
-            yield number, GeomtactError(_DIED)
+        except ray.exceptions.RayError as error:
+            yield number, GeomtactError(f"not done on the cluster, three times: {str(error).splitlines()[0]}")

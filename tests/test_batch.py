@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -18,8 +19,13 @@ PARTS = ("ball", "hex_nut")
 
 
 def written(folder: Path) -> dict:
-    """The hash of every file of a cache."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    """The hash of every file of a cache, but for what a killed process has left half made."""
+    whole = (
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and not str(path.relative_to(folder)).startswith("building-")
+    )
+    files = sorted(path for path in whole if not path.name.startswith("."))
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
@@ -28,9 +34,11 @@ def tasks(folder: Path) -> list:
 
 
 def note(folder: Path, name: str, once: str) -> None:
-    """Writes a file; refuses "bad", and kills its own process where it is the first to do ``once``, or always."""
+    """Writes a file; refuses "bad", fails at "full", dies at "deadly", and where it is the first to do ``once``."""
     if name == "bad":
         raise InputError("bad: no such part")
+    if name == "full":
+        raise OSError("no space left")
     first = folder / "killed"
     if name == once and not first.exists():
         first.touch()
@@ -63,9 +71,9 @@ def test_what_is_there_is_not_made_again(tmp_path):
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_task_that_cannot_be_done_is_named_and_the_others_are_done(tmp_path, jobs):
-    told = dict(run_all(note, [(tmp_path, name, "") for name in ("a", "bad", "b")], jobs))
-    assert told[0] is None and told[2] is None
-    assert str(told[1]) == "bad: no such part"
+    told = dict(run_all(note, [(tmp_path, name, "") for name in ("a", "bad", "full", "b")], jobs))
+    assert told[0] is None and told[3] is None
+    assert str(told[1]) == "bad: no such part" and str(told[2]) == "OSError: no space left"
     assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
 
 
@@ -117,10 +125,19 @@ def test_two_nodes_of_which_one_is_killed_write_the_same_bytes_as_one_process(al
     try:
         other = cluster.add_node(num_cpus=1)
         cluster.wait_for_nodes()
-        kill = threading.Timer(3.0, cluster.remove_node, [other])  # while each node is at a part
-        kill.start()
+        killed_at: list[int] = []
+
+        def kill() -> None:
+            while len(list(tmp_path.glob("*.lock"))) < len(PARTS):  # each node is at a part
+                time.sleep(0.02)
+            cluster.remove_node(other, allow_graceful=False)
+            killed_at.append(len(written(tmp_path)))
+
+        killer = threading.Thread(target=kill)
+        killer.start()
         assert dict(run_all(prepare_part, tasks(tmp_path), ray=cluster.address)) == {0: None, 1: None}
-        kill.join()
+        killer.join()
+        assert killed_at[0] < len(alone)  # midway
         assert sum(node["Alive"] for node in ray.nodes()) == 1
     finally:
         ray.shutdown()

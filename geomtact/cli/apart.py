@@ -42,8 +42,10 @@ def do_all(
         Some are not; the others are.
     """
     from geomtact.batch import run_all
-    from geomtact.errors import InputError
+    from geomtact.errors import InputError, UsageError
 
+    if jobs is not None and ray is not None:
+        raise UsageError("--jobs is for this machine, a Ray cluster has its own number of cores; leave out one of them")
     wrong = []
     together = run_all(work, tasks, min(jobs or os.cpu_count() or 1, len(tasks)), ray)
     for count, (number, error) in enumerate(together, 1):
@@ -57,13 +59,24 @@ def do_all(
         )
 
 
+def everywhere(name: str) -> str:
+    """A name, or the file of that name, in whatever folder a task is done."""
+    return os.path.abspath(name) if os.path.isfile(name) else name
+
+
+def part_of_task(part: str, unit: str | None) -> tuple[str, str | None]:
+    """A part's name or file, and its unit, wherever the task is done; bundled parts have units of their own."""
+    from geomtact.geometry.catalogue import catalogue
+
+    if part in catalogue():
+        return part, None
+    return everywhere(part), unit
+
+
 def quietly(command: Command, options: Mapping[str, Any]) -> None:
-    """Do a command by one core and without a word: a task of :func:`do_all`."""
+    """Do a command without a word: a task of :func:`do_all`."""
     from contextlib import redirect_stderr, redirect_stdout
 
-    import torch
-
-    torch.set_num_threads(1)
     with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         command(**options)
 
@@ -100,6 +113,7 @@ def _judge_apart(judge: Command, options: Mapping[str, Any], jobs: int | None, r
     InputError
         Some parts cannot be judged; what was found of the others is in ``out``.
     """
+    from geomtact.contact_space.store import default_cache_dir
     from geomtact.errors import UsageError
     from geomtact.evaluation.study import THESIS_PARTS
 
@@ -116,7 +130,14 @@ def _judge_apart(judge: Command, options: Mapping[str, Any], jobs: int | None, r
         if before and not file.exists():
             shutil.copyfile(out, file)
     same = dict(options) | {name: None for name in options if name.startswith("plot")}
-    tasks = [(judge, same | {"parts": [part], "out": file}) for part, file in zip(parts, files, strict=True)]
+    same |= {
+        "sensor": everywhere(options["sensor"]),
+        "cache_dir": (options["cache_dir"] or default_cache_dir()).absolute(),
+    }
+    tasks = []
+    for part, file in zip(parts, files, strict=True):
+        name, unit = part_of_task(part, options["unit"])
+        tasks.append((judge, same | {"parts": [name], "unit": unit, "out": file}))
     try:
         do_all(quietly, tasks, parts, "judged", jobs, ray)
     finally:

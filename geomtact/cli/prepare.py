@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from geomtact.cli.apart import Jobs, Ray, do_all
+from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, part_of_task
 from geomtact.cli.library import CacheDir
 from geomtact.cli.shell import progress_bar, tell
 
 if TYPE_CHECKING:
+    from geomtact.geometry.mesh import Mesh
     from geomtact.inference.localizer import Localizer
+    from geomtact.sensing.sensor import Sensor
 
 _MANY_WINDOWS = 10  # long sides of the window, from which on a part's unit is doubted
 Unit = Annotated[str | None, typer.Option("--unit", help="Unit of a mesh file without one: mm, cm, m or inch.")]
@@ -46,18 +49,17 @@ def prepare(
 
     from geomtact.cli.project import resolve
 
-    several = objects is not None and (len(objects) > 1 or ray is not None or jobs is not None)
     values, sources = resolve({"object": objects[0] if objects else None, "unit": unit, "sensor": sensor})
     began = time.perf_counter()
-    if several:
-        _prepare_all(objects or [], values, sources, scorer, max_poses, cache_dir, jobs, ray)
+    if jobs is not None or ray is not None or (objects is not None and len(objects) > 1):
+        _prepare_all(objects, values, sources, scorer, max_poses, cache_dir, jobs, ray)
     else:
         localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, given="OBJECT")
         typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
 
 
 def _prepare_all(
-    objects: list[str],
+    objects: list[str] | None,
     values: dict,
     sources: dict,
     scorer: str | None,
@@ -73,28 +75,56 @@ def _prepare_all(
     InputError
         Some of them cannot be used; the others are ready.
     """
-    import os
-
     from geomtact.batch import prepare_part
     from geomtact.cli.project import require
     from geomtact.contact_space.resolution import MAX_POSES
+    from geomtact.contact_space.store import DEFAULT_LIMIT, cache_entries, default_cache_dir
     from geomtact.geometry.catalogue import catalogue
     from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
     from geomtact.sensing.sensor import Sensor, bundled_sensors
 
-    sensor = require(values, "sensor", bundled_sensors(), "a TOML file")
+    objects = objects or [require(values, "object", list(catalogue()), "a mesh file with --unit", "OBJECT")]
+    gel = Sensor.load(require(values, "sensor", bundled_sensors(), "a TOML file"))
     for key, source in sources.items():
         tell(f"{key}: {values[key]} (from {source})")
     scorer = scorer or DEFAULT_SCORER
     check_name(scorer)
-    name = Sensor.load(sensor).name
-    folder = None if cache_dir is None else cache_dir.absolute()
-    how = (sensor, scorer, max_poses or MAX_POSES, folder)
-    bundled = catalogue()  # which have units of their own
-    tasks = [
-        (each, None, *how) if each in bundled else (os.path.abspath(each), values["unit"], *how) for each in objects
-    ]
-    do_all(prepare_part, tasks, [f"{each} on {name}" for each in objects], "prepared", jobs, ray)
+    _doubt_unit_of_first(objects, values["unit"], gel)
+    # named, so that what is prepared first is not removed to make room for the last
+    folder = (cache_dir or default_cache_dir()).absolute()
+    how = (gel, everywhere(scorer), max_poses or MAX_POSES, folder)
+    tasks = [(*part_of_task(part, values["unit"]), *how) for part in objects]
+    try:
+        do_all(prepare_part, tasks, [f"{part} on {gel.name}" for part in objects], "prepared", jobs, ray)
+    finally:
+        size = sum(entry.size_bytes for entry in cache_entries(folder))
+        if cache_dir is None and size > DEFAULT_LIMIT:
+            tell(
+                f"warning: the cache holds {size / 1e9:.0f} GB; the next part that is prepared alone brings it back to "
+                f"{DEFAULT_LIMIT / 1e9:.0f} GB. Prepare into a folder of your own, by --cache-dir, to keep all"
+            )
+
+
+def _doubt_unit_of_first(parts: list[str], unit: str | None, sensor: Sensor) -> None:
+    """As :func:`_doubt_unit`, of the first mesh file: all have the unit that is given."""
+    from geomtact.errors import GeomtactError
+    from geomtact.geometry.catalogue import catalogue
+    from geomtact.geometry.mesh import load_mesh
+
+    first = next((part for part in parts if part not in catalogue()), None)
+    if first is not None:
+        with contextlib.suppress(GeomtactError, OSError):  # which its task tells
+            _doubt_unit(load_mesh(first, unit, sensor=sensor), sensor)
+
+
+def _doubt_unit(mesh: Mesh, sensor: Sensor) -> None:
+    """Warn of a part that is so large that its unit may be wrong."""
+    windows = mesh.diameter / (2 * sensor.half_window.max())
+    if windows > _MANY_WINDOWS:
+        tell(
+            f"warning: {mesh.name} is {1e3 * mesh.diameter:.0f} mm across as read in {mesh.unit}, {windows:.0f} windows of "
+            f"the sensor {sensor.name!r}: if that is not its size, give its --unit"
+        )
 
 
 def open_localizer(
@@ -134,12 +164,7 @@ def open_localizer(
     mesh = load_mesh(object_name, values["unit"], sensor=gel)
     if prior is not None:
         check_same(heading(prior), mesh, frame)
-    windows = mesh.diameter / (2 * gel.half_window.max())
-    if windows > _MANY_WINDOWS:
-        tell(
-            f"warning: {mesh.name} is {1e3 * mesh.diameter:.0f} mm across as read in {mesh.unit}, {windows:.0f} windows of "
-            f"the sensor {gel.name!r}: if that is not its size, give its --unit"
-        )
+    _doubt_unit(mesh, gel)
     with progress_bar("preparing") as progress:
         return Localizer.prepare(
             mesh, None, gel, scorer=scorer, max_poses=max_poses or MAX_POSES, cache_dir=cache_dir, progress=progress

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from geomtact.cli.apart import Jobs, Ray, do_all, quietly
+from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, part_of_task, quietly
 from geomtact.cli.parts import parts_of
 from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import progress_bar, tell
@@ -131,7 +130,6 @@ def train(
 def _train_each(parts: list[str], options: dict[str, Any]) -> None:
     """For each of several parts, weights of its own in the folder ``out``."""
     from geomtact.cli.shell import check_folder
-    from geomtact.geometry.catalogue import catalogue
 
     jobs, ray = options.pop("jobs"), options.pop("ray")
     folder: Path = options["out"]
@@ -142,11 +140,13 @@ def _train_each(parts: list[str], options: dict[str, Any]) -> None:
     check_folder(folder)
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    bundled = catalogue()  # which have units of their own
+    start = options["start"] and options["start"].absolute()
+    same = options | {"sensor": everywhere(options["sensor"]), "start": start}
     tasks = []
     for part in parts:
-        own = {"object_name": part, "unit": None} if part in bundled else {"object_name": os.path.abspath(part)}
-        tasks.append((train, options | own | {"out": folder / f"{Path(part).stem}.safetensors"}))
+        name, unit = part_of_task(part, options["unit"])
+        own = {"object_name": name, "unit": unit, "out": folder / f"{Path(part).stem}.safetensors"}
+        tasks.append((train, same | own))
     do_all(quietly, tasks, parts, "trained", jobs, ray)
 
 
