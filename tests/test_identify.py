@@ -91,6 +91,8 @@ def test_probabilities_are_evidence_times_weights(drawer):
         ({"odd": False, "unexplained_nats": 7.9}, False),
         ({"odd": False, "unexplained_nats": 8.1}, True),
         ({"odd": False, "unexplained_nats": None}, True),
+        ({"odd": False, "unexplained_nats": 0.0, "misfit_nats": 4.2}, False),
+        ({"odd": False, "unexplained_nats": 0.0, "misfit_nats": 4.3}, True),
     ],
 )
 def test_unlike_all_is_what_is_odd_or_unexplained_of_each(drawer, said, unlike):

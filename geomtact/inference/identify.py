@@ -16,6 +16,9 @@ from geomtact.se3 import Array
 if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
 
+# nats a contact that the likeliest pose of the right part falls short by, of several: 5 % of 22 scenes of seed 77 did by more
+_MISFIT = 4.25
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -115,5 +118,10 @@ def _log_weights(weights: Sequence[float]) -> Array:
 
 
 def _is_unlike(posterior: Posterior) -> bool:
-    unexplained = posterior.settings.get("unexplained_nats", 0.0)
-    return posterior.contact and (posterior.settings["odd"] or unexplained is None or unexplained > UNLIKE)
+    if not posterior.contact:
+        return False
+    told = posterior.settings
+    limits = {"unexplained_nats": UNLIKE, "misfit_nats": _MISFIT}
+    return told["odd"] or any(
+        told.get(name, 0.0) is None or told.get(name, 0.0) > most for name, most in limits.items()
+    )

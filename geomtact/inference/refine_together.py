@@ -46,6 +46,8 @@ _ELSEWHERE, _AT_MOST, _AS_LIKELY = 0.4, 0.2, 5.0
 _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
 # nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 ALIKE, UNLIKE = 4.0, 8.0
+_WORTH = 0.5  # power of the likelihood in the evidence
+_OUTLINE = 100.0  # nats that each metre of a contact's outline costs even at the right pose
 _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
 
 
@@ -70,6 +72,18 @@ class View:
         assert self.contact is not None
         mask = self.contact.mask
         return without_specks(mask, self.refinery.space.sensor.pixel_area(mask.shape))
+
+    @property
+    def measured(self) -> bool:
+        """Whether heights are shown."""
+        return self.contact is not None and self.contact.height is not None
+
+    @property
+    def outline(self) -> float:
+        """Length of the contact's outline within the window [m], whichever way it runs (Cauchy and Crofton)."""
+        dx, dy = 2 * self.refinery.space.sensor.half_window / self.mask.shape[::-1]
+        across, down = self.mask[:, 1:] != self.mask[:, :-1], self.mask[1:] != self.mask[:-1]
+        return float(np.pi / 4 * (across.sum() * dy + down.sum() * dx))
 
     def log_likelihood(self, T: Array) -> Array:
         """Log likelihood (n,) of what is shown, with the object at ``T`` (n, 4, 4) in the first sensor's frame.
@@ -118,6 +132,10 @@ def refine_together(
     is shared out anew by these likelihoods: but only as far as the likeliest pose explains what all sensors show, in the mean
     nearly as well as other poses do what each of them shows. If none does, the right one was not looked into. ``log_prior`` is as
     of ``Posterior.shared_anew``.
+
+    The evidence becomes the mean likelihood under the prior, as far as the cells looked into hold it. ``settings`` tell by how
+    many nats a contact the likeliest pose falls short: ``unexplained_nats``, of the poses that suit each sensor best, and, of
+    masks alone, ``misfit_nats``, of what is left to chance by the length of the outlines.
     """
     looked_into = posterior.likeliest_cells(_CELLS + _PER_MODE * k)
     if not len(looked_into):
@@ -133,14 +151,20 @@ def refine_together(
     mass = posterior.cell_log_density(home) + posterior.index.log_weight[home]
     share_elsewhere = _share_elsewhere(mass, _TRUST * likely, search.felt) if search.felt > 1 else 1.0
     doubt, elsewhere = (1 - (1 - share) * explains for share in (_DOUBT, share_elsewhere))
-    if any(view.contact is not None and view.contact.height is not None for view in views):
-        told = float(np.logaddexp.reduce(mass + search.heights(poses), initial=-np.inf))
-        posterior = replace(posterior, log_evidence=posterior.log_evidence + told)
+    if len(home):
+        known = posterior.index.log_weight if log_prior is None else log_prior
+        heights = search.heights(poses)
+        explained = known[home] + _WORTH * (likely - heights) + heights
+        posterior = replace(posterior, log_evidence=float(np.logaddexp.reduce(explained)))
     posterior = posterior.shared_anew(home, _TRUST * likely, doubt, elsewhere, _BEFORE, log_prior)
 
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: _TOLD * k]
     told_at = search.told(home[leading], poses[leading])
-    said = {"unexplained_nats": float(unexplained) if np.isfinite(unexplained) else None}
+    said: dict[str, float | None] = {"unexplained_nats": float(unexplained)}
+    if not any(view.measured for view in views):
+        outline = np.mean([view.outline for view in search.views[: search.felt]])
+        said["misfit_nats"] = float(-likely.max(initial=-np.inf) / search.felt - _OUTLINE * outline)
+    said = {name: nats if nats is not None and np.isfinite(nats) else None for name, nats in said.items()}
     return replace(posterior, refined=told_at, settings=posterior.settings | said)
 
 
@@ -234,7 +258,8 @@ class _Search:
 
     def heights(self, T: Array) -> Array:
         """Log likelihood (n,) of all heights that are shown, with the object at ``T`` (n, 4, 4)."""
-        return np.sum([view.heights(view.depths(T)) for view in self.views], axis=0)
+        measured = (view for view in self.views if view.measured)
+        return sum((view.heights(view.depths(T)) for view in measured), start=np.zeros(len(T)))
 
     def registered(self, tried: _Tried) -> list[_Tried]:
         """What was tried, and what registration makes of the best for each cell."""
