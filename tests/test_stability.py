@@ -277,11 +277,14 @@ def test_a_stopped_study_goes_on_and_its_picture_comes_from_the_file_alone(comma
 def test_the_answers_of_all_parts_are_taken_together():
     one, other = Answer(1.23456, 1.0, 0.3, 1.0, 0.9, False), REFUSED
 
-    def part(*answers):
+    def part(*answers, effort="fast"):
+        settings = dict.fromkeys(evaluate_stability._ALIKE) | {"effort": effort}
         level = {"level": 2, "figures": stability.summarise(answers), "answers": evaluate_stability._columns(answers)}
-        return {"sweeps": {"specks": {"title": "specks", "inside": [2], "levels": [plain(level)]}}}
+        sweeps = {"specks": {"title": "specks", "inside": [2], "levels": [plain(level)]}}
+        return {"settings": settings, "sweeps": sweeps}
 
-    (level,) = evaluate_stability._together([part(one, one), part(other)])["specks"]["levels"]
+    judged_otherwise = part(one, effort="exact")
+    (level,) = evaluate_stability._together([part(one, one), part(other), judged_otherwise])["specks"]["levels"]
     rounded = replace(one, gain=1.2346)
     assert level == {"level": 2, "figures": stability.summarise([rounded, rounded, other])}
 
@@ -300,6 +303,14 @@ def test_a_level_that_no_touch_fulfils_is_left_out_and_the_others_are_judged_onc
     assert asked == [0, 2, 6, 20, 60, 6]
     part = json.loads((tmp_path / "a.json").read_text("utf-8"))["parts"]["connector_plug"]
     assert [at["level"] for at in part["sweeps"]["specks"]["levels"]] == [0, 2, 20, 60]
+
+
+def test_what_is_as_prepared_is_touched_once(plug, monkeypatch):
+    known, sweep = [], SWEEPS["noise"]
+    at_home = [level for level in sweep.levels if level == 1e3 * MODERATE.outline_rms]
+    first = list(stability.swept(plug, sweep, at_home[0], 2, 1, "fast", known))
+    monkeypatch.setattr(stability, "_alone", None)
+    assert list(stability.swept(plug, SWEEPS["size"], 0, 2, 1, "fast", known)) == first == known
 
 
 def test_a_sweep_that_is_none_is_said(command):

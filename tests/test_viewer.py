@@ -1,7 +1,7 @@
 """Laws of the live view: it shows where the posterior says that the part may be, and is served to a browser."""
 
 import importlib
-import sys
+import importlib.util
 import urllib.request
 
 import numpy as np
@@ -59,6 +59,7 @@ def test_without_contact_no_part_is_drawn(shown, flat_nut):
 def test_images_of_every_kind_can_be_shown():
     mask = np.array([[True, False], [False, False]])
     assert np.array_equal(viewer._picture(mask)[..., 0], [[255, 0], [0, 0]])
+    assert (viewer._picture(np.ones((2, 2), bool)) == 255).all()
     assert viewer._picture(np.linspace(0, 1e-3, 6).reshape(2, 3)).shape == (2, 3, 3)
     assert not viewer._picture(np.zeros((2, 2))).any()
     colour = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
@@ -66,9 +67,20 @@ def test_images_of_every_kind_can_be_shown():
 
 
 def test_without_viser_it_is_said_how_to_get_it(flat_nut, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"geomtact\[viz\]"):
         Viewer(flat_nut.mesh)
+
+
+def test_an_address_of_another_machine_is_refused(flat_nut):
+    with pytest.raises(UsageError, match="--host 203.0.113.7: no address of this machine"):
+        Viewer(flat_nut.mesh, "203.0.113.7")
+
+
+def test_a_mask_of_zeros_and_ones_is_shown_white_on_black(shown, flat_nut, a_touch):
+    _, mask = a_touch(flat_nut)
+    shown.show(1, flat_nut.localize(mask.astype(np.uint8), "mask"))
+    assert np.array_equal(shown._image.image[..., 0] == 255, mask) and not shown._image.image[~mask].any()
 
 
 def test_the_command_shows_every_image(flat_nut, a_touch, tmp_path, monkeypatch, cache_dir):

@@ -15,6 +15,7 @@ from geomtact.cli.prepare import MaxPoses, Unit
 from geomtact.cli.shell import print_table, tell
 
 SCHEMA = "geomtact/stability/2"
+_ALIKE = ("sensor_sha256", "scorer", "touches", "effort", "seed")  # settings that parts taken together share
 _NAMES = (
     "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, kind, detail, rig_shift, rig_turn, jaw, "
     "slips, other_part"
@@ -62,18 +63,21 @@ def judge_stability(
         part = localizer.mesh.name
         found = content["parts"].get(part)
         sweeps = dict(found["sweeps"]) if study_file.begun(found, settings) else {}
+        as_prepared: list = []
         for name in names:
             one = stability.SWEEPS[name]
             done = sweeps.setdefault(name, {"title": one.title, "inside": list(one.inside), "levels": []})["levels"]
             judged = {at["level"] for at in done}  # at a level that no touch fulfils there is nothing to keep
             for level in (level for level in one.levels if level not in judged):
                 many = touches if level in one.inside else -(-touches // 4)
-                todo = stability.swept(localizer, one, level, many, seed, effort)
+                todo = stability.swept(localizer, one, level, many, seed, effort, as_prepared)
                 told = study_file.collect([], todo, many, f"{part}: {one.title} {level:g}", lambda _: None)
                 if told:
                     figures = stability.summarise(told)
                     done.append({"level": level, "figures": figures, "answers": _columns(told)})
-                study_file.keep(out, content, part, settings=settings, sweeps=sweeps)
+                content["parts"][part] = plain({"settings": settings, "sweeps": sweeps})
+                content["together"] = plain(_together(list(content["parts"].values())))
+                study_file.save(out, content)
         _print(part, {name: sweeps[name] for name in names})
     content["together"] = plain(_together(list(content["parts"].values())))
     study_file.save(out, content)
@@ -83,15 +87,17 @@ def judge_stability(
 
 
 def _together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The sweeps of all parts, the answers of each level taken together."""
+    """The sweeps of all parts that were judged as the first one was, the answers of each level taken together."""
     from geomtact.evaluation import stability
 
+    how = [{key: part["settings"][key] for key in _ALIKE} for part in parts]
+    parts = [part for part, own in zip(parts, how, strict=True) if own == how[0]]
     out: dict[str, Any] = {}
     for name in dict.fromkeys(name for part in parts for name in part["sweeps"]):
         held = [part["sweeps"][name] for part in parts if name in part["sweeps"]]
         answers: dict[float, list] = {level: [] for level in stability.SWEEPS[name].levels}
         for at in (at for sweep in held for at in sweep["levels"]):
-            answers[at["level"]] += _answers(at["answers"])
+            answers.setdefault(at["level"], []).extend(_answers(at["answers"]))
         levels = [{"level": x, "figures": stability.summarise(some)} for x, some in answers.items() if some]
         out[name] = {"title": held[0]["title"], "inside": held[0]["inside"], "levels": levels}
     return out

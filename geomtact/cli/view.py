@@ -54,12 +54,13 @@ def view(
     The page shows the sensor, the contact, the part at its most probable pose and, faintly, at poses drawn from the posterior.
     It needs viser: pip install 'geomtact[viz]'. Exit status as of 'geomtact track'.
     """
+    from geomtact.report.viewer import Viewer, check_viewer
+
+    check_viewer(host)  # before minutes go into an index
     given = given_of(object_name, unit, sensor, background, effort)
     localizer, posteriors = open_track(
         source, given, follow, motion_mm, scorer, max_poses, cache_dir, kind=kind, skip_broken=skip_broken, seed=seed
     )
-
-    from geomtact.report.viewer import Viewer
 
     viewer, touched = Viewer(localizer.mesh, host, port), False
     typer.echo(viewer.url)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -223,8 +222,19 @@ SWEEPS = {
 }
 
 
-def swept(localizer: Localizer, sweep: Sweep, level: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """Answers to ``n`` touches, or scenes of several sensors, at a level of a sweep."""
+def swept(
+    localizer: Localizer,
+    sweep: Sweep,
+    level: float,
+    n: int,
+    seed: int,
+    effort: str,
+    as_prepared: list[Answer] | None = None,
+) -> Iterator[Answer]:
+    """Answers to ``n`` touches, or scenes of several sensors, at a level of a sweep.
+
+    Most sweeps begin where all is as the localizer was prepared for: ``as_prepared`` holds those answers, once they are told.
+    """
     if sweep.rig is not None:
         yield from _rigs(localizer, sweep.rig(level), n, seed, effort)
     elif sweep.jaw:
@@ -235,16 +245,15 @@ def swept(localizer: Localizer, sweep: Sweep, level: float, n: int, seed: int, e
         assert sweep.world is not None
         here = World(localizer.mesh, localizer.sensor, MODERATE, penetrations(localizer.space))
         there = sweep.world(here, level)
-        if there == here:
-            yield from _as_prepared(localizer, here, n, seed, effort)
-        else:
+        if there != here or as_prepared is None:
             yield from _alone(localizer, there, n, seed, effort)
-
-
-@lru_cache(maxsize=1)
-def _as_prepared(localizer: Localizer, here: World, n: int, seed: int, effort: str) -> list[Answer]:
-    """Answers where all is as it was prepared, which is where most sweeps begin."""
-    return list(_alone(localizer, here, n, seed, effort))
+        elif len(as_prepared) >= n:
+            yield from as_prepared[:n]
+        else:
+            as_prepared.clear()
+            for answer in _alone(localizer, there, n, seed, effort):
+                as_prepared.append(answer)
+                yield answer
 
 
 def _alone(localizer: Localizer, there: World, n: int, seed: int, effort: str) -> Iterator[Answer]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import socket
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +24,7 @@ _POSES = 60  # of the posterior, that are drawn through one another
 _FAINT = 0.06  # opacity of each
 _CM = 100.0  # a unit of the scene is a centimetre
 _LINES = 1.5  # pixels
+_EVERY = "0.0.0.0"  # all addresses of this machine
 _WINDOW, _CONTACT = (110, 110, 110), (20, 20, 20)
 
 
@@ -36,16 +39,16 @@ class Viewer:
     Raises
     ------
     UsageError
-        Viser is not installed.
+        As :func:`check_viewer`.
     """
 
     def __init__(self, mesh: Mesh, host: str = "127.0.0.1", port: int = 8080) -> None:
-        try:
-            import viser
-        except ImportError:
-            raise UsageError("the viewer needs viser; install it with: pip install 'geomtact[viz]'") from None
+        check_viewer(host)
+        import viser
+
         self._server = viser.ViserServer(host=host, port=port, label=f"geomtact: {mesh.name}", verbose=False)
-        self.url = f"http://{host}:{self._server.get_port()}"
+        name = socket.gethostname() if host == _EVERY else host
+        self.url = f"http://{name}:{self._server.get_port()}"
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._told = self._server.gui.add_markdown("")
         self._image = self._server.gui.add_image(np.zeros((1, 1, 3), np.uint8), label="image")
@@ -68,10 +71,12 @@ class Viewer:
             "/sensor", _around(_CM * apply(T, sensor.corners)), _WINDOW, thickness=_LINES, thickness_units="screen"
         )
         lines = [np.zeros((0, 2, 3))]
+        picture = np.zeros((1, 1, 3), np.uint8)  # of a frame that could not be read
         if posterior.observations:
             seen = posterior.observation
             lines += [_around(_CM * apply(T, line)) for line in outlines_of(seen.contact.mask, sensor)]
-            self._image.image = _picture(seen.image)
+            picture = _picture(seen.contact.mask if seen.kind == "mask" else seen.image)
+        self._image.image = picture
         scene.add_line_segments(
             "/contact", np.concatenate(lines), _CONTACT, thickness=2 * _LINES, thickness_units="screen"
         )
@@ -83,12 +88,31 @@ class Viewer:
             self._drawn.batched_wxyzs = _wxyz(some)
             self._drawn.batched_positions = np.float32(_CM) * some[:, :3, 3].astype(np.float32)
             self._mode.wxyz, self._mode.position = _wxyz(first.T), _CM * first.T[:3, 3]
-            told = f"first mode {100 * first.probability:.2g} %, entropy {posterior.entropy_nats:.1f} nats"
+            told = f"first mode {100 * first.probability:.1f} %, entropy {posterior.entropy_nats:.1f} nats"
         self._told.content = "\n\n".join([f"**{posterior.mesh.name}, frame {number}**", told, *posterior.warnings])
 
     def stop(self) -> None:
         """Serve the page no longer."""
         self._server.stop()
+
+
+def check_viewer(host: str) -> None:
+    """Refuse what a page cannot be served by, before any work is done.
+
+    Raises
+    ------
+    UsageError
+        Viser is not installed, or ``host`` is no address of this machine.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise UsageError("the viewer needs viser; install it with: pip install 'geomtact[viz]'")
+    try:
+        with socket.create_server((host, 0)):
+            pass
+    except OSError as error:
+        raise UsageError(
+            f"--host {host}: no address of this machine ({error.strerror or error}); give 127.0.0.1, or 0.0.0.0 for all of them"
+        ) from None
 
 
 def _wxyz(T: Array) -> NDArray[np.float32]:
@@ -102,9 +126,11 @@ def _around(line: Array) -> Array:
 
 
 def _picture(image: ArrayLike) -> NDArray[np.uint8]:
-    """An image as it was given, (H, W) or (H, W, 3), for the page."""
+    """A mask, or an image as it was given, (H, W) or (H, W, 3), for the page."""
     values = np.asarray(image)
-    if values.dtype != np.uint8:  # a mask, or depths
+    if values.dtype == bool:
+        values = np.where(values, 255, 0).astype(np.uint8)
+    if values.dtype != np.uint8:  # depths
         values = values.astype(float)
         values = np.asarray(255 * (values - values.min()) / max(float(np.ptp(values)), 1e-12), np.uint8)
     return values if values.ndim == 3 else np.repeat(values[..., None], 3, 2)
