@@ -75,7 +75,7 @@ class Posterior:
     T_frame_sensor : (4, 4)
     contact : whether the image shows any contact
     elsewhere : without contact, the prior's log density at poses (n, 4, 4) in ``frame``; it is not saved
-    log_evidence : log of the mean likelihood under the prior, comparable between objects on one sensor
+    log_evidence : log of the mean likelihood under the prior, comparable between objects for the same images and effort
     seed : of the random choices made where credible levels tie
     runs : (N,) how many cells from each of ``cells`` on share one density, as the cells of a block do where there is
         little mass; one each by default
