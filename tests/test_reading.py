@@ -329,6 +329,16 @@ def test_a_dent_is_found_where_it_is_whatever_the_light_does(background, rng):
             assert iou > 0.85 and centre < 2.5
 
 
+@pytest.mark.parametrize("method", ["classical", "pressure"])
+def test_a_finer_camera_sees_the_same_contact(background, rng, method):
+    image, fine = press(background, 200, 90, 40, rng), (640, 480)
+    mask = contact_mask(image, background, method=method)
+    finer = contact_mask(*(cv2.resize(each, fine) for each in (image, background)), method=method)
+    assert finer.shape == fine[::-1]
+    same = cv2.resize(mask.astype(np.uint8), fine).astype(bool)
+    assert (same & finer).sum() > 0.98 * (same | finer).sum()
+
+
 def test_light_drift_and_noise_are_no_contact(background, rng):
     for gain, offset, noise in ((1, 0, 0), (1, 0, 7), (1.1, -6, 3), (0.9, 5, 5)):
         image = np.clip(background * gain + offset + rng.normal(0, noise, background.shape), 0, 255).astype(np.uint8)

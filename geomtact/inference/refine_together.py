@@ -47,7 +47,7 @@ _BEFORE = 0.5  # power of what a cell had, against what its likeliest pose expla
 # nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
 ALIKE, UNLIKE = 4.0, 8.0
 _WORTH = 0.5  # power of the likelihood in the evidence
-_OUTLINE = 100.0  # nats that each metre of a contact's outline costs even at the right pose
+_OUTLINE = 150.0  # nats that each metre of a contact's outline costs even at the right pose
 _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
 
 

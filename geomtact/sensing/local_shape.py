@@ -26,6 +26,7 @@ BySlope = Callable[[Array, Mask, Mask, float, Array], tuple[Array, Mask]]  # slo
 
 METHODS = ("classical", "pressure", "learned")  # the default first
 _GREY = 1 / 255
+_GRID = 120  # pixels along an image's shorter side, which is smoothed by one of them
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
 _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated readings of many gels and lamps
@@ -61,8 +62,10 @@ def contact_mask(
         pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
         check_size(image, sensor, "image")
     reference = None if background is None else same_size(as_unit_rgb(background, "background"), image)
-    # one smoothing scale from the resolution, 2 px at 320 x 240; a second look smooths more where noise asks for it
-    sigma = min(image.shape[:2]) / 120
+    size = image.shape[1::-1]
+    image, reference = _on_grid(image), None if reference is None else _on_grid(reference)
+    # a second look smooths more where noise asks for it
+    sigma = min(image.shape[:2]) / _GRID
     change, felt, strong, noise = _change(image, reference, sigma)
     if felt.any():
         noise_share = noise / float(np.quantile(_size(change)[felt], 0.9))
@@ -70,14 +73,21 @@ def contact_mask(
             sigma *= min(noise_share / _NOISE_SHARE, 2.0)
             change, felt, strong, _ = _change(image, reference, sigma)
     if not felt.any():
-        return felt
+        return np.zeros(size[::-1], bool)
     if method == "learned":
         pressed, mask = _by_network(change, felt)
     else:
         pressed, mask = _by_colour(
             change, felt, strong, sigma, pitch, _by_pressure if method == "pressure" else _by_rim
         )
-    return _components(mask, pressed, strong, sigma)
+    mask = _components(mask, pressed, strong, sigma)
+    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5)
+
+
+def _on_grid(image: Array) -> Array:
+    """``image`` (H, W, 3) on ``_GRID`` pixels along its shorter side: finer ones tell nothing that smoothing leaves."""
+    share = min(1.0, _GRID / min(image.shape[:2]))
+    return np.asarray(cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
 
 
 def _by_colour(
@@ -88,7 +98,7 @@ def _by_colour(
     power, colours = np.linalg.eigh(values.T @ values / len(values))
     if power[1] <= _ONE_COLOUR * power[2]:
         return _half_as_large(_one_way(change @ colours[:, 2], felt), felt)
-    slope = _slope_field(np.tensordot(change, colours[:, 1:] / np.sqrt(power[1:]), 1), felt, sigma, pitch)
+    slope = _slope_field(_transformed(change, (colours[:, 1:] / np.sqrt(power[1:])).T), felt, sigma, pitch)
     if slope is None:
         return _half_as_large(_size(change), felt)
     return by_slope(slope, felt, strong, sigma, pitch)
@@ -153,17 +163,17 @@ def smooth_background(image: Array) -> Array:
 
 
 def as_unit_rgb(image: Any, name: str) -> Array:
-    """An image (H, W, 3), uint8 or float 0..1, or its path, as 0..1; what is none is refused under its ``name``."""
+    """An image (H, W, 3), uint8 or float 0..1, or its path, as float32 0..1; what is none is refused under its ``name``."""
     if isinstance(image, str | Path):
         image = read_image(image)[..., :3]
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
         raise ImageError(f"{name}: expected an RGB image (H, W, 3), got an array of shape {image.shape}")
     if image.dtype == np.uint8:
-        return image / 255.0
+        return np.asarray(cv2.LUT(image, (np.arange(256) / 255).astype(np.float32)))
     if image.dtype.kind != "f":
         raise ImageError(f"{name}: expected uint8 or float 0..1, got {image.dtype}; convert it")
-    image = image.astype(float)
+    image = image.astype(np.float32)
     if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
         raise ImageError(f"{name}: expected finite values from 0 to 1, got NaN or others; divide by the white value")
     return image
@@ -198,7 +208,7 @@ def _change(image: Array, background: Array | None, sigma: float) -> tuple[Array
     """The smoothed change (H, W, 3) from the background, where it is felt and where strongly so, and its noise."""
     smooth = _blurred(image, sigma)
     reference = smooth_background(smooth) if background is None else _blurred(background, sigma)
-    change = _without_light_drift(smooth, reference, _apart(sigma))
+    change = _without_light_drift(smooth, reference, max(1, round(sigma)))
     # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
     floor = 0.0 if background is not None else float(np.median(_size(change)))
     return change, *_felt(change, sigma, floor)
@@ -207,18 +217,19 @@ def _change(image: Array, background: Array | None, sigma: float) -> tuple[Array
 def _without_light_drift(image: Array, reference: Array, step: int) -> Array:
     """``image`` minus the background, whose brightness is fitted per channel (gain, offset) to the calmer half of one in
     ``step`` pixels each way."""
-    gains, offsets = np.ones(3, image.dtype), np.zeros(3, image.dtype)
+    gains, offsets = np.empty(3, image.dtype), np.empty(3, image.dtype)
     for c in range(3):
         x, y = (each[::step, ::step, c].ravel() for each in (reference, image))
-        keep = np.ones(x.size, bool)
+        calm_x, calm_y = x, y
         for _ in range(6):
-            dx = x[keep] - x[keep].mean()
-            variance = float((dx**2).mean())
-            gain = float((dx * y[keep]).mean() / variance) if variance > _GREY**2 else 1.0
-            gain = float(np.clip(gain, 0.8, 1.25))
-            offset = float(y[keep].mean() - gain * x[keep].mean())
+            mean_x, mean_y = calm_x.mean(), calm_y.mean()
+            dx = calm_x - mean_x
+            variance = dx @ dx / dx.size
+            gain = np.clip(dx @ calm_y / dx.size / variance, 0.8, 1.25) if variance > _GREY**2 else dx.dtype.type(1)
+            offset = mean_y - gain * mean_x
             error = np.abs(y - gain * x - offset)
-            keep = error <= np.median(error)
+            calm = np.flatnonzero(error <= np.median(error))
+            calm_x, calm_y = x[calm], y[calm]
         gains[c], offsets[c] = gain, offset
     return image - gains * reference - offsets
 
@@ -253,7 +264,7 @@ def _slope_field(plane: Array, felt: Mask, sigma: float, pitch: Array) -> Array 
     residual, maps = np.linalg.eigh(curl.T @ curl)
     if residual[0] > _CURL_LIMIT * residual[-1]:
         return None
-    return np.tensordot(plane, maps[:, 0].reshape(2, 2), (2, 1))
+    return _transformed(plane, maps[:, 0].reshape(2, 2))
 
 
 def integrate(slope: Array, pitch: Array) -> Array:
@@ -289,7 +300,7 @@ def _sines(values: Array, axis: int) -> Array:
 def _inwards(height: Array, felt: Mask) -> float:
     """1 where the gel is pressed in towards larger ``height`` (H, W), else -1."""
     if (~felt).mean() > 0.15:
-        depth = cv2.distanceTransform(felt.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[felt]
+        depth = cv2.distanceTransform(felt.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)[felt]
         inward = ((height[felt] - height[felt].mean()) * depth).sum()
     else:
         # a contact that fills the window: the dome's difference from the object is curved downwards over most of it
@@ -321,7 +332,7 @@ def _steepest_fall(share: Array, felt: Mask) -> float:
     """The level of ``share`` (H, W) on whose contour it falls fastest in the mean."""
     edges = np.linspace(0.4, 0.9, 21)
     fall = np.hypot(*np.gradient(share))[felt]
-    bins = np.digitize(share[felt], edges)
+    bins = np.searchsorted(edges, share[felt], side="right")
     count = np.bincount(bins, minlength=22)[1:-1]
     mean = np.bincount(bins, fall, minlength=22)[1:-1] / np.maximum(count, 1)
     mean = np.convolve(np.pad(mean, 2, mode="edge"), np.ones(5) / 5, mode="valid")
@@ -351,12 +362,16 @@ def _uphill_maximum(height: Array, value: Array) -> Array:
 def _components(mask: Mask, height: Array, strong: Mask, sigma: float) -> Mask:
     """The components of ``mask`` that are pressed in, backed by a strong change and larger than the smoothing."""
     n, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    area, backed = (np.bincount(labels[where], minlength=n) for where in (mask, strong))
-    deepest = np.zeros(n)
-    np.maximum.at(deepest, labels[mask].astype(np.intp), height[mask])
-    keep = (area > np.pi * (2 * sigma) ** 2) & (backed > 0) & (deepest > 0.3 * height.max())
+    deep = mask & (height > 0.3 * height.max())
+    area, backed, pressed = (np.bincount(labels[where], minlength=n) for where in (mask, strong, deep))
+    keep = (area > np.pi * (2 * sigma) ** 2) & (backed > 0) & (pressed > 0)
     keep[0] = False
     return keep[labels]
+
+
+def _transformed(image: Array, matrix: Array) -> Array:
+    """``matrix`` (D, C) applied to each pixel of ``image`` (H, W, C)."""
+    return np.asarray(cv2.transform(image, matrix))
 
 
 def _size(change: Array) -> Array:
