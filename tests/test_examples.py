@@ -1,5 +1,6 @@
 """The examples run as they stand, in an empty folder, and come to what their pages say of them."""
 
+import json
 import os
 import re
 import subprocess
@@ -7,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 
@@ -41,3 +43,19 @@ def test_a_gripper_that_reads_its_width(example):
     said = example("gripper.py", "--part", "connector_plug", "--max-poses", "20000")
     assert float(re.search(r"the truth: (\S+) nats", said)[1]) > 0
     assert re.search(r"the jaw is \d+\.\d mm open", said)
+
+
+def test_kitting_places_nothing_that_it_is_not_sure_of(example, tmp_path):
+    """One touch of a plug leaves more than a millimetre open."""
+    said = example("kitting.py", "--part", "connector_plug", "--max-poses", "20000", "--touches", "1")
+    assert re.search(r"touch 1: \d+\.\d nats known, it fits with \d %", said) and "not sure, not placed" in said
+    with Image.open(tmp_path / "out" / "kitting" / "connector_plug.gif") as film:
+        assert film.n_frames > 5
+
+
+def test_a_figure_of_the_thesis_shows_the_distances_that_it_names(example, tmp_path):
+    example("thesis_figures.py", "10")
+    figure = json.loads((tmp_path / "out" / "thesis" / "thesis_figures.json").read_text())["10"]
+    for each in figure["shown"]:
+        assert each["add_mm"] == pytest.approx(each["normalised"] * figure["random_mm"], rel=1e-3)
+    assert (tmp_path / "out" / "thesis" / "thesis_errors.png").stat().st_size > 10_000

@@ -28,13 +28,14 @@ parser.add_argument("--part", default="pin", help="a bundled part, or a mesh fil
 parser.add_argument("--unit", help="of a mesh file: mm, cm, m or inch")
 parser.add_argument("--clearance-mm", type=float, default=1.0)
 parser.add_argument("--touches", type=int, default=4)
+parser.add_argument("--max-poses", type=int, default=1_200_000, help="of the grid")
 parser.add_argument("--seed", type=int, default=0)
 options = parser.parse_args()
 if options.touches < 1 or options.clearance_mm < 0:
     parser.error("expected --touches of 1 or more and a --clearance-mm of 0 or more")
 
 try:
-    localizer = Localizer.prepare(options.part, options.unit, sensor="gelslim")
+    localizer = Localizer.prepare(options.part, options.unit, sensor="gelslim", max_poses=options.max_poses)
 except GeomtactError as error:
     parser.error(str(error))
 space, mesh, rng = localizer.space, localizer.mesh, np.random.default_rng(options.seed)
@@ -88,10 +89,9 @@ def draw(fingers, believed, probabilities, placed=None, title=""):
     left.set_title("grey: believed, blue: true")
     colours = [GREEN if p >= SURE else "0.6" for p in probabilities]
     middle.bar(range(1, len(probabilities) + 1), probabilities, color=colours)
-    middle.axhline(SURE, color="k", lw=0.8, ls="--", label=f"sure: {SURE:g}")
-    middle.legend(loc="upper left", frameon=False, fontsize=8)
+    middle.axhline(SURE, color="k", lw=0.8, ls="--")
     middle.set(xlim=(0.4, options.touches + 0.6), xticks=range(1, options.touches + 1), ylim=(0, 1))
-    middle.set(title="P(fits)", xlabel="touches")
+    middle.set(title=f"P(fits), sure from {SURE:g}", xlabel="touches")
     recess = covered(truth[None])
     right.imshow(np.where(recess > 0, 0.25, 0.0), extent=extent, cmap="Greys", vmin=0, vmax=1)
     if placed is not None:
