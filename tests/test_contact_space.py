@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.stats import chi2, kstest
 
 from geomtact.contact_space import store
@@ -17,7 +18,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache, open_index
 from geomtact.errors import CacheError, UsageError
 from geomtact.geometry.approach import allowed, approach_of
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.se3 import exp, random_rotations, transform
 from geomtact.sensing.sensor import Sensor
 
@@ -270,6 +271,24 @@ def test_penetration_is_nan_off_the_space(ball, cone):
     T, ok = free.settle(T, 0.5 * MM)
     assert ok.all() and np.isfinite(free.penetration(T)).all()
     assert np.isnan(cone.space.penetration(T))[1]
+
+
+def tube(bore: float) -> Mesh:
+    made = trimesh.creation.annulus(bore / 2, bore / 2 + 0.01, 0.04, sections=128)
+    return Mesh(made.vertices, made.faces, "tube", "m")
+
+
+@pytest.mark.parametrize("bore, hollow", [(0.09, True), (0.03, False)])
+def test_a_bore_wider_than_the_window_is_a_hollow(bore, hollow):
+    """Of a tube's surface its inner wall faces itself, all but exactly across the bore."""
+    mesh, sensor = tube(bore), Sensor.load("gelslim")
+    inner = np.pi * bore * 0.04 / mesh.areas.sum()
+    assert ContactSpace(mesh, sensor).hollow == pytest.approx(inner if hollow else 0, abs=0.03)
+    assert ContactSpace(mesh, sensor, [((0, 0, 1), 0.1)]).hollow == 0, "what is not approached is no hollow"
+
+
+def test_a_solid_has_no_hollow(ball):
+    assert ContactSpace(ball.mesh, ball.sensor).hollow == 0
 
 
 def test_what_enters_the_housing_does_not_touch():

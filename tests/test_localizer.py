@@ -10,7 +10,7 @@ from geomtact import InputError, Localizer, PoseError, Sensor, UsageError
 from geomtact.evaluation.touches import random_touches
 from geomtact.geometry.approach import approach_of
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import GaussianPrior, prior_log_mass
 from geomtact.registration.rim import SINK
@@ -98,6 +98,15 @@ def test_a_contact_unlike_any_touch_is_warned_of(ball):
     mask = np.zeros(ball.sensor.image_size_px[::-1], bool)
     mask[:12], mask[-12:], mask[:, :12], mask[:, -12:] = True, True, True, True
     assert any("unlike any touch" in w for w in ball.localize(mask).warnings)
+
+
+def test_a_hollow_that_the_sensor_fits_into_is_warned_of(cache_dir):
+    made = trimesh.creation.annulus(0.045, 0.055, 0.04, sections=32)
+    tube = Localizer.prepare(
+        Mesh(made.vertices, made.faces, "tube", "m"), max_poses=2000, scorer="moments", cache_dir=cache_dir
+    )
+    touch = tube.space.sample(1, np.random.default_rng(1))[0][0]
+    assert any("hollows wider" in w for w in tube.localize(tube.simulate(touch).mask).warnings)
 
 
 def test_simulate_is_the_exact_cast(plug, a_touch):

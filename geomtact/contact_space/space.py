@@ -17,6 +17,7 @@ from geomtact.sensing.sensor import Sensor
 
 # a pose settles to this, and so may press deeper than the gel allows, or not quite touch, by as much
 _SETTLED = 1e-6  # m
+_LOOKED_AT = 4096  # points of the surface, for what faces them
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,16 @@ class ContactSpace:
     @cached_property
     def cones(self) -> list[tuple[Array, float]] | None:
         return check_approach(self.approach)
+
+    @cached_property
+    def hollow(self) -> float:
+        """The share of the surface, of what may be approached, that faces another across a gap wider than the window: the sensor
+        may fit in there, and no pose of it there is found by coming from outside (thesis 6.1.1, its footnote)."""
+        points, normals = self.mesh.sample_surface(_LOOKED_AT)
+        reached = allowed(normals, self.cones)
+        gap = self.caster.ways(points[reached], normals[reached])
+        wide = np.isfinite(gap) & (gap > 2 * self.sensor.half_window.max())
+        return float(wide.mean()) if len(gap) else 0.0
 
     def penetration(self, T: ArrayLike) -> Array:
         """Depth (n,) [m] of the deepest point in the window at ``T`` (n, 4, 4); NaN outside the contact pose space."""

@@ -55,6 +55,7 @@ class Effort:
     thorough: bool = True
 
 
+_HOLLOW = 0.01  # share of the surface in hollows that the sensor may fit into, from which it is warned of
 _HALL = 100.0  # m from the origin from which a translation is taken to be in millimetres
 _ROOM = 10.0  # m between two sensors from which translations are taken to be in millimetres
 EFFORTS = {"fast": Effort("blocks", 0), "balanced": Effort("cells", 5, thorough=False), "exact": Effort("all", 25)}
@@ -244,6 +245,11 @@ class Localizer:
         odd = prior is None and self.scorer.witness.odd(evidence, likeliest)
         if odd:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
+        if self.space.hollow > _HOLLOW:
+            warnings.append(
+                f"{100 * self.space.hollow:.0f} % of the part's surface lies in hollows wider than the sensor's window, and "
+                "touches in there are taken for others: touch from outside, or localize on a mesh of that wall alone"
+            )
         return replace(posterior, warnings=warnings, settings=posterior.settings | {"odd": odd})
 
     def simulate(self, T_sensor_object: Any) -> Contact:

@@ -18,6 +18,7 @@ from geomtact.sensing.scene import MISSED, scene_of
 from geomtact.sensing.sensor import Sensor
 
 _RAYS_PER_CALL = 1 << 18
+_OFF = 1e-6  # m from a surface, where a ray begins that shall not meet it
 
 
 class Caster:
@@ -101,6 +102,13 @@ class Caster:
             np.maximum.at(out[part], pose[seen], depth[seen])
             out[part][self._camera_inside(sensor, T[part])] = np.inf
         return out
+
+    def ways(self, points: Array, directions: Array) -> Array:
+        """How far (n,) [m] it is from ``points`` (n, 3) of the surface along unit ``directions`` (n, 3) to the surface again;
+        +inf where it is not met."""
+        rows = (points - self._centre + _OFF * directions, directions)
+        far = self._scene.distances(*(np.ascontiguousarray(each, np.float32) for each in rows))
+        return np.where(far > MISSED, np.inf, far.astype(float))
 
     def lowest_outside(self, sensor: Sensor, T: ArrayLike) -> Array:
         """Lowest z (n,) [m] of the object's vertices outside the window, in the sensor frame; +inf if none is below 0."""
