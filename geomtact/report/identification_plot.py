@@ -32,7 +32,7 @@ def draw_identification(content: Mapping[str, Any]) -> bytes:
     left.axhline(100 / len(content["parts"]), color="0.5", ls=":", lw=1, label="chance")
     left.set(xticks=touches, ylim=(0, 102), xlabel="touches", ylabel="scenes [%]", title="Which part is it?")
     left.spines[["top", "right"]].set_visible(False)
-    left.legend(frameon=False, fontsize=8, loc="center right")
+    left.legend(frameon=False, fontsize=8, loc="upper left")
 
     names = list(content["parts"])
     taken = np.zeros((len(names), len(names)))
