@@ -19,6 +19,17 @@ FAULTS = {
 }
 
 
+def torn(image, level):
+    """With a tear along a curve, a twelfth of the image's height wide, through which ``level`` is seen."""
+    import cv2
+
+    h, w = image.shape[:2]
+    along = np.linspace(0, 1, 40)
+    curve = np.stack([w * (0.35 + 0.25 * along), h * (0.3 + 0.3 * along**2)], 1)
+    mask = cv2.polylines(np.zeros((h, w), np.uint8), [curve.astype(np.int32)], False, 1, round(h / 12))
+    return np.where(mask[..., None] > 0, level, image)
+
+
 @pytest.fixture(scope="module")
 def sets(data_folder):
     """For each set of real readings, its background and images, as 0..1."""
@@ -43,6 +54,30 @@ def test_no_real_reading_is_accused(sets):
     for name, (background, images) in sets.items():
         assert [faults(image, background) for image in images] == [[]] * len(images), name
         assert [faults(image, None) for image in images] == [[]] * len(images), name
+
+
+@pytest.mark.parametrize("level", [0.03, 1.0])
+def test_a_torn_gel_is_found_whenever_it_tore(sets, level):
+    """A camera sees the dark, or a lamp, through it; before the background was taken or after."""
+    for name in ("gelslam", "gelsight", "digit"):
+        background, images = sets[name]
+        for image in images[::4]:
+            for before in (background, torn(background, level), None):
+                (said,) = faults(torn(image, level), before)
+                assert "torn" in said, name
+
+
+def test_markers_are_no_tear(sets):
+    """Nine by seven black dots of a thirtieth of the image's width."""
+    import cv2
+
+    for background, images in sets.values():
+        h, w = background.shape[:2]
+        dots = np.zeros((h, w), np.uint8)
+        for x in np.linspace(0.1, 0.9, 9):
+            for y in np.linspace(0.1, 0.9, 7):
+                cv2.circle(dots, (round(w * x), round(h * y)), round(w / 60), 1, -1)
+        assert faults(*(np.where(dots[..., None] > 0, 0.03, each) for each in (images[0], background))) == []
 
 
 @pytest.mark.parametrize("fault", FAULTS)
