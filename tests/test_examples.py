@@ -3,12 +3,19 @@
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 from PIL import Image
+
+from geomtact import Localizer
+from geomtact.sensing.render import example_reading
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 
@@ -59,3 +66,52 @@ def test_a_figure_of_the_thesis_shows_the_distances_that_it_names(example, tmp_p
     for each in figure["shown"]:
         assert each["add_mm"] == pytest.approx(each["normalised"] * figure["random_mm"], rel=1e-3)
     assert (tmp_path / "out" / "thesis" / "thesis_errors.png").stat().st_size > 10_000
+
+
+def test_the_ros_node_sends_the_first_mode_in_the_images_frame(ball, monkeypatch, rng):
+    """ROS itself is stood in for: the node sees the untouched gel, a press, and an image of another size."""
+    pressed = ball.simulate(ball.space.sample(1, rng, (8e-4, 1e-3))[0][0]).height
+    images = [example_reading(height, ball.sensor.pixel_pitch, 0.0, rng) for height in (0 * pressed, pressed)]
+    images.append(images[1][:-2])
+    published, warned = [], []
+
+    class Node:
+        def __init__(self, name):
+            assert name == "geomtact"
+
+        def declare_parameter(self, name, value):
+            return SimpleNamespace(value=value)
+
+        def create_publisher(self, kind, topic, depth):
+            return SimpleNamespace(publish=published.append)
+
+        def create_subscription(self, kind, topic, seen, depth):
+            pass
+
+        def get_logger(self):
+            return SimpleNamespace(info=lambda line: None, warning=warned.append)
+
+    def spin(node):
+        for image in images:
+            node.seen(SimpleNamespace(header=SimpleNamespace(frame_id="gel"), image=image))
+
+    parts = {
+        "rclpy": {"init": lambda: None, "spin": spin},
+        "rclpy.node": {"Node": Node},
+        "cv_bridge": {"CvBridge": lambda: SimpleNamespace(imgmsg_to_cv2=lambda message, encoding: message.image)},
+        "geometry_msgs.msg": {"PoseWithCovarianceStamped": lambda header: MagicMock(header=header)},
+        "sensor_msgs.msg": {"Image": object},
+    }
+    for name, held in parts.items():
+        module = ModuleType(name)
+        module.__dict__.update(held)
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(Localizer, "prepare", lambda part, sensor: ball)
+    runpy.run_path(str(EXAMPLES / "ros2_node.py"))
+
+    (message,) = published
+    mode = ball.localize(images[1], kind="reading", background=images[0]).modes(1)[0]
+    position = message.pose.pose.position
+    np.testing.assert_allclose([position.x, position.y, position.z], mode.T[:3, 3])
+    assert message.header.frame_id == "gel" and np.shape(message.pose.covariance) == (36,)
+    assert len(warned) == 1 and "px" in warned[0]
