@@ -14,6 +14,7 @@ from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import GaussianPrior, prior_log_mass
 from geomtact.registration.rim import SINK
+from geomtact.scoring import fitted
 from geomtact.se3 import exp, log, random_rotations, transform
 
 MM = 1e-3
@@ -100,7 +101,8 @@ def test_a_contact_unlike_any_touch_is_warned_of(ball):
     assert any("unlike any touch" in w for w in ball.localize(mask).warnings)
 
 
-def test_a_hollow_that_the_sensor_fits_into_is_warned_of(cache_dir):
+def test_a_hollow_that_the_sensor_fits_into_is_warned_of(cache_dir, monkeypatch):
+    monkeypatch.setattr(fitted, "TOUCHES", 60)
     made = trimesh.creation.annulus(0.045, 0.055, 0.04, sections=32)
     tube = Localizer.prepare(
         Mesh(made.vertices, made.faces, "tube", "m"), max_poses=2000, scorer="moments", cache_dir=cache_dir
