@@ -336,6 +336,17 @@ def test_the_grid_does_not_show_as_a_comb():
     assert alone.max() == pytest.approx(1)
 
 
+@pytest.mark.parametrize("mark", [-3.3, 0.0, 4.1])
+@pytest.mark.parametrize("most", [8, 36])
+def test_no_edge_of_a_histogram_falls_on_the_grid(mark, most):
+    """Every bin but those at the ends holds as many of the grid's lines, wherever rounding puts them."""
+    lines = 0.7 * np.arange(-40, 41) + 1e-13 * np.random.default_rng(0).normal(size=81)
+    mass, _ = Samples("x", lines, np.full(81, 1 / 81), mark, 0.7).histogram(most)
+    held = np.round(81 * mass).astype(int)
+    inner = held[np.flatnonzero(held)[1] : np.flatnonzero(held)[-1]]
+    assert held.sum() >= 80 and len(set(inner)) == 1, held
+
+
 def test_contact_centre_is_the_pressed_spot():
     sensor = Sensor.load("gelsight-mini")
     x, y = sensor.pixel_centres()

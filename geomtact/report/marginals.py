@@ -40,11 +40,13 @@ class Samples:
         """
         order = np.argsort(self.values)
         mass = np.cumsum(self.weights[order])
-        low, high = self.values[order[np.searchsorted(mass, [0.0005, min(0.9995, mass[-1])])]]
-        low, high = min(low, self.mark), max(high, self.mark)
+        first, last = self.values[order[np.searchsorted(mass, [0.0005, min(0.9995, mass[-1])])]]
+        low, high = min(first, self.mark), max(last, self.mark)
         width = self.step * max(1, np.ceil((high - low) / ((most - 2) * self.step)))
         bins = int((high - low) // width) + 2
         start = low - 0.5 * (bins * width - (high - low))
+        # where values lie whole steps apart, no edge shall fall on them
+        start = first - (np.floor((first - start) / self.step) + 0.5) * self.step
         return np.histogram(self.values, start + width * np.arange(bins + 1), weights=self.weights)
 
 
