@@ -45,6 +45,8 @@ def train(
     ] = "encoder",
     pairs: Annotated[int, typer.Option(min=32, help="Pairs of contacts that a resnet50 learns from.")] = 100_000,
     side: Annotated[int, typer.Option(min=32, help="Pixels along the side of a resnet50's images.")] = 224,
+    width: Annotated[int, typer.Option(min=8, help="Neurons a layer of an encoder.")] = 512,
+    dimension: Annotated[int, typer.Option(min=2, help="Numbers that an encoder makes of a contact.")] = 16,
     rate: Annotated[float | None, typer.Option(min=1e-9, help="Learning rate, where the usual one diverges.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     work: Annotated[
@@ -91,8 +93,8 @@ def train(
     from geomtact.training.train import Settings
     from geomtact.training.train import train as run
 
-    settings = Settings(steps=steps or 4000, seed=seed)
-    recipe = {"architecture": ARCHITECTURE, "seed": seed}
+    settings = Settings(steps=steps or 4000, width=width, dimension=dimension, seed=seed)
+    recipe = {"architecture": ARCHITECTURE, "width": width, "dimension": dimension, "seed": seed}
     with progress_bar("training") as progress:
         if object_name is None:
             n = scenes or 600

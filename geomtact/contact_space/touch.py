@@ -34,8 +34,15 @@ def felt_mask(
     return elastic_in_window(depth, pitch, margin, sensor.max_penetration)
 
 
-def felt_height(space: ContactSpace, T: ArrayLike) -> NDArray[np.float32]:
-    """How deep an elastic gel is pressed in [m] by the object at ``T`` (4, 4): (H, W) at the sensor's own resolution."""
+def felt_height(space: ContactSpace, T: ArrayLike, elastic: bool = True) -> NDArray[np.float32]:
+    """How deep the gel is pressed in [m] by the object at ``T`` (4, 4): (H, W) at the sensor's own resolution.
+
+    An ``elastic`` gel sinks beside the contact too.
+    """
+    if not elastic:
+        height = space.caster.contact(space.sensor, T).height
+        assert height is not None
+        return height
     depth, pitch, margin = _around(space, T, space.sensor.image_size_px[::-1])
     gel, window = _where_gel(depth, margin, space.sensor.max_penetration)
     return elastic_contact(gel, pitch)[1][window]

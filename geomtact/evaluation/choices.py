@@ -17,14 +17,14 @@ import numpy as np
 
 from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import CALIBRATION_NOISE
+from geomtact.contact_space.touch import CALIBRATION_NOISE, felt_height
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import scores
 from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.fixture import upwards
 from geomtact.evaluation.sensors_study import make_scenes
 from geomtact.evaluation.study import mean_with_interval
-from geomtact.evaluation.touches import random_touches
+from geomtact.evaluation.touches import Touch, random_touches
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.localizer import EFFORTS, Effort, Localizer
@@ -33,7 +33,7 @@ from geomtact.scoring.calibration import calibrate, simulate_touches
 from geomtact.scoring.catalogue import DEFAULT_SCORER
 from geomtact.scoring.fitted import SEED, TOUCHES
 from geomtact.se3 import Array
-from geomtact.sensing.noise import CLEAN, MODERATE, Noise
+from geomtact.sensing.noise import CLEAN, MODERATE, Noise, smooth_field
 from geomtact.sensing.sensor import Sensor
 
 SCENES = ("one touch", "three sensors", "known side")
@@ -54,6 +54,7 @@ class Way:
     cone : half angle [rad] about the known side to which touches are restricted; None for all directions
     quotient : whether poses that look alike by symmetry count as one
     noise, elastic : of the touches that the score is calibrated on, as of ``scoring.calibration.simulate_touches``
+    kind : of the image: "mask" or "height"
     """
 
     choice: str
@@ -65,6 +66,7 @@ class Way:
     quotient: bool = True
     noise: Noise = CALIBRATION_NOISE
     elastic: bool | None = None
+    kind: str = "mask"
 
     @property
     def prepared(self) -> tuple[Any, ...]:
@@ -88,7 +90,11 @@ WAYS = {
     "iou": Way("score", scorer="iou"),
     "l1": Way("score", scorer="l1"),
     "symmetry ignored": Way("symmetry", quotient=False),
+    "heights": Way("image", kind="height"),
     "calibrated without noise": Way("calibration", noise=CLEAN),
+    "calibrated without trembling": Way("calibration", noise=replace(CALIBRATION_NOISE, outline_rms=0.0)),
+    "calibrated without specks": Way("calibration", noise=replace(CALIBRATION_NOISE, specks=0)),
+    "calibrated without gaps": Way("calibration", noise=replace(CALIBRATION_NOISE, missing_probability=0.0)),
     "calibrated on rigid gels": Way("calibration", elastic=False),
     "within 30 degrees": Way("side", SCENES[2:], cone=np.radians(30)),
     "this side alone": Way("side", SCENES[2:], cone=0.0, max_poses=50_000),
@@ -107,7 +113,11 @@ MODELLED = {
     "2.4M poses, not 1.2M": (DEFAULT, "2.4M poses"),
     "the network, not moments": ("moments", DEFAULT),
     "symmetry": ("symmetry ignored", DEFAULT),
+    "heights, not a mask": (DEFAULT, "heights"),
     "noise, in calibrating": ("calibrated without noise", DEFAULT),
+    "trembling outlines": ("calibrated without trembling", DEFAULT),
+    "specks": ("calibrated without specks", DEFAULT),
+    "missing patches": ("calibrated without gaps", DEFAULT),
     "elastic gels, in calibrating": ("calibrated on rigid gels", DEFAULT),
 }
 
@@ -121,11 +131,13 @@ class Timed(Answer):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Something touched: the true pose (4, 4), the masks, and the sensors' poses (n, 4, 4), None in the sensor's own frame."""
+    """Something touched: the true pose (4, 4), the masks, the sensors' poses (n, 4, 4), None in the sensor's own frame, and the
+    height map [m] of a single touch."""
 
     T: Array
     masks: list[Any]
     T_world_sensor: Array | None = None
+    height: Any = None
 
 
 def prepare(
@@ -147,14 +159,29 @@ def prepare(
 
 
 def make(kind: str, localizer: Localizer, n: int, seed: int) -> list[Scene]:
-    """``n`` scenes of a kind, rigid and elastic in turn, with moderate noise; ``localizer`` is the default's."""
+    """``n`` scenes of a kind, rigid and elastic in turn, with moderate noise; ``localizer`` is the default's.
+
+    Where a height map shows contact it is off by a smooth field, as strong as the sensor's file says.
+    """
     if kind == "three sensors":
         scenes = make_scenes(localizer, n, seed, MODERATE, None, _SENSORS)
         return [Scene(s.T_world_object, [t.mask for t in s.touches], s.T_world_sensor) for s in scenes]
     where: Any = localizer
     if kind == "known side":
         where = SimpleNamespace(space=ContactSpace(localizer.mesh, localizer.sensor, [(upwards(localizer.mesh), 0.0)]))
-    return [Scene(t.T_sensor_object, [t.mask]) for t in random_touches(where, n, seed, None, MODERATE)]
+    touches = random_touches(where, n, seed, None, MODERATE)
+    return [
+        Scene(t.T_sensor_object, [t.mask], height=_height(where.space, t, [seed, i])) for i, t in enumerate(touches)
+    ]
+
+
+def _height(space: ContactSpace, touch: Touch, seed: list[int]) -> Array:
+    """The height map (H, W) [m] of a touch."""
+    rng = np.random.default_rng(seed)
+    height = felt_height(space, touch.T_sensor_object, touch.elastic)
+    x, y = space.sensor.pixel_centres()
+    off = space.sensor.height_noise * smooth_field(x, y, rng.uniform(*MODERATE.correlation), rng)
+    return np.where(height > 0, np.maximum(height + off, 0), 0)
 
 
 def localized(
@@ -167,11 +194,13 @@ def localized(
         for name, localizer in localizers.items():
             if kind not in WAYS[name].scenes:
                 continue
+            way = WAYS[name]
             images = scene.masks if len(scene.masks) > 1 else scene.masks[0]
-            T, effort = scene.T_world_sensor, WAYS[name].effort
+            images = scene.height if way.kind == "height" else images
+            T, effort = scene.T_world_sensor, way.effort
             began, posterior = time.perf_counter(), None
             with suppress(NoPoseAgreesError):
-                posterior = localizer.localize(images, "mask", None, T, effort=effort, seed=seed)
+                posterior = localizer.localize(images, way.kind, None, T, effort=effort, seed=seed)
             ms = 1e3 * (time.perf_counter() - began)
             answer = REFUSED if posterior is None else judged(mesh, scene.T, posterior)
             out[name] = Timed(**asdict(answer), ms=ms)
