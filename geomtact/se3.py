@@ -48,6 +48,20 @@ def check_transforms(T: ArrayLike, name: str = "T") -> Array:
     return out
 
 
+def check_pose(T: ArrayLike, name: str = "T") -> Array:
+    """Return ``T`` as float64 (4, 4) after checking that it is one rigid transform.
+
+    Raises
+    ------
+    PoseError
+        As of :func:`check_transforms`, or there are several.
+    """
+    out = check_transforms(T, name)
+    if out.shape != (4, 4):
+        raise PoseError(f"{name}: expected one pose (4, 4), got shape {out.shape}")
+    return out
+
+
 def transform(R: ArrayLike, t: ArrayLike) -> Array:
     """Homogeneous (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3) [m]."""
     R, t = np.asarray(R, float), np.asarray(t, float)

@@ -1,6 +1,7 @@
 """Laws of many tasks: the files are the same however they are made, and a process that is killed loses its own task alone."""
 
 import hashlib
+import inspect
 import json
 import os
 import signal
@@ -107,6 +108,20 @@ def test_a_study_of_parts_apart_finds_what_it_finds_of_one_after_the_other(few_t
     assert {path.name for path in tmp_path.iterdir()} == {"apart.json", "one.json"}
 
 
+def test_every_study_by_part_names_the_part_that_it_cannot_judge(tmp_path):
+    (evaluate,) = app.registered_groups
+    judged_apart = [
+        study.name
+        for study in evaluate.typer_instance.registered_commands
+        if "ray" in inspect.signature(study.callback).parameters
+    ]
+    assert len(judged_apart) >= 8
+    for study in judged_apart:
+        out = tmp_path / f"{study}.json"
+        done = CliRunner().invoke(app, ["evaluate", study, "pim", "--jobs", "1", "--out", str(out)])
+        assert done.exit_code == 3 and "pim: not judged" in done.output, (study, done.output)
+
+
 def test_a_study_apart_keeps_what_it_could_judge_and_names_the_rest(few_touches, tmp_path, cache_dir):
     out = tmp_path / "study.json"
     words = ["evaluate", "stability", PARTS[0], "pim", "--touches", "1", "--sweep", "noise", "--max-poses", "3000"]
@@ -184,6 +199,13 @@ def test_several_parts_are_trained_for_each_into_a_folder(tmp_path):
     for wrong, said in (
         ([*words, "--out", "one.safetensors"], "--out one.safetensors: expected a folder for the weights of 2 parts"),
         ([*words[:1], "--object", "ball", *words[3:], "--jobs", "2"], "--jobs and --ray train for several parts"),
+        (
+            ["train", "--object", "ball", *words[3:], "--width", "64"],
+            "--width does not go with --architecture resnet50",
+        ),
+        (["train", "--architecture", "mask", "--pairs", "64"], "--pairs does not go with --architecture mask"),
+        (["train", "--architecture", "mask", "--object", "ball"], "--object does not go with --architecture mask"),
+        (["train", "--side", "64"], "--side does not go with --architecture encoder"),
     ):
         refused = CliRunner().invoke(app, wrong)
         assert refused.exit_code == 2 and said in refused.output, refused.output

@@ -117,6 +117,8 @@ def test_wrong_names_and_paths_are_told_before_any_work(geomtact, touched, tmp_p
         in geomtact("localize", image, "--effort", "fsat", status=2).stderr
     )
     assert "'mask'" in geomtact("localize", image, "--kind", "maks", status=2).stderr
+    assert "'png'" in geomtact("localize", image, "--out", "out", "--report", "pgn", status=2).stderr
+    assert "--report needs --out" in geomtact("localize", image, "--report", "png", status=2).stderr
     assert "is a file; give a folder" in geomtact("localize", image, "--out", "part.stl", status=2).stderr
     assert "is a file; give a folder" in geomtact("simulate", "ball", "--out", "part.stl", status=2).stderr
     assert "is a folder; give the images in it" in geomtact("localize", str(tmp_path), status=3).stderr
@@ -200,6 +202,11 @@ def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touch
     again = geomtact("localize", touched / "ball_1.png", "--json", "--seed", 0)
     printed = json.loads(again.stdout)
     assert printed["modes"] == content["modes"]
+
+    for wanted, written in (("png", {"report.png"}), ("html", {"report.html"}), ("none", set())):
+        told = geomtact("localize", touched / "ball_1.png", "--out", wanted, "--report", wanted).stdout
+        assert {p.name for p in (tmp_path / wanted).iterdir()} == {"posterior.npz", "result.json"} | written
+        assert all((name in told) == (name in written) for name in ("report.png", "report.html"))
 
     shutil.copytree(cache, tmp_path / "copy")
     assert "ball" in geomtact("cache", "--cache-dir", "copy").stdout

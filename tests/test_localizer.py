@@ -118,7 +118,7 @@ def test_simulate_is_the_exact_cast(plug, a_touch):
     assert contact.height.max() == pytest.approx(plug.space.penetration(T)[0], abs=0.05 * MM)
     with pytest.raises(PoseError):
         plug.simulate(np.eye(3))
-    with pytest.raises(UsageError, match="expected one pose"):
+    with pytest.raises(PoseError, match="expected one pose"):
         plug.simulate(np.stack([T, T]))
 
 

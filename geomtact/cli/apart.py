@@ -130,10 +130,9 @@ def _judge_apart(judge: Command, options: Mapping[str, Any], jobs: int | None, r
         if before and not file.exists():
             shutil.copyfile(out, file)
     same = dict(options) | {name: None for name in options if name.startswith("plot")}
-    same |= {
-        "sensor": everywhere(options["sensor"]),
-        "cache_dir": (options["cache_dir"] or default_cache_dir()).absolute(),
-    }
+    same["sensor"] = everywhere(options["sensor"])
+    if "cache_dir" in options:  # a study of what preparing costs has none
+        same["cache_dir"] = (options["cache_dir"] or default_cache_dir()).absolute()
     tasks = []
     for part, file in zip(parts, files, strict=True):
         name, unit = part_of_task(part, options["unit"])

@@ -33,6 +33,12 @@ class Effort(StrEnum):
     exact = "exact"
 
 
+class Report(StrEnum):
+    html = "html"
+    png = "png"
+    none = "none"
+
+
 def localize(
     images: Annotated[
         list[Path] | None,
@@ -78,6 +84,12 @@ def localize(
     out: Annotated[
         Path | None, typer.Option(help="Folder for result.json, posterior.npz, report.html and report.png.")
     ] = None,
+    report: Annotated[
+        str | None,
+        typer.Option(
+            metavar="|".join(Report), help="Which report goes into --out; both by default.", show_default=False
+        ),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print result.json, and nothing else, to standard output.")
     ] = False,
@@ -110,6 +122,10 @@ def localize(
         "effort": effort,
     }
     check_folder(out)
+    if report is not None:
+        _check_name("report", report, Report)
+        if out is None:
+            raise UsageError("--report needs --out, the folder that it is written into")
     prior = prior and posterior_file(prior, "--prior")
     images = images or []
     live = camera is not None or watch
@@ -208,7 +224,8 @@ def localize(
         from geomtact.report.shown import shown_of
         from geomtact.report.write import write_all
 
-        content = write_all(out, posterior, modes, shown_of(posterior, localizer), settings, timing, told_parts)
+        shown = shown_of(posterior, localizer)
+        content = write_all(out, posterior, modes, shown, settings, timing, told_parts, _reports(report))
     elif as_json:
         from geomtact.report.result import result
 
@@ -220,7 +237,7 @@ def localize(
     else:
         if len(parts) > 1:
             _print_parts(found)
-        _print(posterior, modes, out)
+        _print(posterior, modes, out, _reports(report))
     if not posterior.contact:
         where = "the image" if len(images) == 1 else f"any of the {len(images)} images"
         blank = posterior.observation.kind == "mask"
@@ -269,7 +286,19 @@ def _print_parts(found: Identification) -> None:
     print_table(("part", "probability", "log evidence", "unlike"), rows, ("probability", "log evidence"))
 
 
-def _print(posterior, modes, out: Path | None) -> None:
+def _reports(asked: str | None) -> list[str]:
+    """The reports that are written."""
+    if asked is None:
+        return [kind.value for kind in Report if kind is not Report.none]
+    return [] if asked == Report.none else [asked]
+
+
+def _named(reports: list[str]) -> str:
+    """The reports' files, as a line lists them before others."""
+    return f"report.{' and .'.join(reports)}, " if reports else ""
+
+
+def _print(posterior, modes, out: Path | None, reports: list[str]) -> None:
     from geomtact.report.summary import HEADINGS, caution, facts, summaries_of, table
 
     typer.echo(f"{posterior.mesh.name} on {posterior.sensor.name}, {posterior.frame} frame")
@@ -279,6 +308,4 @@ def _print(posterior, modes, out: Path | None) -> None:
         print_table(HEADINGS, table(summaries), right)
         for line in (*facts(posterior), *caution(summaries)):
             typer.echo(line)
-    typer.echo(
-        f"written: {out}/report.html and .png, result.json, posterior.npz" if out else "for a report, give --out DIR"
-    )
+    typer.echo(f"written: {out}/{_named(reports)}result.json, posterior.npz" if out else "for a report, give --out DIR")

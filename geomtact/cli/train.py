@@ -15,6 +15,13 @@ from geomtact.cli.shell import progress_bar, tell
 from geomtact.errors import InputError, UsageError
 
 MASK = "mask"  # a name for --architecture, beside those of encoders
+# options that say nothing to an architecture
+_OF_RESNET, _OF_ENCODER = ("pairs", "side"), ("start", "width", "dimension")
+_UNSUITED = {
+    "encoder": _OF_RESNET,
+    MASK: ("object_name", "unit", *_OF_RESNET, *_OF_ENCODER),
+    "resnet50": ("scenes", "steps", *_OF_ENCODER),
+}
 _TUNING_RATE = 3e-4  # a step of fine-tuning must not undo what many parts taught
 
 
@@ -43,10 +50,16 @@ def train(
             help="encoder; mask: what finds the contact in a reading; or resnet50: the thesis's network, for one part."
         ),
     ] = "encoder",
-    pairs: Annotated[int, typer.Option(min=32, help="Pairs of contacts that a resnet50 learns from.")] = 100_000,
-    side: Annotated[int, typer.Option(min=32, help="Pixels along the side of a resnet50's images.")] = 224,
-    width: Annotated[int, typer.Option(min=8, help="Neurons a layer of an encoder.")] = 512,
-    dimension: Annotated[int, typer.Option(min=2, help="Numbers that an encoder makes of a contact.")] = 16,
+    pairs: Annotated[
+        int | None, typer.Option(min=32, help="Pairs of contacts that a resnet50 learns from; 100,000 by default.")
+    ] = None,
+    side: Annotated[
+        int | None, typer.Option(min=32, help="Pixels along the side of a resnet50's images; 224 by default.")
+    ] = None,
+    width: Annotated[int | None, typer.Option(min=8, help="Neurons a layer of an encoder; 512 by default.")] = None,
+    dimension: Annotated[
+        int | None, typer.Option(min=2, help="Numbers that an encoder makes of a contact; 16 by default.")
+    ] = None,
     rate: Annotated[float | None, typer.Option(min=1e-9, help="Learning rate, where the usual one diverges.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     work: Annotated[
@@ -74,18 +87,18 @@ def train(
 
     if architecture not in (ARCHITECTURE, MASK, THESIS):
         raise UsageError(f"--architecture {architecture}: expected {ARCHITECTURE}, {MASK} or {THESIS}")
+    for name in _UNSUITED[architecture]:
+        if options[name] is not None:
+            option = "--object" if name == "object_name" else f"--{name}"
+            raise UsageError(f"{option} does not go with --architecture {architecture}; leave it out")
     work = work or out.with_name(f"{out.stem}.training")
     if architecture == MASK:
-        if object_name is not None or start is not None:
-            raise UsageError(
-                f"--architecture {MASK}: it learns from nothing, for all parts; leave out --object and --start"
-            )
         _train_mask(out, work, scenes or 600, steps or 6000, rate, seed)
         return
     if architecture == THESIS:
         if object_name is None:
             raise UsageError(f"--architecture {THESIS}: the thesis's network is trained for one part; give --object")
-        _train_thesis(out, work, object_name, unit, sensor, pairs, side, rate, seed)
+        _train_thesis(out, work, object_name, unit, sensor, pairs or 100_000, side or 224, rate, seed)
         return
     from geomtact.training import dataset
     from geomtact.training.card import read_weights, write_encoder
@@ -93,8 +106,8 @@ def train(
     from geomtact.training.train import Settings
     from geomtact.training.train import train as run
 
-    settings = Settings(steps=steps or 4000, width=width, dimension=dimension, seed=seed)
-    recipe = {"architecture": ARCHITECTURE, "width": width, "dimension": dimension, "seed": seed}
+    settings = Settings(steps=steps or 4000, width=width or 512, dimension=dimension or 16, seed=seed)
+    recipe = {"architecture": ARCHITECTURE, "width": settings.width, "dimension": settings.dimension, "seed": seed}
     with progress_bar("training") as progress:
         if object_name is None:
             n = scenes or 600

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.resolution import Resolution
+from geomtact.contact_space.space import ContactSpace
 from geomtact.geometry.approach import Approach
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
@@ -80,6 +81,11 @@ class Index:
     def angle_step(self) -> float:
         """Angle between neighbouring rotations [rad]."""
         return self.directions.angle_step(self.resolution.turn_step)
+
+    @cached_property
+    def space(self) -> ContactSpace:
+        """The contact pose space, undiscretised."""
+        return ContactSpace(self.mesh, self.sensor, self.approach)
 
     @cached_property
     def directions(self) -> Directions:

@@ -32,7 +32,7 @@ from geomtact.progress import Progress
 from geomtact.scoring.calibration import Calibration, posterior_log_prob
 from geomtact.scoring.catalogue import DEFAULT_SCORER
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
-from geomtact.se3 import Array, check_transforms
+from geomtact.se3 import Array, check_pose, check_transforms
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
@@ -254,10 +254,7 @@ class Localizer:
 
     def simulate(self, T_sensor_object: Any) -> Contact:
         """What the sensor would see at a pose (4, 4), without noise (thesis 6.1.3)."""
-        T = check_transforms(T_sensor_object, "T_sensor_object")
-        if T.shape != (4, 4):
-            raise UsageError(f"simulate: expected one pose (4, 4), got shape {T.shape}")
-        return self.space.caster.contact(self.sensor, T)
+        return self.space.caster.contact(self.sensor, check_pose(T_sensor_object, "T_sensor_object"))
 
     def track(
         self, frames: Iterable[Any], T_world_sensor: Any = None, motion: Any = None, **options: Any
@@ -283,10 +280,10 @@ class Localizer:
     def sensor(self) -> Sensor:
         return self.index.sensor
 
-    @cached_property
+    @property
     def space(self) -> ContactSpace:
         """The object's contact pose space, undiscretised."""
-        return ContactSpace(self.mesh, self.sensor, self.index.approach)
+        return self.index.space
 
     @cached_property
     def refinery(self) -> Refinery:

@@ -118,9 +118,10 @@ class Posterior:
         """The touch it came from, None for a loaded posterior."""
         return self.observations[0] if self.observations else None
 
-    @cached_property
+    @property
     def space(self) -> ContactSpace:
-        return ContactSpace(self.mesh, self.sensor, self.index.approach)
+        """The contact pose space, undiscretised, in the sensor's frame."""
+        return self.index.space
 
     @cached_property
     def poses(self) -> Array:

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.carry import Carry
 from geomtact.contact_space.index import Index
-from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import InputError, UsageError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring.calibration import normalised
-from geomtact.se3 import Array, check_transforms, hat, inverse, log
+from geomtact.se3 import Array, check_pose, check_transforms, hat, inverse, log
 
 LogDensity = Callable[[Array], Array]
 
@@ -50,9 +49,7 @@ class GaussianPrior:
     covariance: Array
 
     def __post_init__(self) -> None:
-        T, C = check_transforms(self.T, "GaussianPrior"), np.asarray(self.covariance, float)
-        if T.shape != (4, 4):
-            raise InputError(f"GaussianPrior: expected one pose (4, 4), got shape {T.shape}")
+        T, C = check_pose(self.T, "GaussianPrior"), np.asarray(self.covariance, float)
         if C.shape != (6, 6) or not np.allclose(C, C.T) or not (np.linalg.eigvalsh(C) > 0).all():
             raise InputError(
                 "GaussianPrior: expected a symmetric positive definite covariance (6, 6), variances in radians and metres "
@@ -208,7 +205,7 @@ def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
 def _of_poses(index: Index, poses: Any, log_masses: Any, T_frame_sensor: Array) -> Array:
     T, mass = _pair(poses, log_masses)
     inside = inverse(T_frame_sensor) @ T
-    depth = ContactSpace(index.mesh, index.sensor, index.approach).penetration(inside)
+    depth = index.space.penetration(inside)
     ok = np.isfinite(depth) & np.isfinite(mass)
     if not ok.any():
         raise InputError(
@@ -239,7 +236,7 @@ def _over_images(index: Index, density: LogDensity) -> Array:
     symmetry = index.mesh.symmetry
     assert symmetry is not None
     images = symmetry.sampled(_TURNS if symmetry.axis is not None else _ROTATIONS)
-    space = ContactSpace(index.mesh, index.sensor, index.approach)
+    space = index.space
 
     def mean(T: Array) -> Array:
         total, count = np.full(len(T), -np.inf), np.zeros(len(T))
@@ -260,7 +257,7 @@ def _by_chunks(index: Index, density: LogDensity, settled: bool = False) -> Arra
     With ``settled``, where it is -inf at a pose that lies a little off the contact pose space, that pose brought to the
     penetration of its cell counts.
     """
-    space, depths = ContactSpace(index.mesh, index.sensor, index.approach), np.array(index.resolution.penetrations)
+    space, depths = index.space, np.array(index.resolution.penetrations)
     out = np.zeros(len(index))
     for start in range(0, len(index), _CHUNK):
         ids = np.arange(start, min(start + _CHUNK, len(index)))

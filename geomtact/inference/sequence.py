@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geomtact.errors import InputError, UsageError, nearest_name
+from geomtact.errors import InputError, PoseError, UsageError, nearest_name
 from geomtact.inference.filter import FRESH, NOW, Counts, Filter
 from geomtact.inference.motion import Motion, UniformBall
 from geomtact.inference.posterior import Posterior
@@ -158,7 +158,7 @@ def _poses(frames: Iterable[Any], T_world_sensor: Any) -> Array | Iterator[Any] 
         return T_world_sensor
     poses = check_transforms(T_world_sensor, "T_world_sensor")
     if poses.ndim > 3:
-        raise InputError(f"T_world_sensor: expected (4, 4), or (n, 4, 4) for n frames, got shape {poses.shape}")
+        raise PoseError(f"T_world_sensor: expected (4, 4), or (n, 4, 4) for n frames, got shape {poses.shape}")
     if poses.ndim == 3 and isinstance(frames, Sized) and len(frames) != len(poses):
         raise _number_error(len(frames), len(poses))
     return poses

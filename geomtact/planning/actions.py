@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import UsageError
 from geomtact.geometry.approach import facing
-from geomtact.se3 import Array, check_transforms, inverse, transform
+from geomtact.se3 import Array, check_pose, inverse, transform
 from geomtact.sensing.moments import moments
 from geomtact.sensing.sensor import Sensor
 
@@ -40,7 +40,7 @@ class Touch:
     cost: float = 1.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_world_sensor", one_pose(self.T_world_sensor))
+        object.__setattr__(self, "T_world_sensor", check_pose(self.T_world_sensor, "T_world_sensor"))
         if not 0 <= self.travel <= _FARTHEST:
             raise UsageError(f"Touch: expected a travel of 0 to {_FARTHEST:g} m, got {self.travel:g}; give metres")
         _check_cost(self.cost)
@@ -108,14 +108,6 @@ class Probe:
         straight = replace(_straight(space.sensor), membrane_radius=0.0)
         felt = space.caster.ray_depths(straight, T, np.zeros((1, 2)))[:, 0] >= 0
         return felt.reshape(T_world_object.shape[:2]), np.zeros((*T_world_object.shape[:2], 0))
-
-
-def one_pose(T: ArrayLike) -> Array:
-    """``T`` (4, 4), checked."""
-    T = check_transforms(T, "T_world_sensor")
-    if T.shape != (4, 4):
-        raise UsageError(f"T_world_sensor: expected one pose (4, 4), got shape {T.shape}")
-    return T
 
 
 def _check_cost(cost: float) -> None:

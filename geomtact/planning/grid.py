@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomtact.geometry.approach import facing, sunflower
-from geomtact.planning.actions import Touch, one_pose
+from geomtact.planning.actions import Touch
 from geomtact.planning.belief import Belief, check_contact, draw_cells
-from geomtact.se3 import Array, apply, inverse, transform
+from geomtact.se3 import Array, apply, check_pose, inverse, transform
 
 _SAME_WAY = np.radians(15)
 _POSES = 128  # that tell the region
@@ -46,7 +46,7 @@ def grid_of_touches(
     long_axis = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][0]
     window = 2 * space.sensor.half_window
     margin = space.sensor.max_penetration
-    before = [one_pose(T) for T in made]
+    before = [check_pose(T, "T_world_sensor") for T in made]
     out = []
     for direction in _directions(posterior, side, long_axis):
         R = _looking(-direction, long_axis, space.sensor.tall)

@@ -18,6 +18,8 @@ from geomtact.report.turnable import turnable
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Mode, Posterior
 
+REPORTS = ("html", "png")
+
 
 def write_all(
     folder: Path,
@@ -27,8 +29,9 @@ def write_all(
     settings: Mapping[str, Any] | None = None,
     timing_ms: Mapping[str, float] | None = None,
     parts: Sequence[Mapping[str, Any]] | None = None,
+    reports: Sequence[str] = REPORTS,
 ) -> dict[str, Any]:
-    """Write posterior.npz, report.png, report.html and result.json into ``folder``, which is made if need be.
+    """Write posterior.npz, result.json and the reports into ``folder``, which is made if need be.
 
     Parameters
     ----------
@@ -37,6 +40,7 @@ def write_all(
     shown : what each sensor showed, see ``report.shown``
     settings, timing_ms : added to the posterior's own in result.json
     parts : of which it may be, where there are several
+    reports : which of ``REPORTS`` are written: report.html, report.png
 
     Returns
     -------
@@ -47,12 +51,14 @@ def write_all(
     folder.mkdir(parents=True, exist_ok=True)
     posterior.save(folder / "posterior.npz")
     summaries = summaries_of(posterior, modes)
-    picture = draw(posterior, modes, summaries, shown)
-    write_whole(folder / "report.png", lambda path: path.write_bytes(picture.whole))
+    picture = draw(posterior, modes, summaries, shown) if reports else None
+    if picture is not None and "png" in reports:
+        write_whole(folder / "report.png", lambda path: path.write_bytes(picture.whole))
     timing = {**(timing_ms or {}), "report": 1e3 * (time.perf_counter() - began)}
     content = result(posterior, modes, settings, timing, parts)
-    view = turnable(posterior, modes, shown) if modes else None
-    html = page(content, table(summaries), [*facts(posterior), *caution(summaries)], picture.bands, view)
-    write_text(folder / "report.html", html)
+    if picture is not None and "html" in reports:
+        view = turnable(posterior, modes, shown) if modes else None
+        html = page(content, table(summaries), [*facts(posterior), *caution(summaries)], picture.bands, view)
+        write_text(folder / "report.html", html)
     write_text(folder / "result.json", to_text(content))
     return content

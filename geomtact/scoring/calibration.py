@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index
-from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import CALIBRATION_NOISE, LEAST_CONTACT, draw_noise, felt_mask, spoilt
 from geomtact.progress import Progress
 from geomtact.scoring.protocol import Scorer
@@ -79,7 +78,7 @@ def simulate_touches(
     Poses are drawn within the cells, not at their centres: the score has to bridge what lies between.
     """
     rng = np.random.default_rng(seed)
-    space = ContactSpace(index.mesh, index.sensor, index.approach)
+    space = index.space
     shape = index.sensor.along(_SHAPE)
     pixel = index.sensor.pixel_area(shape)
     weight = index.weight.ravel().astype(float)
