@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 from geomtact import Localizer, Mesh, load_mesh
 from geomtact.cli import app
-from geomtact.evaluation import known_approach, study
+from geomtact.evaluation import known_approach, proper, study
 from geomtact.evaluation.pose_error import add, add_s, coverage, mssd, random_add
-from geomtact.geometry.distance import PoseDistance
-from geomtact.se3 import exp, random_rotations, transform
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.se3 import exp, log, random_rotations, transform
 from geomtact.sensing.noise import CLEAN, MODERATE
 
 MM = 1e-3
@@ -128,9 +128,67 @@ def test_touches_repeat_and_only_elastic_ones_are_felt_anew(localizer):
         assert np.isfinite(space.penetration(a.T_sensor_object)).all()
 
 
+def test_the_energy_score_is_least_for_the_distribution_that_truths_come_from(rng):
+    """Of distributions of a part without and with symmetry that are shifted, too narrow or too wide."""
+    for name in ("bracket", "hex_nut", "ball"):
+        mesh = load_mesh(name).with_symmetry()
+
+        def drawn(n, spread, shift=0.0):
+            T = exp(rng.normal(size=(n, 6)) * np.repeat([spread * 0.2, spread * 3 * MM], 3))
+            T[:, :3, 3] += shift
+            return T
+
+        truths = drawn(60, 1.0)
+        others = {
+            "true": drawn(400, 1.0),
+            "off": drawn(400, 1.0, 4 * MM),
+            "bold": drawn(400, 0.3),
+            "vague": drawn(400, 3.0),
+        }
+        score = {kind: np.array([proper.energy_score(some, T, mesh) for T in truths]) for kind, some in others.items()}
+        for kind in ("off", "bold", "vague"):
+            more = score[kind] - score["true"]
+            assert more.mean() > 2 * more.std() / np.sqrt(60), (name, kind)
+
+
+def test_the_energy_score_of_a_certain_answer_is_its_error_and_knows_no_symmetry(nut, rng):
+    T, other = random_poses(2, rng)
+    one = np.repeat(other[None], 10, 0)
+    bare = load_mesh("bracket")
+    assert proper.energy_score(one, T, bare) == pytest.approx(add(T, other, bare.surface_points(64))[0])
+    image = other @ nut.symmetry.elements[1]
+    turned = np.repeat(image[None], 10, 0)
+    assert proper.energy_score(one, T, nut) == pytest.approx(proper.energy_score(turned, T, nut))
+
+
+def test_tarp_levels_are_uniform_for_a_calibrated_posterior_and_bunch_for_a_bold_one(nut, rng):
+    distance = PoseDistance(nut)
+
+    def levels(spread):
+        out = []
+        for reference in random_poses(300, rng):
+            T, *drawn = exp(rng.normal(size=(101, 6)) * np.repeat([0.3, 5 * MM], 3))
+            narrow = exp(spread * np.array([log(one) for one in drawn]))
+            out.append(proper.tarp_level(narrow, T, reference, distance))
+        return proper.uniformity(out)
+
+    calibrated, bold = levels(1.0), levels(0.3)
+    assert calibrated["p"] > 0.01 and sum(calibrated["counts"]) == 300
+    assert bold["p"] < 1e-6 and bold["counts"][0] + bold["counts"][-1] > 150
+
+
+def test_modes_that_hold_what_they_claim_are_reliable(rng):
+    claimed = rng.random(4000)
+    found = study.reliability(claimed, rng.random(4000) < claimed)
+    assert sum(b["n"] for b in found) == 4000
+    assert sum(b["low"] <= b["claimed"] <= b["high"] for b in found) >= len(found) - 1
+    (bold,) = study.reliability(np.full(50, 0.8), np.zeros(50))
+    assert bold["share"] == 0 and bold["high"] < bold["claimed"]
+
+
 def test_a_study_says_what_the_posterior_says(localizer):
     touches = study.make_touches(localizer, 8, 1, MODERATE)
-    outcomes = list(study.localize_touches(localizer, touches, "fast", 1))
+    outcomes = list(proper.judge(localizer, touches, "fast", 1))
     for touch, outcome in zip(touches, outcomes, strict=True):
         posterior = localizer.localize(touch.mask, kind="mask", effort="fast", seed=1)
         assert outcome.gain == posterior.log_density(touch.T_sensor_object)
@@ -141,6 +199,12 @@ def test_a_study_says_what_the_posterior_says(localizer):
         assert outcome.mssd10_mm <= outcome.mssd_mm
     figures = study.summarise(outcomes, 5.0)
     assert [figures[g]["n"] for g in ("all", "geometric", "elastic")] == [8, 4, 4]
+    whole = proper.summarise(outcomes, 5.0)["all"]
+    assert whole["recall"]["1"][0] == np.mean([o.mssd_mm <= 10 for o in outcomes])
+    assert sum(whole["levels"]["counts"]) == sum(whole["tarp"]["counts"]) == 8
+    # told of a ball's centre alone, which one touch fixes to a millimetre or two
+    assert all(-0.2 < o.energy_mm <= o.mssd_mm + 3 for o in outcomes)
+    assert [o.held for o in outcomes] == [o.add_mm <= 1e3 * mode_radius(localizer.mesh) for o in outcomes]
     gain = [o.gain for o in outcomes]
     assert figures["all"]["gain_mean"] == pytest.approx(np.mean(gain))
     assert figures["all"]["gain_standard_error"] == pytest.approx(np.std(gain, ddof=1) / np.sqrt(8))
@@ -157,15 +221,15 @@ def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tm
     assert done.exit_code == 0, done.output
     whole = json.loads(out.read_text())
     part = whole["parts"]["ball"]
-    assert whole["schema"] == "geomtact/study/2" and whole["versions"]["numpy"] == np.__version__
+    assert whole["schema"] == "geomtact/study/3" and whole["versions"]["numpy"] == np.__version__
     assert part["settings"]["object_sha256"] == localizer.mesh.sha256 and part["settings"]["seed"] == 1
     assert len(part["outcomes"]) == 6 and part["figures"]["all"]["n"] == 6
 
     asked = []
     monkeypatch.setattr(
-        study,
-        "localize_touches",
-        lambda localizer, todo, effort, seed: asked.append(len(todo)) or _as_before(part, todo),
+        proper,
+        "judge",
+        lambda localizer, made, effort, seed, first: asked.append(len(made) - first) or _as_before(part, first),
     )
     stopped = json.loads(out.read_text())
     stopped["parts"]["ball"]["outcomes"] = part["outcomes"][:4]
@@ -179,8 +243,8 @@ def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tm
     assert asked == [2] and out.read_bytes() == held, "what was judged with other settings is kept"
 
 
-def _as_before(part, todo):
-    return iter([study.Outcome(**o) for o in part["outcomes"][-len(todo) :]])
+def _as_before(part, first):
+    return iter([proper.Judged(**o) for o in part["outcomes"][first:]])
 
 
 def test_a_file_that_is_no_study_is_left_alone(cache, tmp_path):
@@ -198,7 +262,7 @@ def test_touches_are_described(tmp_path):
 
 def test_outcomes_are_plain_numbers(localizer):
     touches = study.make_touches(localizer, 1, 0, MODERATE)
-    (outcome,) = study.localize_touches(localizer, touches, "fast", 0)
+    (outcome,) = proper.judge(localizer, touches, "fast", 0)
     assert json.loads(json.dumps(asdict(outcome))) == asdict(outcome)
 
 

@@ -116,26 +116,35 @@ def test_climbing_never_goes_down_and_reaches_a_near_top(rng):
     assert np.median(-reached) < 0.3 * np.median(-merit(starts))
 
 
-@pytest.mark.parametrize(("n", "k"), [(1, 10), (4, 2), (7, 3), (6, 6), (5, 9)])
-def test_the_best_of_some_is_the_mean_over_all_choices(rng, n, k):
-    error = rng.random(n)
-    chosen = [min(some) for some in combinations(error, min(n, k))]
-    assert ambiguity.best_of(error, k) == pytest.approx(np.mean(chosen))
-
-
-def test_the_best_guess_is_no_worse_than_the_truth_and_a_random_one_no_better_than_the_best_of_ten():
+def test_the_best_guess_is_no_worse_than_the_truth_and_than_a_random_one():
     line = np.arange(12.0)
-    span, guess, ten, least = ambiguity.errors(np.abs(line[:, None] - line))
+    span, guess, least = ambiguity.errors(np.abs(line[:, None] - line))
     assert (span, guess) == (11, 5.5)
     assert least == pytest.approx(3.0)  # from the middle
-    assert ten < guess
-    assert ambiguity.errors(np.zeros((1, 1))) == (0, 0, 0, 0)
+    assert ambiguity.errors(np.zeros((1, 1))) == (0, 0, 0)
+
+
+def test_a_posterior_that_holds_what_feels_the_same_and_nothing_else_has_precision_and_recall_one(rod):
+    distance = PoseDistance(rod.mesh)
+    here, there = transform(SIDEWAYS, [0, 0, 0]), transform(SIDEWAYS, [0.09, 0, 0])
+
+    def told(poses, level):
+        draw = lambda n, rng: np.repeat(poses, -(-n // len(poses)), 0)[:n]  # noqa: E731
+        return SimpleNamespace(contact=True, sample=draw, credible_level=level)
+
+    def judged(posterior, T):
+        return ambiguity.held(posterior, np.stack(T), distance, np.random.default_rng(0))
+
+    assert judged(told([here, there], lambda T: 0.5), [here, there]) == (1, 1)
+    assert judged(told([here, there], lambda T: 0.5), [here]) == (0.5, 1)
+    assert judged(told([here], lambda T: 0.5 if T is not there and T[0, 3] < 0.01 else 1.0), [here, there]) == (1, 0.5)
+    assert judged(SimpleNamespace(contact=False), [here]) == (0, 0)
 
 
 def test_figures_are_told_of_distinctive_and_ambiguous_touches_apart():
     outcomes = [Outcome(side, True, [float(10 * side + k)] * len(ROWS), 50.0) for side in (0, 1) for k in range(3)]
     found = [
-        ambiguity.Ambiguity(side, k, 2, 0.8, span, span / 2, 0.0, span / 2)
+        ambiguity.Ambiguity(side, k, 2, 0.8, span, span / 2, span / 2, 0.5, 1.0)
         for side, k, span in ((0, 0, 5.0), (0, 1, 40.0), (1, 0, 9.9), (1, 1, 10.0))
     ]
     figures = ambiguity.summarise(found, outcomes, 3)

@@ -36,7 +36,7 @@ from geomtact.cli.simulate import NoiseName
 if TYPE_CHECKING:
     from geomtact.evaluation.study import Felt
 
-SCHEMA = "geomtact/study/2"
+SCHEMA = "geomtact/study/3"
 Touches = Annotated[int, typer.Option("--touches", min=1, help="How many touches of each part.")]
 
 
@@ -114,7 +114,7 @@ def judge(
 
     ``felt`` as in ``study.make_touches``; ``solver`` names it in the file.
     """
-    from geomtact.evaluation import study
+    from geomtact.evaluation import proper, study
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     all_figures: dict[tuple[str, str], dict[str, Any]] = {}
@@ -127,18 +127,18 @@ def judge(
             "elastic_solver": solver,
         }
         name = localizer.mesh.name
-        outcomes = study_file.earlier(content["parts"].get(name), settings, study.Outcome)
+        outcomes = study_file.earlier(content["parts"].get(name), settings, proper.Judged)
 
         def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings, **figures: Any) -> None:
             flat = [asdict(o) for o in outcomes]
             study_file.keep(out, content, name, settings=settings, **figures, outcomes=flat)
 
         if len(outcomes) < touches:
-            todo = study.make_touches(localizer, touches, seed, strength, felt)[len(outcomes) :]
-            more = study.localize_touches(localizer, todo, effort, seed)
+            made = study.make_touches(localizer, touches, seed, strength, felt)
+            more = proper.judge(localizer, made, effort, seed, len(outcomes))
             study_file.collect(outcomes, more, touches, f"localizing {name}", keep)
         random_mm = study.expected_random_add(localizer)
-        figures = study.summarise(outcomes, random_mm)
+        figures = proper.summarise(outcomes, random_mm)
         keep(outcomes, random_add_mm=random_mm, figures=figures)
         all_figures |= {(name, group): values for group, values in figures.items()}
         tell(f"{name}: done")

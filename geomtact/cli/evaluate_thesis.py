@@ -119,7 +119,7 @@ def _judge_part(
             judged = known_approach.judge_side(localizer, side, touches, seed, noise, settings["effort"], elastic)
             study_file.collect(done, judged, len(done) + touches, f"touching {mesh.name}", lambda _: None)
         if first and side >= len(found) // first:
-            others = open_set.judge_side(localizer, side, touches, first, seed, noise, elastic)
+            others = open_set.judge_side(localizer, side, touches, first, seed, noise, settings["effort"], elastic)
             study_file.collect(found, others, len(found) + first, f"what else {mesh.name} may be", lambda _: None)
         keep()
     keep()
@@ -150,12 +150,24 @@ def _print(parts: Mapping[str, Any]) -> None:
             continue
         figures = part["ambiguity"]["figures"]
         left = [f"{figures['median'][key]:.1f}" for key in ("span_mm", "random_mm", "least_mm")]
+        left += [f"{100 * figures['mean'][key]:.0f} %" for key in ("precision", "recall")]
         for kind, table in figures["table"].items():
             ours = [f"{table[row]['error_mm_quartiles'][1]:.1f}" for row in ("best", "answer", "refined best10")]
-            rows.append([name, kind, str(table["best"]["n"]), *(left if kind == "all" else [""] * 3), *ours])
+            rows.append([name, kind, str(table["best"]["n"]), *(left if kind == "all" else [""] * len(left)), *ours])
     if rows:
         typer.echo(
-            "What a touch leaves open, whoever reads it, and the errors on touches that leave much and little: medians"
+            "What a touch leaves open, whoever reads it, and the errors on touches that leave much and little: medians. Precision: "
+            "mean share of the posterior at poses that feel the same; recall: mean share of these in its 90 % region"
         )
-        numbers = ["touches", "span [mm]", "a guess", "the best guess", "best", "answer", "best of ten"]
+        numbers = [
+            "touches",
+            "span [mm]",
+            "a guess",
+            "the best guess",
+            "precision",
+            "recall",
+            "best",
+            "answer",
+            "best of ten",
+        ]
         print_table(["part", "kind", *numbers], rows, numbers)

@@ -1,7 +1,8 @@
 """What one touch leaves open, whoever reads it: how far apart the poses lie that feel the same.
 
-No method can know which of these poses it is, so the error expected of a guess among them bounds that of all methods. The
-search for them (``evaluation.alike``) is not exhaustive; what it misses makes the bound lower.
+No method can know which of these poses it is. A guess need not be one of them, and may lie between; but by the triangle
+inequality even the best one is off by half of what the best among them is, or more. The search for them (``evaluation.alike``)
+is not exhaustive. And what the posterior makes of them: whether it holds them, and little else.
 """
 
 from __future__ import annotations
@@ -9,22 +10,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from math import comb
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from geomtact.evaluation.alike import SPACING_MM, STARTS, alike
 from geomtact.evaluation.known_approach import Outcome, touches_of_side
 from geomtact.evaluation.known_approach import summarise as table
-from geomtact.geometry.distance import PoseDistance
+from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.localizer import Localizer
+from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 
 DISTINCTIVE_MM = 10.0  # a touch is distinctive if no pose that feels the same lies farther off
-GUESSES = 10  # as many as in the thesis's best10
+DRAWS = 200  # poses of a posterior
+REGION = 0.9  # of a posterior's mass, within which poses count as told
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,10 @@ class Ambiguity:
     poses : how many feel the same, ``alike.SPACING_MM`` apart, the true one among them
     needed : overlap (IoU) of contacts that feel the same: the median of two noisy readings of the true pose
     span_mm : from the true pose to the farthest of them
-    random_mm, random10_mm : expected error of one of them guessed at random, and of the best of ten
-    least_mm : expected error of the best guess, were each of them as likely to be the true one
+    random_mm : expected error of one of them guessed at random
+    least_mm : expected error of the best guess among them, were each of them as likely to be the true one
+    precision : share of the posterior that lies within a mode's radius of one of them
+    recall : share of them that the region of 90 % of the posterior holds
     """
 
     side: int
@@ -47,8 +50,9 @@ class Ambiguity:
     needed: float
     span_mm: float
     random_mm: float
-    random10_mm: float
     least_mm: float
+    precision: float
+    recall: float
 
 
 def settings(touches: int) -> dict[str, Any]:
@@ -57,24 +61,32 @@ def settings(touches: int) -> dict[str, Any]:
 
 
 def judge_side(
-    localizer: Localizer, side: int, n: int, first: int, seed: int, noise: Noise, elastic: bool | None
+    localizer: Localizer, side: int, n: int, first: int, seed: int, noise: Noise, effort: str, elastic: bool | None
 ) -> Iterator[Ambiguity]:
     """What the ``first`` of the ``n`` touches leave open that ``known_approach.judge_side`` judges."""
     distance = PoseDistance(localizer.mesh)
     for number, touch in enumerate(islice(touches_of_side(localizer, side, n, seed, noise, elastic), first)):
         T, needed = alike(localizer, touch, noise, np.random.default_rng([seed, side, number]))
-        yield Ambiguity(side, number, len(T), needed, *errors(1e3 * np.stack([distance.mean(one, T) for one in T])))
+        left = errors(1e3 * np.stack([distance.mean(one, T) for one in T]))
+        posterior = localizer.localize(touch.mask, "mask", effort=effort, seed=seed)
+        rng = np.random.default_rng([seed, side, number, 1])
+        yield Ambiguity(side, number, len(T), needed, *left, *held(posterior, T, distance, rng))
 
 
-def errors(between: Array) -> tuple[float, float, float, float]:
-    """Span, and expected errors of a guess, of the best of ten and of the best guess, from the distances (n, n) between
-    poses that feel the same, the true one first."""
-    return (
-        float(between[0].max()),
-        float(between[0].mean()),
-        best_of(between[0], GUESSES),
-        float(between.mean(0).min()),
-    )
+def errors(between: Array) -> tuple[float, float, float]:
+    """Span, and expected errors of a guess and of the best guess, from the distances (n, n) between poses that feel the same, the
+    true one first."""
+    return float(between[0].max()), float(between[0].mean()), float(between.mean(0).min())
+
+
+def held(posterior: Posterior, T: Array, distance: PoseDistance, rng: np.random.Generator) -> tuple[float, float]:
+    """Precision and recall of a posterior, of the poses ``T`` (n, 4, 4) that feel the same."""
+    if not posterior.contact:
+        return 0.0, 0.0
+    drawn, radius = posterior.sample(DRAWS, rng), mode_radius(distance.mesh)
+    near = np.any([distance.within(one, drawn, radius) for one in T], axis=0)
+    inside = np.array([posterior.credible_level(one) <= REGION for one in T])
+    return float(near.mean()), float(inside.mean())
 
 
 def summarise(found: Sequence[Ambiguity], outcomes: Sequence[Outcome], touches: int) -> dict[str, Any]:
@@ -85,7 +97,7 @@ def summarise(found: Sequence[Ambiguity], outcomes: Sequence[Outcome], touches: 
     tables = {"all": judged}
     for name, kind in (("distinctive", True), ("ambiguous", False)):
         tables[name] = [o for o, d in zip(judged, distinctive, strict=True) if d is kind]
-    names = ("poses", "needed", "span_mm", "random_mm", "random10_mm", "least_mm")
+    names = ("poses", "needed", "span_mm", "random_mm", "least_mm", "precision", "recall")
     return {
         "n": len(found),
         "distinctive": float(np.mean(distinctive)),
@@ -93,10 +105,3 @@ def summarise(found: Sequence[Ambiguity], outcomes: Sequence[Outcome], touches: 
         "mean": {name: float(np.mean([getattr(a, name) for a in found])) for name in names},
         "table": {name: table(some) for name, some in tables.items() if some},
     }
-
-
-def best_of(error: ArrayLike, k: int) -> float:
-    """Expected least of ``k`` different ones drawn at random of ``error`` (n,); of all, if they are fewer."""
-    error = np.sort(np.asarray(error, float))
-    n, k = len(error), min(k, len(error))
-    return float(sum(e * comb(n - 1 - i, k - 1) for i, e in enumerate(error)) / comb(n, k))

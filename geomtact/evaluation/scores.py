@@ -110,7 +110,7 @@ def bytes_per_pose(scorer: Scorer, index: Index) -> float:
 
 
 def judged(localizer: Localizer, touches: Sequence[Touch], effort: str, seed: int) -> Iterator[Scored]:
-    """As ``study.localize_touches``, with the time of the score."""
+    """Localizes each touch and says how that went, and the time of the score."""
     for outcome, posterior in study.judged(localizer, touches, effort, seed):
         # an image without contact is not scored
         score_ms = sum(posterior.timing_ms.get(stage, 0.0) for stage in ("score", "posterior"))

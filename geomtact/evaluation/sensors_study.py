@@ -118,13 +118,15 @@ def fuse_scenes(
 
 def summarise(outcomes: Sequence[Fused]) -> list[dict[str, Any]]:
     """Figures for each number of sensors; ``more`` is the mean gain over one sensor less, with its paired 95 % bootstrap
-    interval, and ``ruled_out`` the share of scenes in which the true pose was given no probability."""
+    interval, and ``ruled_out`` the share of scenes in which the true pose was given no probability: of the others are gain and
+    claim."""
     gains = {n: _column(outcomes, n, "gain") for n in sorted({o.sensors for o in outcomes})}
     rng, out = np.random.default_rng(0), []
     for n, gain in gains.items():
         figures: dict[str, Any] = {"sensors": n, "n": len(gain), "ruled_out": float((~np.isfinite(gain)).mean())}
-        kept = gain[np.isfinite(gain)]
-        figures |= {"gain_mean": float(kept.mean()), "claimed_mean": float(_column(outcomes, n, "claimed").mean())}
+        kept = np.isfinite(gain)
+        claimed = _column(outcomes, n, "claimed")
+        figures |= {"gain_mean": float(gain[kept].mean()), "claimed_mean": float(claimed[kept].mean())}
         if n - 1 in gains:
             more = (gain - gains[n - 1])[np.isfinite(gain) & np.isfinite(gains[n - 1])]
             figures["more"] = mean_with_interval(more, rng)

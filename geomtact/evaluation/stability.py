@@ -20,6 +20,7 @@ from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.pose_error import coverage
 from geomtact.evaluation.sensors_study import make_scenes
+from geomtact.evaluation.study import CERTAIN
 from geomtact.evaluation.touches import closed_on, counts, penetrations
 from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.geometry.mesh import Mesh, coarser
@@ -372,22 +373,24 @@ def _sequences(localizer: Localizer, slips: int, n: int, seed: int, effort: str)
 def summarise(answers: Sequence[Answer]) -> dict[str, Any]:
     """Figures of the answers at one level.
 
-    ``ruled_out`` is the share of truths that were given no probability; ``found_out`` the share of wrong answers that carry a
-    warning or hold less than half, ``alarmed`` that of right ones which carry a warning; both None where there are no such.
-    Gains are of the truths not ruled out. Coverage has 99 % intervals.
+    ``ruled_out`` is the share of truths that were given no probability; ``certain`` that of first modes which hold half or more;
+    ``found_out`` the share of wrong answers that carry a warning or hold less than half, ``alarmed`` that of right ones which
+    carry a warning; both None where there are no such.
+    What is told and claimed is of the truths not ruled out. Coverage has 99 % intervals.
     """
     gain = np.array([a.gain for a in answers])
-    felt = np.isfinite(gain)
+    felt, claimed = np.isfinite(gain), np.array([a.claimed for a in answers])
     wrong, right = [a for a in answers if a.wrong], [a for a in answers if not a.wrong]
     return {
         "n": len(answers),
         "gain_mean": float(gain[felt].mean()) if felt.any() else None,
-        "claimed_mean": float(np.mean([a.claimed for a in answers])),
+        "claimed_mean": float(claimed[felt].mean()) if felt.any() else None,
         "ruled_out": float(1 - felt.mean()),
         "mssd_mm_median": float(np.median([a.mssd_mm for a in answers])),
         "wrong": len(wrong) / len(answers),
         "warned": float(np.mean([a.warned for a in answers])),
         "silent": float(np.mean([a.silent for a in answers])),
+        "certain": float(np.mean([a.probability >= CERTAIN for a in answers])),
         "found_out": float(np.mean([not a.silent for a in wrong])) if wrong else None,
         "alarmed": float(np.mean([a.warned for a in right])) if right else None,
         "coverage": [asdict(c) for c in coverage([a.level for a in answers], (0.5, 0.9), 0.99)],

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.contact_class import CLASSES, contact_class
-from geomtact.evaluation.pose_error import coverage, mssd, random_add
+from geomtact.evaluation.pose_error import coverage, mssd, random_add, share_with_interval
 from geomtact.evaluation.touches import Touch, random_touches
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference.localizer import Localizer
@@ -26,6 +26,7 @@ MODES = 10  # the thesis's best10, of modes instead of poses
 WRONG_MM = 10.0  # MSSD beyond which a first mode is wrong
 RESAMPLES = 2000
 CERTAIN = 0.5  # a first mode below this probability is one of high entropy
+CLAIMED = (0.0, 0.01, 0.1, 0.3, 0.6, 0.9, 1.0)  # edges of the bins of what first modes hold
 Felt = Callable[[ContactSpace, Array, bool], NDArray[np.bool_]]
 
 
@@ -87,16 +88,10 @@ def make_touches(
     ]
 
 
-def localize_touches(localizer: Localizer, touches: Sequence[Touch], effort: str, seed: int) -> Iterator[Outcome]:
-    """Localizes each touch and says how that went."""
-    for outcome, _ in judged(localizer, touches, effort, seed):
-        yield outcome
-
-
 def judged(
     localizer: Localizer, touches: Sequence[Touch], effort: str, seed: int
 ) -> Iterator[tuple[Outcome, Posterior]]:
-    """As :func:`localize_touches`, with the posterior that each outcome is read from."""
+    """Localizes each touch and says how that went, with the posterior that tells it."""
     distance = PoseDistance(localizer.mesh)
     for touch in touches:
         T = touch.T_sensor_object
@@ -162,6 +157,20 @@ def coverage_figures(levels: ArrayLike, confidence: float = 0.95) -> dict[str, A
         "coverage": [asdict(c) for c in found],
         "coverage_error": max(abs(c.share - c.nominal) for c in found),
     }
+
+
+def reliability(probability: ArrayLike, right: ArrayLike) -> list[dict[str, float]]:
+    """First modes in bins of the ``probability`` (n,) that they claim: how many, their mean claim, and the share that is
+    ``right`` (n,), with its 95 % binomial interval."""
+    probability, right = np.asarray(probability, float), np.asarray(right, bool)
+    bin_of = np.searchsorted(CLAIMED[1:-1], probability, side="right")
+    out = []
+    for b in np.unique(bin_of):
+        some = bin_of == b
+        share, low, high = share_with_interval(int(right[some].sum()), int(some.sum()))
+        claimed = float(probability[some].mean())
+        out.append({"n": int(some.sum()), "claimed": claimed, "share": share, "low": low, "high": high})
+    return out
 
 
 def expected_random_add(localizer: Localizer) -> float:
