@@ -156,8 +156,8 @@ def _print(parts: Mapping[str, Any]) -> None:
             rows.append([name, kind, str(table["best"]["n"]), *(left if kind == "all" else [""] * len(left)), *ours])
     if rows:
         typer.echo(
-            "What a touch leaves open, whoever reads it, and the errors on touches that leave much and little: medians. Precision: "
-            "mean share of the posterior at poses that feel the same; recall: mean share of these in its 90 % region"
+            "What a touch leaves open, whoever reads it, and the errors on touches that leave much and little: medians. "
+            "Precision: mean share of the posterior at poses that feel the same; recall: mean share of these in its 90 % region"
         )
         numbers = [
             "touches",
