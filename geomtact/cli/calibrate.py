@@ -13,14 +13,18 @@ from geomtact.errors import UsageError
 
 if TYPE_CHECKING:
     from geomtact.sensing.calibrate import Calibrated
+    from geomtact.sensing.sensor import Sensor
 
 
 def calibrate(
     presses: Annotated[
-        list[Path], typer.Argument(metavar="PRESS...", help="Images of one ball, pressed in here and there.")
+        list[Path],
+        typer.Argument(
+            metavar="PRESS...", help="Images of one ball, pressed in here and there; or Taxim's table, polycalib.npz."
+        ),
     ],
-    ball_mm: Annotated[float, typer.Option("--ball-mm", help="Diameter of the ball.")],
     background: Annotated[Path, typer.Option(help="The same sensor without contact.")],
+    ball_mm: Annotated[float | None, typer.Option("--ball-mm", help="Diameter of the ball.")] = None,
     pitch_mm: Annotated[
         tuple[float, float] | None,
         typer.Option("--pitch-mm", help="Millimetres per pixel on the membrane, along x and along y."),
@@ -31,6 +35,10 @@ def calibrate(
     pin_spacing_mm: Annotated[
         float | None, typer.Option("--pin-spacing-mm", help="From pin to pin of that board.")
     ] = None,
+    other_presses: Annotated[
+        Path | None, typer.Option(help="Folder of presses of another ball, which tell how the membrane bulges.")
+    ] = None,
+    other_ball_mm: Annotated[float | None, typer.Option("--other-ball-mm", help="Diameter of that ball.")] = None,
     sensor: SensorName = None,
     name: Annotated[str | None, typer.Option(help="Name of the new sensor.")] = None,
     out: Annotated[Path, typer.Option(help="Sensor file to write.")] = Path("sensor.toml"),
@@ -49,8 +57,10 @@ def calibrate(
             raise UsageError(f"{path}: expected a name that ends in {suffix}; give one")
         if path is not None and not path.parent.is_dir():
             raise UsageError(f"{path}: there is no folder {path.parent}; make it, or give another")
-    for option, least, value in (("--ball-mm", 0.1, ball_mm), ("--pitch-mm", 0.001, min(pitch_mm or (0.1,)))):
-        if not least < value < 1000 * least:
+    balls = (("--ball-mm", ball_mm), ("--other-ball-mm", other_ball_mm))
+    lengths = [(option, 0.1, value) for option, value in balls] + [("--pitch-mm", 0.001, pitch_mm and min(pitch_mm))]
+    for option, least, value in lengths:
+        if value is not None and not least < value < 1000 * least:
             raise UsageError(
                 f"{option} {value:g}: expected millimetres, {least:g} to {1000 * least:g}; metres are 1000 times that"
             )
@@ -61,21 +71,82 @@ def calibrate(
                 "--pins and --pin-spacing-mm belong together, and stand in place of --pitch-mm; give these two"
             )
         pitch = _pitch_of(pins, background, 1e-3 * pin_spacing_mm)
+    if (other_presses is None) != (other_ball_mm is None):
+        raise UsageError("--other-presses and --other-ball-mm belong together; give both")
+    if presses[0].suffix == ".npz":
+        if len(presses) > 1 or ball_mm is not None or plot is not None or other_presses is not None:
+            raise UsageError(f"{presses[0]}: a table of Taxim stands alone; leave out other presses, balls and --plot")
+        _write(_of_taxim(presses[0], background, pitch, sensor, name or out.stem), sensor, out)
+        return
+    if ball_mm is None:
+        raise UsageError("--ball-mm: expected the ball's diameter in millimetres, got none; give it")
     found = calibrated(presses, 1e-3 * ball_mm, background, pitch, sensor, name or out.stem)
     for left_out, why in found.left_out.items():
         tell(f"warning: {left_out} is left out: {why}")
     for warning in found.warnings:
         tell(f"warning: {warning}")
     _print(found, ball_mm)
-    out.write_text(found.sensor.to_toml(), "utf-8")
-    typer.echo(f"wrote {out}: geomtact.contact_height(image, background, {str(out)!r}) tells heights")
-    if sensor is None:
-        typer.echo(
-            "its geometry is a camera with parallel rays before a flat gel, 2 mm deep: write in what you know of it"
-        )
+    if other_presses is not None and other_ball_mm is not None:
+        _print_membrane(found, ball_mm, other_presses, other_ball_mm, background)
+    _write(found.sensor, sensor, out)
     if plot is not None:
         plot.write_bytes(draw_calibration(found, 1e-3 * ball_mm))
         typer.echo(f"wrote {plot}")
+
+
+def _write(calibrated: Sensor, geometry: str | None, out: Path) -> None:
+    """Write a sensor's file; ``geometry`` is whose it has."""
+    out.write_text(calibrated.to_toml(), "utf-8")
+    typer.echo(f"wrote {out}: geomtact.contact_height(image, background, {str(out)!r}) tells heights")
+    if geometry is None:
+        typer.echo(
+            "its geometry is a camera with parallel rays before a flat gel, 2 mm deep: write in what you know of it"
+        )
+
+
+def _of_taxim(
+    table: Path, background: Path, pitch: tuple[float, float] | None, sensor: str | None, name: str
+) -> Sensor:
+    """The sensor whose colours a table of Taxim tells."""
+    from dataclasses import replace
+
+    from geomtact.sensing.image_file import read_image
+    from geomtact.sensing.sensor import Sensor
+    from geomtact.sensing.taxim import colours_of_taxim
+
+    height, width = read_image(background).shape[:2]
+    if sensor is None and pitch is None:
+        raise UsageError(f"{table}: a table of Taxim has no pitch; give --pitch-mm, --pins or --sensor")
+    base = Sensor.load(sensor) if sensor is not None else Sensor(name, (width, height), pitch or (0.0, 0.0), 0.0, 2e-3)
+    if base.image_size_px != (width, height):
+        raise UsageError(
+            f"--sensor {sensor}: has {base.image_size_px[0]} x {base.image_size_px[1]} px, the background {width} x {height}; "
+            "name the sensor that took it"
+        )
+    colour = colours_of_taxim(table, (height, width))
+    typer.echo(
+        f"slopes of up to 30 degrees that the table shows are told to {colour.slope_rms:.3f} rms (1 is 45 degrees)"
+    )
+    return replace(base, name=name, pixel_pitch=pitch or base.pixel_pitch, colour=colour)
+
+
+def _print_membrane(found: Calibrated, ball_mm: float, folder: Path, other_mm: float, background: Path) -> None:
+    """Print how the membrane bulges, by presses of another ball."""
+    from geomtact.sensing.calibrate import calibrated, membrane_curvature
+
+    if not folder.is_dir():
+        raise UsageError(f"--other-presses {folder}: no such folder; give the one that holds presses of the other ball")
+    others = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp"))
+    second = calibrated(others, 1e-3 * other_mm, background, sensor=found.sensor)
+    curvature, std = membrane_curvature(found, 1e-3 * ball_mm, second, 1e-3 * other_mm)
+    said = f"bulges by 1/{1e3 / curvature:.0f} mm" if curvature > 2 * std else "shows no bulge"
+    typer.echo(
+        f"  membrane              {said}: a curvature of {1e-3 * curvature:.4f} 1/mm, give or take {1e-3 * std:.4f}"
+    )
+    if curvature > 2 * std:
+        typer.echo(
+            f"  (membrane_radius_mm = {1e3 / curvature:.0f} in a sensor file that --sensor names takes that into account)"
+        )
 
 
 def _pitch_of(pins: Path, background: Path, spacing: float) -> tuple[float, float]:

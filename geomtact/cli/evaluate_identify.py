@@ -89,13 +89,23 @@ def _print(figures: Sequence[Mapping[str, Any]]) -> None:
     def percent(three: Sequence[float]) -> str:
         return "{:.0f} ({:.0f}-{:.0f}) %".format(*(100 * share for share in three))
 
-    headings = ["touches", "scenes", "right", "P(right)", "sure and wrong", "foreign found", "known called foreign"]
+    headings = [
+        "touches",
+        "scenes",
+        "right",
+        "claimed",
+        "log P(right)",
+        "sure and wrong",
+        "foreign found",
+        "known called foreign",
+    ]
     rows = [
         [
             str(f["touches"]),
             str(f["n"]),
             percent(f["right"]),
-            f"{f['probability_median']:.2f}",
+            f"{100 * f['claimed']:.0f} %",
+            f"{f['log_probability_mean']:.2f}",
             f"{100 * f['sure_and_wrong']:.0f} %",
             percent(f["foreign"]),
             percent(f["alarmed"]),

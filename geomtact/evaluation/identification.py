@@ -63,8 +63,9 @@ def _told(parts: Sequence[Localizer], scene: Scene, number: int, touches: int, s
 def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:
     """Figures for each number of touches over all parts, ``told`` by the name of the true one.
 
-    ``right``: the share of scenes whose part is the most probable; ``probability_median``, what it is given. ``foreign``: the
-    share that is said to be unlike all parts where the true one is not among them; ``alarmed``, where it is. With 95 % intervals.
+    ``right``: the share of scenes whose part is the most probable, and ``claimed``, how probable that one is said to be (mean);
+    ``probability_median`` and ``log_probability_mean`` [nats] of what the true part is given. ``foreign``: the share that is said
+    to be unlike all parts where the true one is not among them; ``alarmed``, where it is. With 95 % intervals.
     """
     out = []
     for touches in range(1, MOST + 1):
@@ -77,8 +78,12 @@ def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:
         for key, which in (("right", right), ("foreign", foreign), ("alarmed", alarmed)):
             figures[key] = share_with_interval(sum(which), len(which))
         figures["probability_median"] = float(np.median(probability))
-        sure = [max(_posterior(each).values()) > 0.95 for _, each in cases]
-        figures["sure_and_wrong"] = float(np.mean(np.array(sure) & ~np.array(right)))
+        with np.errstate(divide="ignore"):
+            figures["log_probability_mean"] = float(np.log(probability).mean())
+        most = np.array([max(_posterior(each).values()) for _, each in cases])
+        figures["claimed"] = float(most.mean())
+        sure = most > 0.95
+        figures["sure_and_wrong"] = float(np.mean(sure & ~np.array(right)))
         out.append(figures)
     return out
 

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
-from geomtact.errors import ImageError, InputError, UsageError
+from geomtact.errors import InputError, UsageError
 from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable, fit_weights, terms
 from geomtact.sensing.height import relief
-from geomtact.sensing.local_shape import as_unit_rgb, check_size, colour_change, contact_mask
+from geomtact.sensing.local_shape import check_size
+from geomtact.sensing.press import Press, find_presses, named_image
 from geomtact.sensing.sensor import Sensor
 
 _FEWEST = 3  # presses
@@ -28,31 +29,12 @@ INNER = 0.6  # share of the imprint's radius within which the gel surely lies on
 _MEASURED = 0.5  # share of it within which the ball is measured
 _OUTER = 2.2  # times the imprint's radius, beyond which the gel is flat
 _PIXELS, _FLAT_PIXELS = 3000, 1000  # of a press that are used, at most
-_ROUND = 0.05  # of the radius that half of an outline may stray from its circle
-_SEEN = 0.4  # share of the circle that has to be seen
 _SPAN = 0.5  # of the window along each side, over which presses should be spread
+_UNLIKE = 1.3  # times as large has one of two balls to be
+_BEND = 5.0  # half diagonals of the window: radius of a membrane that is tried
+_STEPS = 3  # towards the one that is found
+_RESAMPLED = 400
 _AGREES = 0.1  # by which presses may measure the ball wrongly, in the median
-
-
-@dataclass(frozen=True, eq=False)
-class Press:
-    """One press of the ball.
-
-    Attributes
-    ----------
-    name : of its image
-    change, felt : (H, W, 3) of colour from the background, and (H, W) where it is felt
-    mask : (H, W) its imprint
-    centre : (column, row) of the imprint's circle [px]
-    radius : and its radius along x [px]
-    """
-
-    name: str
-    change: Array
-    felt: NDArray[np.bool_]
-    mask: NDArray[np.bool_]
-    centre: Array
-    radius: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +102,10 @@ def calibrated(
         )
     if not (np.isfinite(ball_diameter) and 1e-4 < ball_diameter < 0.1):
         raise UsageError(f"ball_diameter: expected metres, 0.0001 to 0.1, got {ball_diameter}; 6.31 mm is 0.00631")
-    reference = _image(background, "background")[1]
+    reference = named_image(background, "background")[1]
     known = None if sensor is None else Sensor.load(sensor)
     pitch = known.pixel_pitch if pixel_pitch is None and known is not None else pixel_pitch
-    found, left_out = _presses(presses, reference, None if pitch is None else _pair(pitch))
+    found, left_out = find_presses(presses, reference, None if pitch is None else _pair(pitch))
     if pitch is None:
         most = 0.5 * ball_diameter / max((press.radius for press in found), default=np.inf)
         bound = f"; it is at most {1e3 * most:.4f} mm, the ball's radius over the largest imprint's" if found else ""
@@ -172,78 +154,11 @@ def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) ->
     return out
 
 
-def _image(source: Any, role: str) -> tuple[str, Array]:
-    """The name of an image, and it (H, W, 3) as 0..1."""
-    if isinstance(source, str | Path):
-        from geomtact.sensing.image_file import read_image
-
-        return str(source), as_unit_rgb(read_image(source), str(source))
-    return role, as_unit_rgb(source, role)
-
-
 def _pair(pitch: float | tuple[float, float]) -> tuple[float, float]:
     x, y = np.broadcast_to(np.asarray(pitch, float), 2)
     if not (min(x, y) > 1e-6 and max(x, y) < 1e-2):
         raise UsageError(f"pixel_pitch: expected metres, 0.000001 to 0.01, got {pitch}; 0.0634 mm is 0.0000634")
     return float(x), float(y)
-
-
-def _presses(
-    images: Sequence[Any], reference: Array, pitch: tuple[float, float] | None
-) -> tuple[list[Press], dict[str, str]]:
-    """Those of the images that show a ball, and why the others do not."""
-    found, left_out = [], {}
-    seen: list[Array] = []
-    stretch = 1.0 if pitch is None else pitch[1] / pitch[0]
-    for number, source in enumerate(images, 1):
-        name, image = _image(source, f"press {number}")
-        if image.shape != reference.shape:
-            raise ImageError(
-                f"{name}: expected the background's size, {reference.shape[1]} x {reference.shape[0]} px, got "
-                f"{image.shape[1]} x {image.shape[0]} px; give images of one sensor"
-            )
-        if any(np.array_equal(image, other) for other in seen):
-            left_out[name] = "it is the same image as one before"
-            continue
-        seen.append(image)
-        change, felt = colour_change(image, reference)
-        mask = contact_mask(image, reference)
-        if not mask.any():
-            left_out[name] = "no contact was found"
-            continue
-        circle = _circle(mask, stretch)
-        if isinstance(circle, str):
-            left_out[name] = circle
-        else:
-            found.append(Press(name, change, felt, mask, *circle))
-    return found, left_out
-
-
-def _circle(mask: NDArray[np.bool_], stretch: float) -> tuple[Array, float] | str:
-    """Centre (column, row) and radius along x of the circle that the outline of a mask is, or what is wrong with it. Rows are
-    ``stretch`` times as far apart as columns."""
-    import cv2
-
-    h, w = mask.shape
-    contours = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-    points = max(contours, key=len)[:, 0].astype(float)
-    # where the image's border cuts the contact there is no outline
-    points = points[(points > 1).all(1) & (points[:, 0] < w - 2) & (points[:, 1] < h - 2)]
-    if len(points) < 20:
-        return "hardly any of its outline lies within the image"
-    points[:, 1] *= stretch
-    weight = np.ones(len(points))
-    for _ in range(10):
-        A = np.column_stack([2 * points, np.ones(len(points))])
-        solved = np.linalg.lstsq(A * weight[:, None], (points**2).sum(1) * weight, rcond=None)[0]
-        radius = float(np.sqrt(max(solved[2] + solved[:2] @ solved[:2], 0.0)))
-        off = np.linalg.norm(points - solved[:2], axis=1) - radius
-        weight = 1 / (1 + (off / (0.02 * radius + 1e-9)) ** 2)
-    if np.median(np.abs(off)) > _ROUND * radius:
-        return "its outline is no circle"
-    if len(np.unique(np.arctan2(*(points - solved[:2]).T) // (np.pi / 18))) < _SEEN * 36:
-        return "less than two fifths of its circle are seen"
-    return np.array([solved[0], solved[1] / stretch]), radius
 
 
 def _samples(press: Press, sensor: Sensor, ball: float) -> tuple[Array, Array]:
@@ -281,6 +196,57 @@ def _left_one_out(
         squares.append(((features[on] @ weights.T - true[on]) ** 2).mean())
         diameters[i] = _diameter(_inner(press, sensor, _MEASURED), weights)
     return diameters, float(np.sqrt(np.mean(squares))), float(np.median(beside))
+
+
+def membrane_curvature(
+    first: Calibrated, first_ball: float, second: Calibrated, second_ball: float
+) -> tuple[float, float]:
+    """How a membrane bulges, from presses of two balls of different size: its curvature [1/m], and the standard deviation.
+
+    Taken for flat, a membrane that bulges takes so much off the curvature of every ball, which one ball alone leaves unnoticed:
+    its colours are fitted to what they are said to show. Of two balls each is then measured wrongly by the other's colours, the
+    larger one as too large. The curvature sought is that with which neither is.
+
+    Parameters
+    ----------
+    first, second : presses of either ball by one sensor, calibrated each by its own
+    first_ball, second_ball : their diameters [m]
+
+    Raises
+    ------
+    InputError
+        The balls are of nearly one size, which tells nothing.
+    """
+    if max(first_ball, second_ball) < _UNLIKE * min(first_ball, second_ball):
+        raise InputError(
+            f"balls of {1e3 * first_ball:g} and {1e3 * second_ball:g} mm tell nothing of the membrane: one should be "
+            f"{_UNLIKE:g} times as large as the other, or larger"
+        )
+    balls = ((first.presses, 0.5 * first_ball), (second.presses, 0.5 * second_ball))
+    flat = _told_by_the_other(balls, replace(first.sensor, membrane_radius=0.0))
+    bend = gained = _BEND * float(np.hypot(*first.sensor.half_window))
+
+    def curvature(rows: Sequence[NDArray[np.int64]]) -> float:
+        return float(np.median(flat[0][rows[0]]) - np.median(flat[1][rows[1]])) / gained
+
+    every = [np.arange(len(each)) for each in flat]
+    for _ in range(_STEPS):
+        bent = _told_by_the_other(balls, replace(first.sensor, membrane_radius=bend))
+        a, b = (there - here for here, there in zip(flat, bent, strict=True))
+        gained = float(np.median(b) - np.median(a)) * bend  # by what is told of the larger ball, for a curvature of one
+        bend = 1 / max(curvature(every), 1 / bend / _STEPS)
+    rng = np.random.default_rng(0)
+    drawn = [curvature([rng.integers(len(each), size=len(each)) for each in flat]) for _ in range(_RESAMPLED)]
+    return curvature(every), float(np.std(drawn))
+
+
+def _told_by_the_other(balls: Sequence[tuple[Sequence[Press], float]], sensor: Sensor) -> list[Array]:
+    """For either ball the log of its diameter on each press, as the colours tell that the other's presses give, over its own."""
+    weights = [_weights([_samples(press, sensor, ball) for press in presses]) for presses, ball in balls]
+    return [
+        np.log([_diameter(_inner(press, sensor, _MEASURED), other) / (2 * ball) for press in presses])
+        for (presses, ball), other in zip(balls, reversed(weights), strict=True)
+    ]
 
 
 def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Array, Array]:
