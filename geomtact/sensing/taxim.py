@@ -45,8 +45,8 @@ def read_table(path: str | Path) -> Array:
 
 
 def change_of(table: Array, slope: Array, u: NDArray, v: NDArray) -> Array:
-    """The change of colour (n, 3), 0..1, that a table tells of slopes (n, 2), depth over column and over row, at columns ``u`` (n,)
-    and rows ``v`` (n,)."""
+    """The change of colour (n, 3), 0..1, that a table tells of slopes (n, 2), of depth along columns and along rows, at columns
+    ``u`` (n,) and rows ``v`` (n,)."""
     last = len(table) - 1
     steep = np.arctan(np.hypot(*slope.T)) / (0.5 * np.pi) * last
     towards = (np.arctan2(slope[:, 1], slope[:, 0]) + np.pi) / (2 * np.pi) * last
