@@ -70,11 +70,14 @@ def test_the_most_probable_comes_first_with_its_posterior(drawer):
 
 
 def test_probabilities_are_evidence_times_weights(drawer):
+    """The evidence of one contact's moments counts by a quarter, before the weights do."""
     mask = touches(drawer[1])[0]
     alike = {c.name: c for c in identify(drawer, mask, kind="mask", effort="fast").candidates}
     for name, candidate in alike.items():
         own = next(each for each in drawer if each.mesh.name == name)
         assert candidate.log_evidence == own.localize(mask, "mask", effort="fast").log_evidence
+    beyond = alike["ball"].log_evidence - alike["rod"].log_evidence
+    assert alike["ball"].probability / alike["rod"].probability == pytest.approx(np.exp(beyond / 4))
     weights = (1.0, 2.0, 0.0)
     found = {
         c.name: c.probability for c in identify(iter(drawer), mask, weights, kind="mask", effort="fast").candidates
@@ -180,15 +183,16 @@ def test_the_command_line_tells_the_part(drawer, tmp_path, monkeypatch):
 def test_the_study_tells_what_identify_does(drawer):
     told = list(identify_scenes(drawer[1], drawer, 2, 3, MODERATE, "fast", first=1))
     assert [[each.touches for each in some] for some in told] == [[1, 2, 3]]
-    assert all(each.scene == 1 and set(each.log_evidence) == {"rod", "ball", "block"} for each in told[0])
-    assert told[0][0].log_evidence["ball"] > told[0][0].log_evidence["rod"]
+    assert all(each.scene == 1 and set(each.log_probability) == {"rod", "ball", "block"} for each in told[0])
+    assert told[0][0].log_probability["ball"] > told[0][0].log_probability["rod"]
 
 
 def test_figures_of_the_study_follow_from_what_was_told():
     def told(touches, a, b, unlike_a, unlike_b):
-        return Told(0, touches, {"a": a, "b": b}, {"a": unlike_a, "b": unlike_b})
+        logs = np.array([a, b]) - np.logaddexp(a, b)
+        return Told(0, touches, dict(zip("ab", logs.tolist(), strict=True)), {"a": unlike_a, "b": unlike_b})
 
-    of_a = [told(1, 0.0, -9.0, False, True), told(2, 0.0, -9.0, True, True), told(3, -np.inf, -np.inf, True, True)]
+    of_a = [told(1, 0.0, -9.0, False, True), told(2, 0.0, -9.0, True, True), told(3, 0.0, 0.0, True, True)]
     of_b = [told(1, 5.0, 0.0, False, False), told(2, 0.0, 0.1, True, False), told(3, -9.0, 0.0, True, False)]
     one, two, three = summarise({"a": of_a, "b": of_b})
     assert (one["right"][0], one["foreign"][0], one["alarmed"][0], one["sure_and_wrong"]) == (0.5, 0.5, 0, 0.5)
@@ -199,7 +203,7 @@ def test_figures_of_the_study_follow_from_what_was_told():
     content["parts"] = {
         name: {
             "outcomes": [
-                [{"log_evidence": {k: e if np.isfinite(e) else None for k, e in t.log_evidence.items()}} for t in some]
+                [{"log_probability": {k: e if np.isfinite(e) else None for k, e in t.log_probability.items()}} for t in some]
             ]
         }
         for name, some in (("a", of_a), ("b", of_b))

@@ -221,6 +221,7 @@ def test_figures_follow_from_the_answers():
         "ruled_out": pytest.approx(0.2),
         "mssd_mm_median": 50.0,
         "wrong": 0.6,
+        "certain": 0.8,
         "warned": 0.4,
         "silent": 0.2,
         "found_out": pytest.approx(2 / 3),

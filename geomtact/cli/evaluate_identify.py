@@ -41,7 +41,7 @@ def judge_identification(
     """Judge which part it is: touches of each of several parts, localized on all of them, and on all but the right one.
 
     Prints how often the right part is the most probable, how often a part that is not among them is said to be foreign, and how
-    often one that is; and writes them and every evidence to --out.
+    often one that is; and writes them and every probability to --out.
     """
     from geomtact.evaluation import identification, study
     from geomtact.geometry.catalogue import catalogue
@@ -78,11 +78,11 @@ def judge_identification(
 
 
 def _told(written: Mapping[str, Any]) -> Any:
-    """An outcome as written, null standing for an evidence that JSON has no number for."""
+    """An outcome as written, null standing for a log that JSON has no number for."""
     from geomtact.evaluation.identification import Told
 
-    evidence = {name: -float("inf") if e is None else e for name, e in written["log_evidence"].items()}
-    return Told(**{**written, "log_evidence": evidence})
+    logs = {name: -float("inf") if each is None else each for name, each in written["log_probability"].items()}
+    return Told(**{**written, "log_probability": logs})
 
 
 def _print(figures: Sequence[Mapping[str, Any]]) -> None:

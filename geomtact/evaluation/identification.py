@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,13 +26,13 @@ class Told:
     Attributes
     ----------
     scene, touches : which of the part's scenes, and from how many of its touches
-    log_evidence : by part's name; -inf where no pose agrees with all touches
+    log_probability : of each part, by its name; -inf where no pose agrees with all touches
     unlike : by part's name, whether what is shown was said to be unlike it
     """
 
     scene: int
     touches: int
-    log_evidence: dict[str, float]
+    log_probability: dict[str, float]
     unlike: dict[str, bool]
 
 
@@ -55,9 +56,10 @@ def _told(parts: Sequence[Localizer], scene: Scene, number: int, touches: int, s
     try:
         found = {each.name: each for each in identify(parts, images, **options).candidates}
     except NoPoseAgreesError:  # of no part
-        return Told(number, touches, dict.fromkeys(names, -np.inf), dict.fromkeys(names, True))
-    evidence = {name: found[name].log_evidence for name in names}
-    return Told(number, touches, evidence, {name: found[name].unlike for name in names})
+        return Told(number, touches, dict.fromkeys(names, -math.log(len(names))), dict.fromkeys(names, True))
+    with np.errstate(divide="ignore"):
+        log_probability = {name: float(np.log(found[name].probability)) for name in names}
+    return Told(number, touches, log_probability, {name: found[name].unlike for name in names})
 
 
 def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:
@@ -70,26 +72,19 @@ def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:
     out = []
     for touches in range(1, MOST + 1):
         cases = [(name, each) for name, some in told.items() for each in some if each.touches == touches]
-        probability = np.array([_posterior(each)[name] for name, each in cases])
-        right = [max(each.log_evidence, key=each.log_evidence.__getitem__) == name for name, each in cases]
+        log_probability = np.array([each.log_probability[name] for name, each in cases])
+        right = [max(each.log_probability, key=each.log_probability.__getitem__) == name for name, each in cases]
         foreign = [all(unlike for part, unlike in each.unlike.items() if part != name) for name, each in cases]
         alarmed = [all(each.unlike.values()) for _, each in cases]
         figures: dict[str, Any] = {"touches": touches, "n": len(cases)}
         for key, which in (("right", right), ("foreign", foreign), ("alarmed", alarmed)):
             figures[key] = share_with_interval(sum(which), len(which))
-        figures["probability_median"] = float(np.median(probability))
-        with np.errstate(divide="ignore"):
-            figures["log_probability_mean"] = float(np.log(probability).mean())
-        most = np.array([max(_posterior(each).values()) for _, each in cases])
+        figures["probability_median"] = float(np.median(np.exp(log_probability)))
+        figures["log_probability_mean"] = float(log_probability.mean())
+        most = np.exp([max(each.log_probability.values()) for _, each in cases])
         figures["claimed"] = float(most.mean())
         sure = most > 0.95
         figures["sure_and_wrong"] = float(np.mean(sure & ~np.array(right)))
         out.append(figures)
     return out
 
-
-def _posterior(each: Told) -> dict[str, float]:
-    logs = np.array(list(each.log_evidence.values()))
-    if not np.isfinite(logs).any():
-        return dict.fromkeys(each.log_evidence, 1 / len(logs))
-    return dict(zip(each.log_evidence, np.exp(logs - np.logaddexp.reduce(logs)).tolist(), strict=True))

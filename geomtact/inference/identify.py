@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 # nats a contact that the likeliest pose of the right part falls short by, of several: 5 % of 22 scenes of seed 77 did by more
 _MISFIT = 4.6
+# what evidence of the moments is worth between parts, since a density fitted to a part's own touches is too sure of others':
+# chosen on 600 touches of ten parts, seed 7777
+_OF_MOMENTS = 0.25
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class Candidate:
     Attributes
     ----------
     name : of the part
-    probability : that it is this one, of those given
+    probability : that it is this one, of those given: evidence of moments counts by a quarter, of pixels in full
     log_evidence : of what is shown, if it is; -inf where no pose agrees with all sensors
     unlike : whether hardly any touch of this part is so unlikely, or no pose explains all contacts
     """
@@ -92,7 +95,7 @@ def identify(
             last_error = error
             continue
         told.append((localizer.mesh.name, posterior.log_evidence, _is_unlike(posterior)))
-        merits.append(posterior.log_evidence + (0.0 if known is None else float(known[i])))
+        merits.append(_worth(posterior) * posterior.log_evidence + (0.0 if known is None else float(known[i])))
         if best is None or merits[-1] > best[0]:
             best = merits[-1], localizer, posterior
     if not told:
@@ -115,6 +118,10 @@ def _log_weights(weights: Sequence[float]) -> Array:
         raise UsageError(f"identify: expected weights >= 0, one a part, got {weights}")
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(given / given.sum()))
+
+
+def _worth(posterior: Posterior) -> float:
+    return 1.0 if "unexplained_nats" in posterior.settings else _OF_MOMENTS
 
 
 def _is_unlike(posterior: Posterior) -> bool:

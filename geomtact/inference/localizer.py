@@ -55,8 +55,6 @@ class Effort:
     thorough: bool = True
 
 
-# what the evidence of one contact's moments is worth between parts: chosen on 600 touches of ten parts, seed 7777
-_ALONE = 0.25
 _HOLLOW = 0.01  # share of the surface in hollows that the sensor may fit into, from which it is warned of
 _HALL = 100.0  # m from the origin from which a translation is taken to be in millimetres
 _ROOM = 10.0  # m between two sensors from which translations are taken to be in millimetres
@@ -172,7 +170,6 @@ class Localizer:
             touch = counted_once(touch, prior)
             if not touch.contact:
                 return touch
-            touch = replace(touch, log_evidence=_ALONE * touch.log_evidence)
             with _timed(touch.timing_ms, "refine"):
                 contact = touch.observation.contact
                 if contact.height is not None and how.modes:

@@ -38,8 +38,8 @@ def draw_identification(content: Mapping[str, Any]) -> bytes:
     taken = np.zeros((len(names), len(names)))
     for row, name in enumerate(names):
         for some in content["parts"][name]["outcomes"]:
-            evidence = [some[-1]["log_evidence"][other] for other in names]
-            taken[row, int(np.argmax([-np.inf if e is None else e for e in evidence]))] += 1
+            logs = [some[-1]["log_probability"][other] for other in names]
+            taken[row, int(np.argmax([-np.inf if each is None else each for each in logs]))] += 1
     taken /= np.maximum(taken.sum(1, keepdims=True), 1)
     right.imshow(taken, cmap="Blues", vmin=0, vmax=1)
     for (row, column), share in np.ndenumerate(taken):
