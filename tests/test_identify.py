@@ -203,7 +203,10 @@ def test_figures_of_the_study_follow_from_what_was_told():
     content["parts"] = {
         name: {
             "outcomes": [
-                [{"log_probability": {k: e if np.isfinite(e) else None for k, e in t.log_probability.items()}} for t in some]
+                [
+                    {"log_probability": {k: e if np.isfinite(e) else None for k, e in t.log_probability.items()}}
+                    for t in some
+                ]
             ]
         }
         for name, some in (("a", of_a), ("b", of_b))

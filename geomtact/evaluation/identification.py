@@ -87,4 +87,3 @@ def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:
         figures["sure_and_wrong"] = float(np.mean(sure & ~np.array(right)))
         out.append(figures)
     return out
-
