@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 from typer.testing import CliRunner
 
 from geomtact.cli import app
@@ -30,7 +31,9 @@ def test_a_way_differs_from_the_default_in_one_thing():
             for f in fields(way)
             if f.name not in ("choice", "scenes") and getattr(way, f.name) != getattr(WAYS[DEFAULT], f.name)
         }
-        assert len(changed) == (0 if name == DEFAULT else 2 if name == "this side alone" else 1), name
+        assert len(changed) == (0 if name == DEFAULT else {"this side alone": 2, "this side, exact": 3}.get(name, 1)), (
+            name
+        )
     assert all(a in WAYS and b in WAYS for a, b in MODELLED.values())
     assert all(set(way.scenes) <= set(choices.SCENES) for way in WAYS.values())
 
@@ -88,7 +91,7 @@ def test_what_is_modelled_adds_the_paired_difference():
 
 
 @pytest.fixture
-def few_ways(monkeypatch):
+def few_ways(monkeypatch, few_touches):
     names = (DEFAULT, "no mode refined", "symmetry ignored", "calibrated on rigid gels", "this side alone")
     monkeypatch.setattr(choices, "WAYS", {name: replace(WAYS[name], max_poses=SMALL) for name in names})
     monkeypatch.setattr(choices, "TOUCHES", 60)
@@ -114,3 +117,19 @@ def test_the_study_judges_every_way_on_the_same_touches_and_goes_on_where_it_was
     monkeypatch.setattr(choices, "prepare", None)  # a study that is done prepares nothing
     assert CliRunner().invoke(app, command).exit_code == 0
     assert json.loads(out.read_text("utf-8"))["parts"] == content["parts"]
+
+
+def test_weights_of_ones_own_are_ways_more(tmp_path):
+    """An encoder of another size has the default's grid, the thesis's network one like its own."""
+    from geomtact.scoring.encoder import WEIGHTS
+
+    small, resnet = tmp_path / "small.safetensors", tmp_path / "resnet.safetensors"
+    small.write_bytes(WEIGHTS.read_bytes())
+    save_file({"x": np.zeros(1, np.float32)}, resnet, {"architecture": "resnet50"})
+    ways = choices.ways_of([small, resnet])
+    assert set(ways) - set(WAYS) == {"encoder small", "the thesis's network"}
+    assert ways["encoder small"] == replace(ways["encoder"], choice="encoder", scorer=str(small))
+    assert ways["the thesis's network"].max_poses == 150_000
+    told_more = {"encoder": told([1.0, 2.0], 1.0), "encoder small": told([0.5, 1.0], 1.0)}
+    assert modelled(told_more)["encoder small, not encoder"]["adds"][0] == pytest.approx(-0.75)
+    assert front(summarise({DEFAULT: told([1.0, 2.0], 1.0), **told_more}))[0] == DEFAULT

@@ -22,7 +22,7 @@ def cache(tmp_path_factory):
 
 
 @pytest.fixture
-def geomtact(tmp_path, monkeypatch, cache):
+def geomtact(tmp_path, monkeypatch, cache, few_touches):
     """Runs a command in an empty folder; checks the exit status."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GEOMTACT_CACHE", str(cache))

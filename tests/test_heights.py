@@ -18,10 +18,9 @@ from geomtact.se3 import transform
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.elastic import elastic_contact
 from geomtact.sensing.image_file import read_image
-from geomtact.sensing.local_shape import METHODS
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.render import Lamps, example_reading, render
-from geomtact.sensing.sensor import HEIGHT_NOISE
+from geomtact.sensing.sensor import CONTACT_METHODS, HEIGHT_NOISE
 
 CIRCLES = Path(__file__).with_name("circles_gelslam_gsmini.csv")
 MM = 1e-3
@@ -37,7 +36,7 @@ def under_ball(depth, centre=(0.0, 0.0), radius=BALL):
 
 
 @pytest.fixture(scope="module")
-def balls(tmp_path_factory):
+def balls(tmp_path_factory, few_touches):
     """The ball, and one half as large again."""
     cache, out = tmp_path_factory.mktemp("cache"), []
     for radius in (BALL, 1.5 * BALL):
@@ -151,7 +150,7 @@ def test_a_rendered_reading_gives_its_contact_back(rng):
     reading, background = (
         example_reading(h, SENSOR.pixel_pitch, 1 / 255, rng) for h in (height, np.zeros_like(height))
     )
-    for method in METHODS:
+    for method in CONTACT_METHODS:
         found = contact_mask(reading, background, SENSOR, method)
         offset = np.argwhere(found).mean(0) - np.argwhere(touched).mean(0)
         assert np.hypot(*offset) < 2 and 0.7 < found.sum() / touched.sum() < 2
@@ -168,7 +167,7 @@ def test_simulated_readings_are_localized_as_they_come(tmp_path):
     assert read_observation(image, "gelsight-mini", background=background).contact.mask.any()
 
 
-def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp_path, cache_dir):
+def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp_path, cache_dir, few_touches):
     """Every sixth press that lies wholly in the window; the calibration saw presses of the other ball alone."""
     folder = data_folder / "gelslam_gsmini_balls"
     sensors = calibrations(data_folder)

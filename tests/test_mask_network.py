@@ -20,7 +20,10 @@ from geomtact.evaluation.readings import (
     overlap,
     summarise_contacts,
 )
-from geomtact.sensing.mask_network import WEIGHTS, MaskNetwork, contact_probability, seen_change
+from geomtact.sensing.image_file import read_image
+from geomtact.sensing.mask_network import CHANNELS, WEIGHTS, MaskNetwork, contact_probability, seen
+from geomtact.sensing.reading import read_observation
+from geomtact.sensing.sensor import Sensor
 from geomtact.training.presses import PRESSES, READINGS, make_presses, press_part
 from geomtact.training.train_mask import Settings, train_mask, validate, write_mask_network
 
@@ -37,15 +40,15 @@ def parts():
 
 def test_a_press_shows_colour_around_its_contact(parts):
     again = press_part(0, 7)
-    assert np.array_equal(again.change, parts[0].change) and np.array_equal(again.contact, parts[0].contact)
+    assert np.array_equal(again.seen, parts[0].seen) and np.array_equal(again.contact, parts[0].contact)
     for part in parts:
-        assert part.change.shape == (PRESSES, READINGS, 3, 60, 80) and part.contact.shape == (PRESSES, 60, 80)
+        assert part.seen.shape == (PRESSES, READINGS, CHANNELS, 60, 80) and part.contact.shape == (PRESSES, 60, 80)
         assert part.contact.min() >= 0 and part.contact.max() <= 1 and (part.contact.max((1, 2)) > 0.5).all()
         # the gel is flat under a flat face: colours show at the contact's border
         touched = (part.contact > 0.5).astype(np.uint8)
         rim, far = (np.stack([cv2.dilate(each, np.ones((n, n))) for each in touched]) > 0 for n in (5, 25))
         rim &= ~np.stack([cv2.erode(each, np.ones((5, 5))) for each in touched]).astype(bool)
-        size = np.linalg.norm(part.change.astype(float), axis=2)
+        size = np.linalg.norm(part.seen[:, :, :3].astype(float), axis=2)
         for reading in range(READINGS):
             assert size[:, reading][rim].mean() > 2 * size[:, reading][~far].mean()
 
@@ -54,7 +57,7 @@ def test_presses_are_made_once(tmp_path, monkeypatch):
     first = make_presses(tmp_path, 1, 7, processes=1)
     made = (tmp_path / "0.npz").stat().st_mtime_ns
     second = make_presses(tmp_path, 1, 7, processes=1)
-    assert np.array_equal(first[0].change, second[0].change) and (tmp_path / "0.npz").stat().st_mtime_ns == made
+    assert np.array_equal(first[0].seen, second[0].seen) and (tmp_path / "0.npz").stat().st_mtime_ns == made
 
 
 def test_a_stopped_run_goes_on_to_the_same_weights(parts, tmp_path):
@@ -97,19 +100,34 @@ def test_the_network_that_comes_along_knows_presses_it_never_saw():
     from geomtact.sensing.mask_network import _network
 
     parts = [press_part(i, 991) for i in range(4)]
-    change, contact = (torch.from_numpy(np.concatenate([getattr(p, n) for p in parts])) for n in ("change", "contact"))
+    sights, contact = (torch.from_numpy(np.concatenate([getattr(p, n) for p in parts])) for n in ("seen", "contact"))
     assert WEIGHTS.stat().st_size < 5e6
-    assert validate(_network(), change, contact) > 0.6
+    assert validate(_network(), sights, contact) > 0.6
 
 
 @pytest.mark.parametrize("shape", [(240, 320), (320, 240), (123, 161)])
 def test_images_of_any_shape_get_a_probability_at_each_pixel(shape, rng):
-    change = rng.normal(0, 0.01, (*shape, 3))
-    probability = contact_probability(change)
+    change, image = rng.normal(0, 0.01, (*shape, 3)), rng.uniform(0, 1, (*shape, 3))
+    probability = contact_probability(change, image)
     assert probability.shape == shape and (probability >= 0).all() and (probability <= 1).all()
     # in shares of the strongest: how bright lamps are changes nothing
-    assert contact_probability(7 * change) == pytest.approx(probability, abs=1e-4)
-    assert min(seen_change(change).shape[1:]) == 60
+    assert contact_probability(7 * change, image) == pytest.approx(probability, abs=1e-4)
+    assert min(seen(change, image).shape[1:]) == 60 and len(seen(change, image)) == CHANNELS
+    # nothing tells which way is up
+    turned = contact_probability(change[::-1, ::-1], image[::-1, ::-1])
+    assert turned[::-1, ::-1] == pytest.approx(probability, abs=1e-3)
+
+
+def test_the_sensor_says_how_contact_is_found_and_probabilities_reach_the_localizer(data_folder):
+    folder = data_folder / "gelslam_gsmini_balls"
+    image, background = (read_image(folder / name) for name in ("6.310mm/40.png", "background.png"))
+    plain = Sensor.load("gelsight-mini")
+    learned = replace(plain, contact_method="learned")
+    assert Sensor.from_toml(learned.to_toml()).contact_method == "learned"
+    first, second = (read_observation(image, each, background=background).contact for each in (plain, learned))
+    assert first.probability is None and np.array_equal(first.mask, contact_mask(image, background, plain))
+    assert np.array_equal(second.mask, contact_mask(image, background, plain, "learned"))
+    assert np.array_equal(second.mask, second.probability > 0.5) and second.shown is second.probability
 
 
 def test_an_unknown_method_is_refused(rng):

@@ -56,7 +56,7 @@ class Press:
 
 
 @pytest.fixture(scope="module")
-def balls(data_folder, cache_dir):
+def balls(data_folder, cache_dir, few_touches):
     out = {}
     for diameter in DIAMETERS:
         ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5 * float(diameter) * MM)
@@ -151,7 +151,7 @@ def _of_marker(row, sensor):
 
 
 @pytest.fixture(scope="module")
-def marker(data_folder, tmp_path_factory):
+def marker(data_folder, tmp_path_factory, few_touches):
     """A localizer of a marker on a DIGIT that others simulated, and the posterior of each of their readings with its
     pose, but for how deep it presses: [(posterior, T)]."""
     folder = data_folder / "hsp_digit_sim_ycb"

@@ -544,3 +544,20 @@ def test_a_start_that_is_no_pose_is_refused(refiner, block):
     for wrong in (np.nan * T, 1e3 * T):
         with pytest.raises(PoseError, match="start pose"):
             refiner(surface, SPREAD).refine(problem, np.stack([T, wrong]))
+
+
+@pytest.mark.parametrize("unsure", [0.1e-3, 0.5e-3, 1e-3])
+def test_an_outline_is_as_unsure_as_the_probability_of_contact_says(unsure):
+    """Where the outline errs by s, the probability of contact is that of a Gaussian of that width."""
+    from scipy.stats import norm
+
+    sensor = Sensor("plain", (320, 240), (1e-4, 1e-4), 0.0, 2e-3)
+    x, y = np.meshgrid(*sensor.pixel_centres())
+    beside = np.hypot(x - 1e-3, y) - 6e-3
+    problem = make_problem(norm.cdf(-beside / unsure).astype(np.float32), sensor)
+    sharp = make_problem(beside < 0, sensor)
+    assert problem.noise == pytest.approx(np.maximum(unsure, sharp.noise[0]), rel=0.1)
+    from_centre = problem.points[:, :2] - [1e-3, 0]
+    radius = np.linalg.norm(from_centre, axis=1, keepdims=True)
+    assert radius == pytest.approx(6e-3, abs=1e-5) and (sharp.noise == sharp.noise[0]).all()
+    assert problem.facing[:, :2] == pytest.approx(from_centre / radius, abs=0.1)

@@ -352,3 +352,36 @@ def test_a_part_whose_touches_are_all_alike_is_refused(make_localizer, monkeypat
         make_localizer(slab, "gelsight-mini", approach=[((0, 0, 1), 0.0)], max_poses=5_000, cache_dir=tmp_path)
     assert "a larger window" in str(error.value) and "\n" not in str(error.value)
     assert not list(tmp_path.glob("*/best*.json"))
+
+
+# --- probabilities in a mask's stead
+
+
+@pytest.mark.parametrize(
+    "name", ["encoder", "moments", "likelihood", "iou", "l1", "chamfer", "cosine", "hu", "fourier"]
+)
+def test_probabilities_of_0_and_1_score_as_the_mask_does(name, plug, a_touch):
+    _, mask = a_touch(plug)
+    scorer = fitted_scorer(name, plug.index, plug.cache_dir / plug.index.key).scorer
+    expected = scorer.score(plug.index, mask)
+    assert scorer.score(plug.index, mask.astype(np.float32)) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+def test_what_may_be_contact_counts_by_its_probability(plug, a_touch):
+    """Half of a patch beside the contact moves the moments half as far as all of it."""
+    _, mask = a_touch(plug)
+    beside = np.zeros_like(mask)
+    beside[:40, :60] = True
+    sums = [m.astype(np.float32) for m in (mask, mask + 0.4 * beside, mask | beside)]
+    centre, area = zip(*[(m[:2], np.exp(m[2])) for m in moments(np.stack(sums), plug.sensor)], strict=True)
+    first, some, all_of_it = (c * a for c, a in zip(centre, area, strict=True))
+    assert some - first == pytest.approx(0.4 * (all_of_it - first), rel=1e-3)
+
+
+def test_dust_is_dust_by_its_probability_too():
+    probability = np.full((100, 100), 0.1, np.float32)
+    probability[20:60, 20:60], probability[80:82, 80:82] = 0.9, 0.7
+    clean = without_specks(probability, 1e-8)
+    assert (clean[80:82, 80:82] == 0).all()
+    clean[80:82, 80:82] = 0.7
+    assert np.array_equal(clean, probability)

@@ -35,6 +35,7 @@ def test_a_sensor_survives_writing_and_reading(name):
 def test_the_hash_is_of_the_geometry_and_not_of_the_note():
     plain = Sensor.from_toml(PLAIN)
     assert Sensor.from_toml(PLAIN + 'note = "seen on a Tuesday"').sha256 == plain.sha256
+    assert Sensor.from_toml(PLAIN + 'contact_method = "learned"').sha256 == plain.sha256
     assert Sensor.from_toml(PLAIN + "membrane_radius_mm = 30").sha256 != plain.sha256
     assert Sensor.from_toml(PLAIN + "housing_depth_mm = 0").sha256 != plain.sha256
 
@@ -58,6 +59,7 @@ def test_a_sensor_is_read_from_a_file_and_passed_through(tmp_path):
         ("membrane_radius_mm = 5.0", "must be 0 (flat) or exceed the window's half diagonal, 11.32 mm"),
         ("housing_depth_mm = -1", "housing_depth_mm must be >= 0"),
         ("note = 3", "note must be a str, got 3"),
+        ("contact_method = 'clasical'", "contact_method must be one of classical, pressure, learned, got 'clasical'"),
         ("a = = 3", "not valid TOML"),
     ],
 )

@@ -29,6 +29,14 @@ def judge_choices(
         int, typer.Option("--touches", min=2, help="How many scenes of each kind, for each part.")
     ] = 100,
     seed: study_options.Seed = 3,
+    weights: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--weights",
+            help="Weights that 'geomtact train' wrote: an encoder of another size, or the thesis's network; each is a way more.",
+            show_default=False,
+        ),
+    ] = None,
     out: study_options.Out = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", help="PNG of information and error against the time of a touch.")
@@ -46,7 +54,7 @@ def judge_choices(
     from geomtact.report.result import plain
     from geomtact.sensing.sensor import Sensor
 
-    content, gel = study_file.load(out, SCHEMA), Sensor.load(sensor)
+    content, gel, ways = study_file.load(out, SCHEMA), Sensor.load(sensor), choices.ways_of(weights or [])
     for mesh in study_options.meshes(parts, unit, gel):
         settings = plain(
             {
@@ -56,7 +64,7 @@ def judge_choices(
                 "sensor_sha256": gel.sha256,
                 "touches": touches,
                 "seed": seed,
-                "ways": {name: asdict(way) for name, way in choices.WAYS.items()},
+                "ways": {name: asdict(way) | {"scorer": Path(way.scorer).name} for name, way in ways.items()},
             }
         )
         found = content["parts"].get(mesh.name)
@@ -64,7 +72,7 @@ def judge_choices(
         part = known | {"settings": settings}
         done = {kind: list(part["scenes"].get(kind, {}).get("answers", [])) for kind in choices.SCENES}
         if any(len(some) < touches for some in done.values()):
-            _judge(mesh, gel, part, done, touches, seed, lambda part=part: _keep(out, content, part))
+            _judge(mesh, gel, ways, part, done, touches, seed, lambda part=part: _keep(out, content, part))
         _summarise(part)
         _keep(out, content, part)
         _print(mesh.name, part)
@@ -78,7 +86,14 @@ def _keep(out: Path | None, content: dict[str, Any], part: Mapping[str, Any]) ->
 
 
 def _judge(
-    mesh: Mesh, sensor: Sensor, part: dict[str, Any], done: dict[str, list], n: int, seed: int, save: Any
+    mesh: Mesh,
+    sensor: Sensor,
+    ways: Mapping[str, Any],
+    part: dict[str, Any],
+    done: dict[str, list],
+    n: int,
+    seed: int,
+    save: Any,
 ) -> None:
     """Prepare every way and localize what is left of the scenes, in every way."""
     import tempfile
@@ -89,9 +104,9 @@ def _judge(
     localizers: dict[str, Localizer] = {}
     spent: dict[tuple[Any, ...], float | None] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name, way in choices.WAYS.items():
+        for name, way in ways.items():
             with progress_bar(f"preparing {mesh.name}, {name}") as progress:
-                localizers[name], seconds = choices.prepare(mesh, sensor, name, Path(folder), progress)
+                localizers[name], seconds = choices.prepare(mesh, sensor, way, Path(folder), progress)
             spent.setdefault(way.prepared, seconds)
             part["ways"][name] = {
                 "choice": way.choice,
@@ -101,7 +116,7 @@ def _judge(
             }
         for kind in choices.SCENES:
             scenes = choices.make(kind, localizers[choices.DEFAULT], n, seed)
-            todo = choices.localized(localizers, scenes[len(done[kind]) :], kind, seed)
+            todo = choices.localized(localizers, ways, scenes[len(done[kind]) :], kind, seed)
             rows = ({name: asdict(answer) for name, answer in told.items()} for told in todo)
 
             def keep(answers: list, kind: str = kind) -> None:

@@ -35,25 +35,26 @@ def judge_readings(
     Prints a table of each, and writes them and every outcome to --out.
     """
     from geomtact.evaluation import readings
-    from geomtact.sensing.local_shape import METHODS
+    from geomtact.sensing.sensor import CONTACT_METHODS
 
     content = study_file.load(out, SCHEMA)
     sets, methods = readings.imprints(folder), readings.methods()
     if circles is not None:
         sets["gelslam"] = readings.imprints_by_eye(folder, circles)
+    default = CONTACT_METHODS[0]
     for name, some in sets.items():
         found = {method: readings.find(some, method, find) for method, find in methods.items()}
         study_file.keep(
             out,
             content,
             name,
-            settings={"set": name, "n": len(some), "default": METHODS[0]},
+            settings={"set": name, "n": len(some), "default": default},
             figures={method: readings.summarise_contacts(each) for method, each in found.items()},
             outcomes=[asdict(o) for each in found.values() for o in each],
         )
     _print_contacts({name: content["parts"][name]["figures"] for name in sets})
     if sheet is not None:
-        _draw(sheet, sets, methods[METHODS[0]], {name: content["parts"][name]["figures"][METHODS[0]] for name in sets})
+        _draw(sheet, sets, methods[default], {name: content["parts"][name]["figures"][default] for name in sets})
 
     sensors = readings.calibrations(folder)
     measured = readings.measure_balls(folder, sensors)

@@ -33,7 +33,7 @@ def judge_thesis_table(
     touches: Annotated[int, typer.Option("--touches", min=1, help="How many touches from each side.")] = 40,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     felt: study_options.Felt = study_options.FeltName.elastic,
-    effort: study_options.EffortLevel = Effort.balanced,
+    effort: study_options.EffortLevel = Effort.exact,
     ambiguity: Annotated[
         int, typer.Option("--ambiguity", min=0, help="For how many of them to seek all poses that feel the same.")
     ] = 0,

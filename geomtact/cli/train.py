@@ -190,7 +190,7 @@ def _train_mask(out: Path, work: Path, parts: int, steps: int, rate: float | Non
     with progress_bar("training") as progress:
         made = make_presses(work / "presses", parts, seed, progress)
         network, curve = train_mask(made, settings, work, progress)
-    write_mask_network(out, network, curve, settings, sum(len(p.change) for p in made))
+    write_mask_network(out, network, curve, settings, sum(len(p.seen) for p in made))
     tell(f"overlaps the contact by {curve['validation'][-1]:.2f} on parts that it never saw")
     typer.echo(f"written: {out} and {out.with_suffix('.json').name}")
 

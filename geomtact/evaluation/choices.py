@@ -30,14 +30,15 @@ from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.localizer import EFFORTS, Effort, Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import calibrate, simulate_touches
-from geomtact.scoring.catalogue import DEFAULT_SCORER
+from geomtact.scoring.catalogue import DEFAULT_SCORER, SCORERS
+from geomtact.scoring.encoder import THESIS, about
 from geomtact.scoring.fitted import SEED, TOUCHES
 from geomtact.se3 import Array
 from geomtact.sensing.noise import CLEAN, MODERATE, Noise, smooth_field
 from geomtact.sensing.sensor import Sensor
 
 SCENES = ("one touch", "three sensors", "known side")
-DEFAULT = "balanced"
+DEFAULT, _ENCODER = "balanced", "encoder"
 _SENSORS = 3
 _BALANCED = EFFORTS["balanced"]
 _ONE, _ALL = SCENES[:1], SCENES[:2]
@@ -85,10 +86,7 @@ WAYS = {
     "75k poses": Way("grid", _ALL, max_poses=75_000),
     "300k poses": Way("grid", _ALL, max_poses=300_000),
     "2.4M poses": Way("grid", _ALL, max_poses=2_400_000),
-    "moments": Way("score", scorer="moments"),
-    "cosine": Way("score", scorer="cosine"),
-    "iou": Way("score", scorer="iou"),
-    "l1": Way("score", scorer="l1"),
+    **{name: Way("score", scorer=name) for name in SCORERS if name != DEFAULT_SCORER},
     "symmetry ignored": Way("symmetry", quotient=False),
     "heights": Way("image", kind="height"),
     "calibrated without noise": Way("calibration", noise=CLEAN),
@@ -98,9 +96,12 @@ WAYS = {
     "calibrated on rigid gels": Way("calibration", elastic=False),
     "within 30 degrees": Way("side", SCENES[2:], cone=np.radians(30)),
     "this side alone": Way("side", SCENES[2:], cone=0.0, max_poses=50_000),
+    "this side, exact": Way("side", SCENES[2:], EFFORTS["exact"], cone=0.0, max_poses=50_000),
 }
 
-# what is modelled: (the way without it, the way with it). Known sides are not among them: their nats count from another uniform
+_THESIS_POSES = 150_000  # of its discretisation (6.1.2)
+
+# what is modelled: (the way without it, the way with it). A known side is not among them: its nats count from another uniform
 MODELLED = {
     "every cell, not blocks": ("fast", DEFAULT),
     "pixels and 25 modes (exact)": (DEFAULT, "exact"),
@@ -119,7 +120,20 @@ MODELLED = {
     "specks": ("calibrated without specks", DEFAULT),
     "missing patches": ("calibrated without gaps", DEFAULT),
     "elastic gels, in calibrating": ("calibrated on rigid gels", DEFAULT),
+    "outlines (exact), of a known side": ("this side alone", "this side, exact"),
 }
+
+
+def ways_of(weights: Sequence[Path]) -> dict[str, Way]:
+    """``WAYS``, and one more for each file of weights that ``geomtact train`` wrote: an encoder of another size, on the default's
+    grid, or the thesis's network, on a grid as large as its own."""
+    out = dict(WAYS)
+    for path in weights:
+        if about(path).get("architecture") == THESIS:
+            out["the thesis's network"] = Way("score", scorer=str(path), max_poses=_THESIS_POSES)
+        else:
+            out[f"encoder {path.stem}"] = Way("encoder", scorer=str(path))
+    return out
 
 
 @dataclass(frozen=True)
@@ -141,10 +155,9 @@ class Scene:
 
 
 def prepare(
-    mesh: Mesh, sensor: Sensor, name: str, cache_dir: Path, progress: Progress | None = None
+    mesh: Mesh, sensor: Sensor, way: Way, cache_dir: Path, progress: Progress | None = None
 ) -> tuple[Localizer, float | None]:
     """The localizer of a way, and the seconds that preparing it took; None where it was in the cache."""
-    way = WAYS[name]
     approach = None if way.cone is None else [(upwards(mesh), way.cone)]
     if not way.quotient:
         mesh = replace(mesh, symmetry=Symmetry("none", np.eye(4)[None], None, mesh.centre))
@@ -185,16 +198,16 @@ def _height(space: ContactSpace, touch: Touch, seed: list[int]) -> Array:
 
 
 def localized(
-    localizers: Mapping[str, Localizer], scenes: Sequence[Scene], kind: str, seed: int
+    localizers: Mapping[str, Localizer], ways: Mapping[str, Way], scenes: Sequence[Scene], kind: str, seed: int
 ) -> Iterator[dict[str, Timed]]:
     """For each scene what every way says of it."""
     mesh = localizers[DEFAULT].mesh
     for scene in scenes:
         out = {}
         for name, localizer in localizers.items():
-            if kind not in WAYS[name].scenes:
+            way = ways[name]
+            if kind not in way.scenes:
                 continue
-            way = WAYS[name]
             images = scene.masks if len(scene.masks) > 1 else scene.masks[0]
             images = scene.height if way.kind == "height" else images
             T, effort = scene.T_world_sensor, way.effort
@@ -252,7 +265,7 @@ def beaten_by(answers: Mapping[str, Sequence[Timed]], figures: Mapping[str, Mapp
 
 def _comparable(figures: Mapping[str, Mapping[str, Any]], name: str, alike: bool = True) -> bool:
     """Whether a way rules out no more truths than the default, and if ``alike`` counts gains from the same uniform."""
-    same = WAYS[name].cone == WAYS[DEFAULT].cone or not alike
+    same = name not in WAYS or WAYS[name].cone == WAYS[DEFAULT].cone or not alike
     return same and bool(figures[name]["ruled_out"] <= figures[DEFAULT]["ruled_out"])
 
 
@@ -266,7 +279,8 @@ def adds(without: Sequence[Answer], with_it: Sequence[Answer]) -> list[float]:
 def modelled(answers: Mapping[str, Sequence[Timed]]) -> dict[str, dict[str, Any]]:
     """What each thing modelled adds [nats], of those whose two ways were judged; and its time as a factor."""
     out = {}
-    for what, (without, with_it) in MODELLED.items():
+    sizes = {f"{name}, not {_ENCODER}": (_ENCODER, name) for name in answers if name.startswith("encoder ")}
+    for what, (without, with_it) in (MODELLED | sizes).items():
         if without in answers and with_it in answers:
             ms = [float(np.median([a.ms for a in answers[name]])) for name in (without, with_it)]
             more = adds(answers[without], answers[with_it])

@@ -23,7 +23,7 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.refine import TRUST, Refinery
-from geomtact.inference.refine_together import View
+from geomtact.inference.search import View
 from geomtact.planning.belief import draw_cells
 from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.next_touch import judge

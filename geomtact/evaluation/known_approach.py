@@ -39,7 +39,7 @@ class Outcome:
     ----------
     side : number of the side that is touched
     error_mm : of each of ``ROWS``: the most probable mode of the grid, the same pose refined, refined as in the thesis, the
-        first mode after all were refined and weighed anew, and the best of ten modes before and after refinement
+        first mode of what ``localize`` says, and the best of ten modes of the grid and of that
     random_mm : expected ADD of a random guess, touching from that side
     """
 
@@ -90,11 +90,11 @@ def _answers(localizer: Localizer, touch: Touch, effort: str) -> list[Array]:
     """The poses (k, 4, 4) that each of ``ROWS`` names."""
     index, sensor = localizer.index, localizer.sensor
     grid = localizer.touch(touch.mask, "mask", None, np.eye(4), "sensor", None, effort, 0)
-    refined = localizer.refinery.refine(grid, grid.observation.contact, MODES)
+    refined = localizer.localize(touch.mask, "mask", effort=effort)
     before, after = (np.stack([mode.T for mode in posterior.modes(MODES)]) for posterior in (grid, refined))
     first = grid.leading_cells(1)
     best = index.poses(first)
-    ours = refined.refined[int(first[0])].T[None]
+    ours = localizer.refinery.refine(grid, grid.observation.contact, 1).refined[int(first[0])].T[None]
     mask = without_specks(touch.mask, sensor.pixel_area(touch.mask.shape))
     spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
     theirs = thesis_refinement(localizer.space, spread)(Seen(mask, make_problem(mask, sensor, None)), best[0]).T[None]

@@ -24,8 +24,8 @@ from geomtact.inference.localizer import Localizer
 from geomtact.se3 import inverse
 from geomtact.sensing.calibrate import calibrated, measured_diameter
 from geomtact.sensing.image_file import read_image
-from geomtact.sensing.local_shape import METHODS, contact_mask
-from geomtact.sensing.sensor import Sensor
+from geomtact.sensing.local_shape import contact_mask
+from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 
 MM = 1e-3
 BALLS = (6.310, 9.500)  # mm, of the folder gelslam_gsmini_balls
@@ -146,7 +146,7 @@ def _drawn(rows: Sequence[Mapping[str, str]], columns: Sequence[str], folder: Pa
 
 def methods() -> dict[str, Method]:
     """From a reading and its background to the contact: ours, and the classical baseline."""
-    ours: dict[str, Method] = {name: partial(contact_mask, method=name) for name in METHODS}
+    ours: dict[str, Method] = {name: partial(contact_mask, method=name) for name in CONTACT_METHODS}
     return ours | {"difference": largest_difference}
 
 

@@ -25,7 +25,8 @@ from geomtact.errors import NoPoseAgreesError
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
-from geomtact.inference.refine_together import View, refine_together
+from geomtact.inference.refine_together import refine_together
+from geomtact.inference.search import View
 from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, inverse
 

@@ -26,14 +26,16 @@ from geomtact.inference.fusion import fused_posterior
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import opened, prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
-from geomtact.inference.refine_together import View, refine_together
+from geomtact.inference.refine_by_outline import few_are_left, refine_by_outline
+from geomtact.inference.refine_together import refine_together
+from geomtact.inference.search import View
 from geomtact.planning.next_touch import Action, next_touch
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import Calibration, posterior_log_prob
 from geomtact.scoring.catalogue import DEFAULT_SCORER
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
 from geomtact.se3 import Array, check_pose, check_transforms
-from geomtact.sensing.contact import Contact
+from geomtact.sensing.contact import Contact, Shown
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
 
@@ -48,17 +50,23 @@ class Effort:
         cells, their pixels counted too
     modes : that are refined
     thorough : whether each is refined by all registrations or by one
+    outlines : whether, of one mask, the outline is what tells them apart where few enough cells are left (see ``gels``)
     """
 
     resolved: str
     modes: int
     thorough: bool = True
+    outlines: bool = False
 
 
 _HOLLOW = 0.01  # share of the surface in hollows that the sensor may fit into, from which it is warned of
 _HALL = 100.0  # m from the origin from which a translation is taken to be in millimetres
 _ROOM = 10.0  # m between two sensors from which translations are taken to be in millimetres
-EFFORTS = {"fast": Effort("blocks", 0), "balanced": Effort("cells", 5, thorough=False), "exact": Effort("all", 25)}
+EFFORTS = {
+    "fast": Effort("blocks", 0),
+    "balanced": Effort("cells", 5, thorough=False),
+    "exact": Effort("all", 25, outlines=True),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,12 +180,16 @@ class Localizer:
                 return touch
             with _timed(touch.timing_ms, "refine"):
                 contact = touch.observation.contact
-                if contact.height is not None and how.modes:
-                    before = None
-                    if prior is not None:
-                        before = prior_log_mass(self.index, prior, T_frame_sensor[0], frame)
-                    return refine_together(touch, [View(self.refinery, contact, np.eye(4))], how.modes, seed, before)
-                return self.refinery.refine(touch, contact, how.modes, how.thorough)
+                heights, outlines = contact.height is not None, how.outlines and few_are_left(touch)
+                if not how.modes or not (heights or outlines):
+                    return self.refinery.refine(touch, contact, how.modes, how.thorough)
+                before = None
+                if prior is not None:
+                    before = prior_log_mass(self.index, prior, T_frame_sensor[0], frame)
+                view = View(self.refinery, contact, np.eye(4))
+                if heights:
+                    return refine_together(touch, [view], how.modes, seed, before)
+                return refine_by_outline(touch, view, how.modes, seed, before)
         localizers = (self, *self.others) if self.others else (self,) * len(images)
         if len(localizers) != len(images):
             raise UsageError(
@@ -207,11 +219,13 @@ class Localizer:
         settings = self._settings(effort, seed)
         with _timed(timing, "read"):
             observation = read_observation(image, self.sensor, kind, background)
-        mask, above, warnings = observation.contact.mask, 0.0, list(observation.warnings)
-        if observation.contact.height is not None and observation.contact.height[mask].any():
+        contact, above, warnings = observation.contact, 0.0, list(observation.warnings)
+        mask: Shown = contact.shown
+        if contact.height is not None and contact.height[contact.mask].any():
             # a contour line of the gel where it surely lies on the object, which reaches below it by as much
-            above = observation.contact.sure_depth
-            mask = observation.contact.deeper(above)
+            above = contact.sure_depth
+            mask = contact.deeper(above)
+        touched = bool((mask > 0.5).any())
         common: dict[str, Any] = {
             "frame": frame,
             "T_frame_sensor": T_frame_sensor,
@@ -220,12 +234,12 @@ class Localizer:
             "settings": settings
             | {
                 "kind": observation.kind,
-                "heights": observation.contact.height is not None,
-                "images": [digest(observation.image) if mask.any() else None],
+                "heights": contact.height is not None,
+                "images": [digest(observation.image) if touched else None],
             },
             "timing_ms": timing,
         }
-        if not mask.any():
+        if not touched:
             elsewhere = prior_log_density(prior, self.mesh, frame)
             nothing = Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, **common)
             return replace(nothing, elsewhere=elsewhere, warnings=warnings)
@@ -304,9 +318,9 @@ class Localizer:
 
 
 def _calibrated_as(localizer: Localizer, sensor: Sensor) -> Localizer:
-    """``localizer`` on another sensor of the same geometry, with its own colours and noise."""
-    held = localizer.sensor
-    if (held.colour, held.height_noise) == (sensor.colour, sensor.height_noise):
+    """``localizer`` on another sensor of the same geometry, whose readings are read in its own way."""
+    held, wanted = ((s.colour, s.height_noise, s.contact_method) for s in (localizer.sensor, sensor))
+    if held == wanted:
         return localizer
     return replace(localizer, index=replace(localizer.index, sensor=sensor))
 

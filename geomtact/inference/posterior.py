@@ -157,8 +157,8 @@ class Posterior:
         return np.array([cell for cell, _ in found], np.int64)
 
     def likeliest_cells(self, n: int) -> NDArray[np.int64]:
-        """Pose ids (m,) of the ``n`` most probable cells, the most probable first; no more than are looked at for modes."""
-        rows = self._top_rows()
+        """Pose ids (m,) of the ``n`` most probable cells, or the hearts of runs of them, the most probable first."""
+        rows = self._top_rows(n)
         return self._heart(rows[np.argsort(-self.log_prob[rows], kind="stable")[:n]])
 
     def shared_anew(
@@ -174,12 +174,13 @@ class Posterior:
         share ``doubt``, which stays. Of what all other runs have, a share ``elsewhere`` counts.
 
         Each gets by what the images made of it before, to the power ``before``, times exp(``log_likelihood``) (n,), up to a
-        constant; one without likelihood keeps what it has. ``log_prior`` (M,) is the log mass of every cell of the index before
-        the images, the uniform's by default.
+        constant; one without likelihood keeps what it has, and cells that no run holds get nothing. ``log_prior`` (M,) is the
+        log mass of every cell of the index before the images, the uniform's by default.
         """
-        row, which = np.unique(self._rows_of(cells)[0], return_inverse=True)
+        row, held_here = self._rows_of(cells)
+        row, which = np.unique(row[held_here], return_inverse=True)
         likeliest = np.full(len(row), -np.inf)
-        np.maximum.at(likeliest, which, np.asarray(log_likelihood, float))
+        np.maximum.at(likeliest, which, np.asarray(log_likelihood, float)[held_here])
         row, likeliest = row[likeliest > -np.inf], likeliest[likeliest > -np.inf]
         had = self.log_prob[row].astype(float)
         told, at = self._log_density_of(row), self.cells[row]
@@ -361,21 +362,21 @@ class Posterior:
                 covered.update(inside.tolist())
         return self._share_out(members)[:k]
 
-    def _top_rows(self) -> NDArray[np.int64]:
-        """The rows (m,) with the most mass a cell, ``_SEEDS`` of them where there are as many."""
+    def _top_rows(self, n: int = _SEEDS) -> NDArray[np.int64]:
+        """The ``n`` rows (m,) with the most mass a cell, where there are as many."""
         p = self.log_prob
         if self.runs is not None:
             many = np.flatnonzero(self.runs > 1)
             p = p.copy()
             p[many] -= np.log(self.runs[many])
-        if len(p) > 100 * _SEEDS:
+        if len(p) > 100 * n:
             # the quantile of every fiftieth row leaves few to look at
-            some = p[::50]
-            rows = np.flatnonzero(p >= np.partition(some, -_SEEDS // 5)[-_SEEDS // 5])
+            some, few = p[::50], max(1, n // 5)
+            rows = np.flatnonzero(p >= np.partition(some, -few)[-few])
         else:
             rows = np.arange(len(p))
-        if len(rows) > _SEEDS:
-            rows = rows[np.argpartition(p[rows], -_SEEDS)[-_SEEDS:]]
+        if len(rows) > n:
+            rows = rows[np.argpartition(p[rows], -n)[-n:]]
         return rows[p[rows] > -np.inf]
 
     def _within(self, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -64,8 +64,8 @@ class Refinery:
         if not len(cells):
             return posterior
         index, sensor = posterior.index, self.space.sensor
-        mask = without_specks(contact.mask, sensor.pixel_area(contact.mask.shape))
-        problem = make_problem(mask, sensor, contact.height)
+        shown = without_specks(contact.shown, sensor.pixel_area(contact.mask.shape))
+        problem, mask = make_problem(shown, sensor, contact.height), shown > 0.5
         start = index.poses(cells)
         candidates = [start, self._centred(posterior, mask, cells, start)]
         refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index, thorough)]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.registration.protocol import Problem, Surface
 from geomtact.se3 import Array, apply, inverse, unit
-from geomtact.sensing.contact import Contact
+from geomtact.sensing.contact import Contact, Shown
 from geomtact.sensing.sensor import Sensor
 
 SINK, SINK_STD = 0.2e-3, 0.35e-3  # m that a gel, rigid or elastic, is taken to sink around the object, give or take
@@ -44,7 +44,8 @@ def make_problem(
 
     Parameters
     ----------
-    mask : (H, W) bool, on any grid over the sensor's window
+    mask : (H, W) bool, on any grid over the sensor's window; or the probability of contact at each pixel, by which its outline
+        is the less sure the more slowly that falls
     sensor : whose membrane the contact lies on
     height : (H, W) how deep the gel is pressed in [m], where the reading tells; NaN tells nothing. The contact is then taken
         to be where it is more than half of the deepest, and ``sink`` is not used
@@ -56,7 +57,8 @@ def make_problem(
         for an elastic one
     sink_std : and how much more or less it may be [m]; by default both gels may be
     """
-    contact: NDArray[np.bool_] = np.asarray(mask, bool)
+    shown = np.asarray(mask)
+    contact: NDArray[np.bool_] = shown if shown.dtype == bool else shown > 0.5
     pitch_xy = 2 * sensor.half_window / contact.shape[::-1]
     pitch = float(np.sqrt(pitch_xy.prod()))
     outline_noise, height_noise = (
@@ -68,8 +70,9 @@ def make_problem(
         return sensor.lift((uv + 0.5) * pitch_xy - sensor.half_window, depth)
 
     if height is None:
-        uv, outward, spacing = _outline(contact, pitch_xy, max_points)
-        met = _on_outline(lifted(uv), outward, sink, outline_noise, spacing / (np.sqrt(np.pi) * correlation), sensor)
+        uv, outward, unsure, spacing = _outline(shown, pitch_xy, max_points)
+        noise = np.maximum(outline_noise, unsure)
+        met = _on_outline(lifted(uv), outward, sink, noise, spacing / (np.sqrt(np.pi) * correlation), sensor)
         inside, outside = (lifted(uv) for uv in _inside_and_outside(contact, pitch_xy, max_points))
         # what the gel may have sunk to lies neither inside nor outside
         inside, outside = inside + sink * _down(inside, sensor), outside + (sink + sink_std) * _down(outside, sensor)
@@ -78,12 +81,17 @@ def make_problem(
         depth, known, clear = _depths(height)
         lying = Contact(contact, depth.astype(np.float32))
         half, deep = lying.sure_depth, lying.sure
-        uv, outward, spacing = _outline(deep, pitch_xy, max_points)
+        uv, outward, _, spacing = _outline(deep, pitch_xy, max_points)
         # of an elastic gel, what is not pressed in half as deep as the deepest may hang free of the object, far beside it
         # even: only where the gel drops off steeply a wall is near
         steep = _at(clear & (np.hypot(*np.gradient(depth, *pitch_xy[::-1])) > _STEEP), uv)
         rim = _on_outline(
-            lifted(uv[steep]), outward[steep], half, outline_noise, spacing / (np.sqrt(np.pi) * correlation), sensor
+            lifted(uv[steep]),
+            outward[steep],
+            half,
+            np.full(steep.sum(), outline_noise),
+            spacing / (np.sqrt(np.pi) * correlation),
+            sensor,
         )
         uv, apart = _spaced(deep & known, pitch_xy, max_points)
         gel = lifted(uv, _at(depth, uv))
@@ -108,9 +116,10 @@ def make_problem(
 
 
 def _on_outline(
-    rim: Array, outward: Array, sink: float, noise: float, weight: float, sensor: Sensor
+    rim: Array, outward: Array, sink: float, noise: Array, weight: float, sensor: Sensor
 ) -> dict[str, Array]:
-    """Fields of a ``Problem`` for points (n, 3) of an outline on the membrane and its normals (n, 2) in the image's plane."""
+    """Fields of a ``Problem`` for points (n, 3) of an outline on the membrane, its normals (n, 2) in the image's plane, and its
+    noise (n,) [m]."""
     down = _down(rim, sensor)
     facing = np.concatenate([outward, np.zeros((len(outward), 1))], 1)
     return {
@@ -118,7 +127,7 @@ def _on_outline(
         "facing": facing,
         "across": unit(np.cross(down, facing)),
         "sinking": down,
-        "noise": np.full(len(rim), noise),
+        "noise": noise,
         "weight": np.full(len(rim), min(1.0, weight)),
     }
 
@@ -204,23 +213,25 @@ def _spaced(where: NDArray[np.bool_], pitch_xy: Array, most: int) -> tuple[Array
     return np.stack([cols, rows], 1)[:most].astype(float), float(np.sqrt((apart * pitch_xy).prod()))
 
 
-def _outline(mask: NDArray[np.bool_], pitch_xy: Array, max_points: int) -> tuple[Array, Array, float]:
-    """Subpixel outline (n, 2) in (column, row), its outward unit normals (n, 2) in metric axes, and its spacing [m].
+def _outline(shown: Shown, pitch_xy: Array, max_points: int) -> tuple[Array, Array, Array, float]:
+    """Subpixel outline (n, 2) in (column, row), its outward unit normals (n, 2) in metric axes, how unsure it is along them by
+    the probabilities that are ``shown`` (n,) [m], and its spacing [m].
 
     Where the border of the image cuts the contact there is no outline.
     """
     from scipy.ndimage import gaussian_filter, map_coordinates
     from skimage.measure import find_contours
 
-    none = np.zeros((0, 2)), np.zeros((0, 2)), float(pitch_xy.mean())
+    none = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), float(pitch_xy.mean())
+    mask = shown > 0.5
     rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows) or min(mask.shape) < 2:
         return none
     # the neighbourhood of the contact is enough; at the image's border it ends there, so that no outline follows it
     top, left = max(rows[0] - 4, 0), max(cols[0] - 4, 0)
-    part = mask[top : rows[-1] + 5, left : cols[-1] + 5].astype(np.float32)
-    # a blur of one pixel takes the stairs out of the outline
-    smooth = gaussian_filter(part, 1.0, mode="nearest", truncate=3.0)
+    smooth = shown[top : rows[-1] + 5, left : cols[-1] + 5].astype(np.float32)
+    if shown.dtype == bool:  # a blur of one pixel takes the stairs out of the outline
+        smooth = gaussian_filter(smooth, 1.0, mode="nearest", truncate=3.0)
     contours = [c for c in find_contours(smooth, 0.5) if len(c) > _FEWEST]
     if not contours:
         return none
@@ -242,5 +253,7 @@ def _outline(mask: NDArray[np.bool_], pitch_xy: Array, max_points: int) -> tuple
     outward = -np.stack([slope[1] / pitch_xy[0], slope[0] / pitch_xy[1]], 1)
     steep = np.linalg.norm(outward, axis=1)
     good = steep > 1e-9
-    rc, outward = rc[good], outward[good] / steep[good, None]
-    return (rc + [top, left])[:, ::-1], outward, float(spacing)
+    rc, outward, steep = rc[good], outward[good] / steep[good, None], steep[good]
+    # where an outline that errs by s may be, the probability falls by 1 / (s sqrt(2 pi)) a metre
+    unsure = np.zeros(len(rc)) if shown.dtype == bool else 1 / (np.sqrt(2 * np.pi) * steep)
+    return (rc + [top, left])[:, ::-1], outward, unsure, float(spacing)

@@ -16,7 +16,7 @@ _TICKS = (-5, -2, -1, -0.5, -0.2, -0.1, 0, 0.1, 0.2, 0.5, 1, 2, 5)  # nats
 
 def draw_costs(content: Mapping[str, Any]) -> bytes:
     """A PNG with a row for each part and, for several, one for their mean: information and error against the time of one touch
-    and of three sensors, and information against the time of preparing.
+    and of three sensors, error of a known side, and information against the time of preparing.
 
     The line joins the ways that no other is as fast and as good as; the default is ringed.
     """
@@ -29,13 +29,14 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
     ways = next(iter(content["parts"].values()))["ways"]
     choices = list(dict.fromkeys(way["choice"] for way in ways.values()))
     looks = dict(zip(choices, zip(cycle(COLOURS), cycle(_SHAPES), strict=False), strict=False))
-    figure = Figure(figsize=(17, 3.9 * len(rows) + 0.5), dpi=90, layout="constrained", facecolor="white")
+    figure = Figure(figsize=(21, 3.9 * len(rows) + 0.5), dpi=90, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    grid = figure.subplots(len(rows), 4, squeeze=False)
+    grid = figure.subplots(len(rows), 5, squeeze=False)
     panels = (
         ("one touch", "ms", "gain", "time of a touch [ms]", "one touch: information [nats]", 1),
         ("three sensors", "ms", "gain", "time of three touches [ms]", "three sensors: information [nats]", 1),
         ("three sensors", "ms", "mssd", "time of three touches [ms]", "three sensors: median MSSD [mm]", -1),
+        ("known side", "ms", "mssd", "time of a touch [ms]", "known side: median MSSD [mm]", -1),
         ("one touch", "ready", "gain", "time of preparing [s]", "one touch: information [nats]", 1),
     )
     named: list[tuple[Any, list[Named]]] = []
@@ -61,12 +62,13 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
 
 
 def draw_modelled(content: Mapping[str, Any]) -> bytes:
-    """A PNG: what each thing modelled adds [nats] for each part, with paired 95 % intervals; one touch and three sensors."""
+    """A PNG: what each thing modelled adds [nats] for each part and kind of scene, with paired 95 % intervals."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     parts = content["parts"]
-    scenes = [s for s in ("one touch", "three sensors") if any(p["scenes"][s]["modelled"] for p in parts.values())]
+    kinds = ("one touch", "three sensors", "known side")
+    scenes = [s for s in kinds if any(p["scenes"][s]["modelled"] for p in parts.values())]
     names = list(dict.fromkeys(n for p in parts.values() for s in scenes for n in p["scenes"][s]["modelled"]))
     figure = Figure(
         figsize=(6.2 * len(scenes) + 1, 0.42 * len(names) + 1.4), dpi=100, layout="constrained", facecolor="white"
@@ -115,11 +117,11 @@ def _points(part: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float | No
 
 
 def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float | None]]]:
-    """The means over all parts; None where one is not known."""
+    """The means over all parts of the ways that all have; None where one is not known."""
     out: dict[str, dict[str, dict[str, float | None]]] = {}
     for scene, ways in parts[0].items():
-        for name, point in ways.items():
-            for key in point:
+        for name in [each for each in ways if all(each in part[scene] for part in parts)]:
+            for key in ways[name]:
                 values = [part[scene][name][key] for part in parts]
                 mean = None if None in values else sum(values) / len(values)
                 out.setdefault(scene, {}).setdefault(name, {})[key] = mean

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import Index, spelled_out
 from geomtact.scoring.calibration import Calibration, Touches, best_floor, calibrate, posterior_log_prob
 from geomtact.scoring.encoder import EncoderScorer
+from geomtact.sensing.contact import Shown
 
 SHARE = 0.98  # of the mass, that is scored cell by cell
 _LEADING = 64  # blocks among whose cells the best is looked for
@@ -58,7 +59,7 @@ class BlockScorer:
         constant = 0.5 * temperature * np.log(narrow).sum(1) - (narrow * middle**2).sum(1)
         return cls(cells, _single(narrow), _single(narrow * middle), _single(constant), temperature)
 
-    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """Score (P B,) of every block: under the normal model, the temperature times the log of the mean of
         exp(score / temperature) over its cells."""
         return self.trusted(index, self.cells.seen(index, mask))[0]
@@ -144,13 +145,13 @@ class Cascade:
         partly = Calibration(**data["partly"]) if "partly" in data else None
         return cls(blocks, Calibration(**data["coarse"]), partly)
 
-    def whole(self, index: Index, mask: NDArray[np.bool_]) -> Rows:
+    def whole(self, index: Index, mask: Shown) -> Rows:
         """The blocks alone."""
         first, runs = index.block_runs
         score = self.blocks.score(index, mask)
         return _possible(Rows(first, runs, score, index.log_block_weight, self.coarse, self.blocks.name))
 
-    def expanded(self, index: Index, mask: NDArray[np.bool_]) -> Rows:
+    def expanded(self, index: Index, mask: Shown) -> Rows:
         """Blocks, and cell by cell those of them that hold ``SHARE`` of the mass."""
         first, counts = index.block_runs
         seen = self.blocks.cells.seen(index, mask)

@@ -21,6 +21,7 @@ from scipy.special import erf
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.scoring.vectors import VectorScorer
+from geomtact.sensing.contact import Shown
 from geomtact.sensing.moments import without_specks
 from geomtact.sensing.sensor import Sensor
 
@@ -47,7 +48,7 @@ class EncoderScorer(VectorScorer):
 
     usual: float = np.inf
 
-    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """Similarity (P, n) of ``mask`` (h, w) to the mask of every pose: minus the squared distance of the vectors, as
         far as it is to be trusted."""
         out = super().score(index, mask)
@@ -71,7 +72,7 @@ class EncoderScorer(VectorScorer):
         out -= np.float32(seen @ seen)
         return out
 
-    def seen(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def seen(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""
         assert isinstance(self.descriptor, Tower)
         image = _lying(without_specks(mask, index.sensor.pixel_area(mask.shape))[None].astype(np.float32))[0]

@@ -33,6 +33,7 @@ from geomtact.scoring.product import Comparison, Product, choose
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import describe_index
 from geomtact.scoring.witness import Witness
+from geomtact.sensing.contact import Shown
 
 FORMAT = 10
 _COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
@@ -65,7 +66,7 @@ class FittedScorer:
     exact_scorer: Scorer | None = None
     exact_calibration: Calibration | None = None
 
-    def rows(self, index: Index, mask: NDArray[np.bool_], resolved: str) -> Rows:
+    def rows(self, index: Index, mask: Shown, resolved: str) -> Rows:
         """Scores of all cells under the uniform prior.
 
         ``resolved`` says how: "blocks" alone, "cells" where the mass is and, on a large grid, blocks elsewhere, or "all"
@@ -80,7 +81,7 @@ class FittedScorer:
     def cells(
         self,
         index: Index,
-        mask: NDArray[np.bool_],
+        mask: Shown,
         log_prior: NDArray[np.floating] | None,
         exact: bool,
         above: float = 0.0,

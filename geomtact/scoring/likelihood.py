@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import Index
 from geomtact.scoring.overlap import overlaps, to_grid
 from geomtact.se3 import Array
+from geomtact.sensing.contact import Shown
 from geomtact.sensing.moments import without_specks
 
 THRESHOLDS = (0.0, 0.25, 0.5)  # of the penetration
@@ -40,7 +41,7 @@ class PixelLikelihood:
 
     name: str = "likelihood"
 
-    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """Log likelihood (P, n) of ``mask`` (h, w) at every pose."""
         seen = to_grid(without_specks(mask, index.sensor.pixel_area(mask.shape)), index.resolution.mask_shape)
         depths = np.asarray(index.resolution.penetrations)

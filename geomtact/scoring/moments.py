@@ -17,6 +17,7 @@ from scipy.special import gammaln
 
 from geomtact.contact_space.index import Index
 from geomtact.se3 import Array
+from geomtact.sensing.contact import Shown
 from geomtact.sensing.moments import moments, without_specks
 
 _CHUNK = 1 << 15
@@ -62,15 +63,15 @@ class Moments:
     def _whiten(self) -> Array:
         return np.linalg.cholesky(np.linalg.inv(self.covariance)).T
 
-    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """Log likelihood (P, n) of the moments of ``mask``."""
         return self._of(index, mask, index.moments).reshape(index.height.shape)
 
-    def of_drawn(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def of_drawn(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """As :meth:`score`, at the poses of ``index.drawn_moments`` alone: (m,)."""
         return self._of(index, mask, index.drawn_moments)
 
-    def _of(self, index: Index, mask: NDArray[np.bool_], stored: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _of(self, index: Index, mask: Shown, stored: NDArray[np.float32]) -> NDArray[np.float32]:
         seen = _seen(index, mask) - self.bias
         W = self._whiten.astype(np.float32)
         target = (W @ seen).astype(np.float32)
@@ -89,5 +90,5 @@ class Moments:
         return np.float32(norm) - np.float32((nu + d) / 2) * out
 
 
-def _seen(index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _seen(index: Index, mask: Shown) -> NDArray[np.float32]:
     return moments(without_specks(mask, index.sensor.pixel_area(mask.shape))[None], index.sensor)[0]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index, pack
+from geomtact.sensing.contact import Shown
 
 _THREADS = 2
 _CHUNK = 1 << 15  # poses a step: the words of one chunk stay in the processor's cache
@@ -45,7 +46,7 @@ class PixelL1:
 
     name: str = "l1"
 
-    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         mask = to_grid(mask, index.resolution.mask_shape)
         shared = overlaps(index.bits, mask)
         differing = index.area.astype(np.int32) + int(mask.sum()) - 2 * shared
@@ -61,7 +62,7 @@ class IoU:
 
     name: str = "iou"
 
-    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         mask = to_grid(mask, index.resolution.mask_shape)
         shared = overlaps(index.bits, mask)
         union = index.area.astype(np.int32) + int(mask.sum()) - shared
@@ -70,7 +71,7 @@ class IoU:
         return ratio
 
 
-def to_grid(mask: NDArray[np.bool_], shape: Sequence[int]) -> NDArray[np.bool_]:
+def to_grid(mask: Shown, shape: Sequence[int]) -> NDArray[np.bool_]:
     """``mask`` (H, W) on another grid (h, w) over the same window: contact where most of the pixel's area is."""
     small = cv2.resize(np.asarray(mask, np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
     return small >= 0.5

@@ -16,6 +16,7 @@ from geomtact.contact_space.index import Index
 from geomtact.scoring.calibration import Calibration, Touches, calibrated
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import VectorScorer
+from geomtact.sensing.contact import Shown
 
 RATIOS = (0.25, 0.5, 1.0)  # of what a further score counts, each score divided by its own temperature
 _PLACES, _TOUCHES = 15_000, 120  # that scores are compared on
@@ -33,7 +34,7 @@ class Product:
         """Such as "1 encoder + 0.25 iou"."""
         return " + ".join(f"{w:.3g} {s.name}" for w, s in zip(self.weights, self.scorers, strict=True))
 
-    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """Score (P, n) of ``mask`` (h, w) at every pose."""
         out = np.float32(self.weights[0]) * self.scorers[0].score(index, mask)
         for scorer, weight in zip(self.scorers[1:], self.weights[1:], strict=True):

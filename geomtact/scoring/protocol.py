@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
+from geomtact.sensing.contact import Shown
 
 
 class Scorer(Protocol):
@@ -20,6 +21,9 @@ class Scorer(Protocol):
     @property
     def name(self) -> str: ...
 
-    def score(self, index: Index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Similarity (P, n) of ``mask`` (h, w), over the whole window on any grid, to the mask of every pose of ``index``."""
+    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+        """Similarity (P, n) of ``mask`` (h, w), over the whole window on any grid, to the mask of every pose of ``index``.
+
+        ``mask`` is bool, or the probability of contact at each pixel.
+        """
         ...

@@ -19,6 +19,7 @@ from torch import nn
 from geomtact.errors import InputError
 from geomtact.scoring.encoder import THESIS
 from geomtact.scoring.vectors import VectorScorer
+from geomtact.sensing.contact import Shown
 from geomtact.sensing.sensor import Sensor
 
 SIDE, NUMBERS = 224, 1000
@@ -52,7 +53,7 @@ class Resnet:
 class CosineScorer(VectorScorer):
     """Cosine of the vectors, negative ones taken as 0, of touches and stored contacts."""
 
-    def score(self, index, mask: NDArray[np.bool_]) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
+    def score(self, index, mask: Shown) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
         """Similarity (P, n) of ``mask`` (h, w) to the mask of every pose, 0 to 1."""
         return np.maximum(self.stored @ self.seen(index, mask), 0).reshape(index.height.shape)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.scoring.moments import Moments
+from geomtact.sensing.contact import Shown
 
 _SMALL = 60_000  # poses up to which the mean is over all of them
 
@@ -30,9 +31,7 @@ class Witness:
     moments: Moments
     usual: tuple[float, float] = (-np.inf, -np.inf)
 
-    def evidence(
-        self, index: Index, mask: NDArray[np.bool_], log_prior: NDArray[np.floating] | None = None
-    ) -> tuple[float, float]:
+    def evidence(self, index: Index, mask: Shown, log_prior: NDArray[np.floating] | None = None) -> tuple[float, float]:
         """Log evidence of ``mask`` (h, w), and the log likelihood of the best pose.
 
         Under the uniform distribution on a large grid the mean is over poses drawn once for all; ``log_prior`` (N,) are

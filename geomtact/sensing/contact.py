@@ -15,6 +15,8 @@ _FADING = 0.35  # slope at the border of what is pressed in, in shares of the st
 _BORDER = 2  # px
 _FAINT = 0.01  # share of the deepest that is no indentation
 
+Shown = NDArray[np.bool_] | NDArray[np.float32]  # (H, W) whether each pixel is in contact, or how probably
+
 
 @dataclass(frozen=True)
 class Contact:
@@ -25,11 +27,18 @@ class Contact:
     mask : (H, W) bool, True where the object touches (the thesis's local shape)
     height : (H, W) float32, depth of the indentation [m], 0 outside the contact; None where only the mask is known
     share : of the deepest, from which on the gel surely lies on the object, within the mask
+    probability : (H, W) float32 that each pixel is in contact, more than half within the mask; None where that is not known
     """
 
     mask: NDArray[np.bool_]
     height: NDArray[np.float32] | None = None
     share: float = HALF
+    probability: NDArray[np.float32] | None = None
+
+    @property
+    def shown(self) -> Shown:
+        """What scores and registration take: the probabilities where they are known, else the mask."""
+        return self.mask if self.probability is None else self.probability
 
     @classmethod
     def of_height(cls, height: NDArray[np.float32]) -> Contact:

@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.se3 import Array
 from geomtact.sensing.image_file import read_image
-from geomtact.sensing.sensor import Sensor
+from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 
 Mask = NDArray[np.bool_]
 BySlope = Callable[[Array, Mask, Mask, float, Array], tuple[Array, Mask]]  # slope, felt, strong, sigma, pitch
 
-METHODS = ("classical", "pressure", "learned")  # the default first
 _GREY = 1 / 255
 _GRID = 120  # pixels along an image's shorter side, which is smoothed by one of them
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
@@ -32,11 +31,12 @@ _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
 _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated readings of many gels and lamps
 _ONE_COLOUR = 0.03  # power of the second colour over that of the first, under which there is but one: a white gel's
 _EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse, from which on slopes are seen
+_SURELY = 0.501  # probability of what counts as contact, at least
 _CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like slopes
 
 
 def contact_mask(
-    image: Any, background: Any = None, sensor: Sensor | str | None = None, method: str = METHODS[0]
+    image: Any, background: Any = None, sensor: Sensor | str | None = None, method: str | None = None
 ) -> Mask:
     """Where the object touches, in an RGB reading.
 
@@ -47,18 +47,27 @@ def contact_mask(
         which serves for contacts much smaller than the window
     sensor : gives the pixel pitch where columns and rows differ, and the size to check; None: square pixels
     method : "classical": within the rim where the gel is steepest, by its slope, which colours tell up to a factor; "pressure":
-        where, by that slope, a thick elastic gel is pressed on; or "learned": by a network trained on simulated readings alone
+        where, by that slope, a thick elastic gel is pressed on; or "learned": by a network trained on simulated readings alone,
+        where colours tell the slope. None: as the sensor says, "classical" without one
 
     Returns
     -------
     (H, W) bool; all False where nothing stands out of the image's own noise
     """
-    if method not in METHODS:
-        raise UsageError(f"contact_mask: no method named {method!r}{nearest_name(str(method), METHODS)}")
+    return find_contact(image, background, sensor, method)[0]
+
+
+def find_contact(
+    image: Any, background: Any = None, sensor: Sensor | str | None = None, method: str | None = None
+) -> tuple[Mask, NDArray[np.float32] | None]:
+    """As :func:`contact_mask`, and the probability (H, W) that each pixel is in contact, where the ``method`` tells that."""
+    if method is not None and method not in CONTACT_METHODS:
+        raise UsageError(f"contact_mask: no method named {method!r}{nearest_name(str(method), CONTACT_METHODS)}")
     image = as_unit_rgb(image, "image")
     pitch = np.ones(2)
     if sensor is not None:
         sensor = Sensor.load(sensor)
+        method = method or sensor.contact_method
         pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
         check_size(image, sensor, "image")
     reference = None if background is None else same_size(as_unit_rgb(background, "background"), image)
@@ -73,15 +82,17 @@ def contact_mask(
             sigma *= min(noise_share / _NOISE_SHARE, 2.0)
             change, felt, strong, _ = _change(image, reference, sigma)
     if not felt.any():
-        return np.zeros(size[::-1], bool)
-    if method == "learned":
-        pressed, mask = _by_network(change, felt)
-    else:
-        pressed, mask = _by_colour(
-            change, felt, strong, sigma, pitch, _by_pressure if method == "pressure" else _by_rim
-        )
+        return np.zeros(size[::-1], bool), None
+    if method == "learned" and not _of_one_colour(change, felt):
+        probability = _by_network(change, image, felt)
+        mask = _components(_filled(probability > 0.5), probability, strong, sigma)
+        # what is no contact by its size or for want of change is none by its probability either
+        probability = np.where(mask, np.maximum(probability, _SURELY), np.where(probability > 0.5, 0, probability))
+        full = np.asarray(cv2.resize(probability, size, interpolation=cv2.INTER_LINEAR), np.float32)
+        return full > 0.5, full
+    pressed, mask = _by_colour(change, felt, strong, sigma, pitch, _by_pressure if method == "pressure" else _by_rim)
     mask = _components(mask, pressed, strong, sigma)
-    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5)
+    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5), None
 
 
 def _on_grid(image: Array) -> Array:
@@ -90,13 +101,20 @@ def _on_grid(image: Array) -> Array:
     return np.asarray(cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
 
 
+def _of_one_colour(change: Array, felt: Mask) -> bool:
+    """Whether all that is felt changes along one colour, as a white gel does, which tells no slope."""
+    values = change[felt]
+    power = np.linalg.eigvalsh(values.T @ values)
+    return bool(power[1] <= _ONE_COLOUR * power[2])
+
+
 def _by_colour(
     change: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array, by_slope: BySlope
 ) -> tuple[Array, Mask]:
     """How much the gel is pressed in (H, W), up to a factor, and the contact: by its slope, where colours tell that."""
     values = change[felt]
     power, colours = np.linalg.eigh(values.T @ values / len(values))
-    if power[1] <= _ONE_COLOUR * power[2]:
+    if _of_one_colour(change, felt):
         return _half_as_large(_one_way(change @ colours[:, 2], felt), felt)
     slope = _slope_field(_transformed(change, (colours[:, 1:] / np.sqrt(power[1:])).T), felt, sigma, pitch)
     if slope is None:
@@ -139,12 +157,11 @@ def _half_as_large(size: Array, felt: Mask) -> tuple[Array, Mask]:
     return size, _filled(size > 0.5 * np.quantile(size[felt], 0.95))
 
 
-def _by_network(change: Array, felt: Mask) -> tuple[Array, Mask]:
-    """The probability (H, W) of contact, and where it is more likely than not."""
+def _by_network(change: Array, image: Array, felt: Mask) -> Array:
+    """The probability (H, W) of contact, none where nothing is felt."""
     from geomtact.sensing.mask_network import contact_probability
 
-    probability = contact_probability(change)
-    return probability.astype(float), _filled(probability > 0.5) & felt
+    return np.asarray(contact_probability(change, image) * felt, float)
 
 
 def smooth_background(image: Array) -> Array:
@@ -198,13 +215,13 @@ def same_size(background: Array, image: Array) -> Array:
     return background
 
 
-def colour_change(image: Array, background: Array) -> tuple[Array, Mask]:
+def colour_change(image: NDArray[np.floating], background: NDArray[np.floating]) -> tuple[Array, Mask]:
     """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it is felt."""
     change, felt, _, _ = _change(image, background, min(image.shape[:2]) / 120)
     return change, felt
 
 
-def _change(image: Array, background: Array | None, sigma: float) -> tuple[Array, Mask, Mask, float]:
+def _change(image: Any, background: Any, sigma: float) -> tuple[Array, Mask, Mask, float]:
     """The smoothed change (H, W, 3) from the background, where it is felt and where strongly so, and its noise."""
     smooth = _blurred(image, sigma)
     reference = smooth_background(smooth) if background is None else _blurred(background, sigma)

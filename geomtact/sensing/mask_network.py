@@ -1,4 +1,7 @@
-"""The network that tells the contact from a change of colour: a small U-Net, trained on simulated readings alone."""
+"""The network that tells the contact from a change of colour: a small U-Net, trained on simulated readings alone.
+
+Where a channel is as bright as it can be, its change tells no slope: so it is said, too, how much of each pixel is blown out.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,11 @@ from safetensors.torch import load_file
 from torch import nn
 
 WEIGHTS = Path(__file__).with_name("mask_network.safetensors")
-WIDTHS = (8, 16, 32, 48)  # channels, at each halving
+WIDTHS = (12, 24, 48, 64)  # channels, at each halving
 _SIDE = 60  # px of the shorter side of what it sees
 _STEP = 8  # px that sides are multiples of
+CHANNELS = 6  # three of change, three of what is blown out
+_BLOWN_OUT = 0.98  # brightness from which on
 
 Image = NDArray[np.float32]
 
@@ -26,15 +31,15 @@ class MaskNetwork(nn.Module):
 
     def __init__(self, widths: tuple[int, ...] = WIDTHS):
         super().__init__()
-        self.down = nn.ModuleList([_block(a, b) for a, b in zip((3, *widths), widths, strict=False)])
+        self.down = nn.ModuleList([_block(a, b) for a, b in zip((CHANNELS, *widths), widths, strict=False)])
         pairs = list(zip(widths, widths[1:], strict=False))
         self.up = nn.ModuleList([_block(a + b, a) for a, b in reversed(pairs)])
         self.out = nn.Conv2d(widths[0], 1, 1)
 
-    def forward(self, change: torch.Tensor) -> torch.Tensor:
-        """Log odds (n, h, w) of ``change`` (n, 3, h, w), in shares of the strongest."""
-        h, w = change.shape[-2:]
-        seen, x = [], F.pad(change, (0, -w % _STEP, 0, -h % _STEP))
+    def forward(self, seen_there: torch.Tensor) -> torch.Tensor:
+        """Log odds (n, h, w) of what is :func:`seen` (n, ``CHANNELS``, h, w)."""
+        h, w = seen_there.shape[-2:]
+        seen, x = [], F.pad(seen_there, (0, -w % _STEP, 0, -h % _STEP))
         for i, block in enumerate(self.down):
             x = block(F.avg_pool2d(x, 2) if i else x)
             seen.append(x)
@@ -44,20 +49,25 @@ class MaskNetwork(nn.Module):
         return out
 
 
-def contact_probability(change: ArrayLike) -> Image:
-    """Probability (H, W) of contact at each pixel, of a ``change`` of colour (H, W, 3) from the background, RGB."""
-    change = np.asarray(change, np.float32)
+def contact_probability(change: ArrayLike, image: ArrayLike) -> Image:
+    """Probability (H, W) of contact at each pixel, of a ``change`` of colour (H, W, 3) of an ``image`` (H, W, 3) 0..1 from its
+    background, RGB. The image is looked at as it is and turned by 180 degrees: nothing tells which way is up."""
+    x = torch.from_numpy(seen(change, image))
+    turned = [(), (-1, -2)]
     with torch.inference_mode():
-        log_odds = _network()(torch.from_numpy(seen_change(change))[None])[0].numpy()
-    full = cv2.resize(log_odds, change.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+        log_odds = _network()(torch.stack([x.flip(axes) for axes in turned]))
+        mean = torch.stack([each.flip(axes) for each, axes in zip(log_odds, turned, strict=True)]).mean(0).numpy()
+    full = cv2.resize(mean, np.shape(change)[1::-1], interpolation=cv2.INTER_CUBIC)
     return np.asarray(1 / (1 + np.exp(-full)), np.float32)
 
 
-def seen_change(change: ArrayLike) -> Image:
-    """What the network sees (3, h, w) of a change of colour (H, W, 3): smaller, in shares of what hardly any pixel exceeds."""
+def seen(change: ArrayLike, image: ArrayLike) -> Image:
+    """What the network sees (``CHANNELS``, h, w) of a change of colour (H, W, 3) in an ``image`` (H, W, 3) 0..1: all smaller,
+    the change in shares of what hardly any pixel exceeds."""
     small = to_side(np.asarray(change, np.float32))
     strongest = float(np.quantile(np.linalg.norm(small, axis=-1), 0.98))
-    return np.ascontiguousarray((small / max(strongest, 1e-6)).transpose(2, 0, 1))
+    blown_out = to_side((np.asarray(image) >= _BLOWN_OUT).astype(np.float32))
+    return np.ascontiguousarray(np.concatenate([small / max(strongest, 1e-6), blown_out], -1).transpose(2, 0, 1))
 
 
 def to_side(image: Image) -> Image:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,8 +15,8 @@ FEATURES = ("centroid x", "centroid y", "log area", "log size", "stretch along x
 _SPECK = 0.15e-6  # m^2: a patch below this is dust when there is a contact ten times as large
 
 
-def moments(masks: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.float32]:
-    """Moments (n, 6) of contact masks (n, h, w) that cover the sensor's window, as named in ``FEATURES``.
+def moments(masks: NDArray[Any], sensor: Sensor) -> NDArray[np.float32]:
+    """Moments (n, 6) of contact masks (n, h, w), bool or probabilities, that cover the window, as named in ``FEATURES``.
 
     Lengths are shares of the window's half diagonal, so that the features have no unit.
     """
@@ -48,8 +49,12 @@ def _powers(sensor: Sensor, h: int, w: int) -> tuple[NDArray[np.float32], NDArra
     return np.ascontiguousarray(X.T), Y, float((x[1] - x[0]) * (y[1] - y[0]))
 
 
-def without_specks(mask: NDArray[np.bool_], pixel_area: float) -> NDArray[np.bool_]:
-    """``mask`` (h, w), of pixels of ``pixel_area`` [m^2], without patches that are dust beside a far larger contact."""
+def without_specks(mask: NDArray[Any], pixel_area: float) -> NDArray[Any]:
+    """``mask`` (h, w), of pixels of ``pixel_area`` [m^2], without patches that are dust beside a far larger contact; bool, or the
+    probability of contact at each pixel."""
+    if mask.dtype != bool:
+        touched = mask > 0.5
+        return np.where(touched & ~without_specks(touched, pixel_area), 0, mask)
     # labels of 16 bits take a third of the time, where no more patches fit into the mask
     fit = np.prod([(side + 1) // 2 for side in mask.shape])
     kind = cv2.CV_16U if fit < (1 << 16) - 1 else cv2.CV_32S

@@ -58,7 +58,7 @@ def find_presses(
             continue
         seen.append(image)
         change, felt = colour_change(image, reference)
-        mask = contact_mask(image, reference)
+        mask = contact_mask(image, reference, method="classical")
         if not mask.any():
             left_out[name] = "no contact was found"
             continue

@@ -14,7 +14,7 @@ from geomtact.sensing.checks import faults
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.height import contact_height
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
-from geomtact.sensing.local_shape import as_unit_rgb, contact_mask
+from geomtact.sensing.local_shape import as_unit_rgb, contact_mask, find_contact
 from geomtact.sensing.sensor import Sensor
 
 __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observation", "write_image"]
@@ -221,10 +221,9 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
     seen = _rgb(array, name)
     found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))
     warnings.extend(f"{name}: {fault}" for fault in found)
-    mask = contact_mask(seen, reference, sensor)
-    if sensor.colour is None or reference is None:
-        return Contact(mask)
-    return Contact(mask, contact_height(seen, reference, sensor))
+    mask, probability = find_contact(seen, reference, sensor)
+    height = None if sensor.colour is None or reference is None else contact_height(seen, reference, sensor)
+    return Contact(mask, height, probability=probability)
 
 
 def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:

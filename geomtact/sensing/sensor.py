@@ -30,6 +30,7 @@ _KEYS = {
     "membrane_radius_mm": float,
     "housing_depth_mm": float,
     "height_noise_mm": float,
+    "contact_method": str,
     "note": str,
     "colour": dict,
 }
@@ -38,6 +39,7 @@ _REQUIRED = ("name", "image_size_px", "pixel_pitch_mm", "camera_distance_mm", "m
 _YAML = (".yaml", ".yml")
 
 HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
+CONTACT_METHODS = ("classical", "pressure", "learned")  # of finding the contact in a reading, the default first
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class Sensor:
     membrane_radius : 0 means flat; otherwise the gel bulges towards the object with this radius
     housing_depth : how far the object may reach below z = 0 outside the window; None rules nothing out
     height_noise : standard deviation of its heights, beside a twentieth of each
+    contact_method : one of ``CONTACT_METHODS``, which finds the contact in its readings
     note : where the figures come from
     colour : how its colours tell the gel's slope; None where that is not calibrated
     """
@@ -66,6 +69,7 @@ class Sensor:
     membrane_radius: float = 0.0
     housing_depth: float | None = None
     height_noise: float = field(default=HEIGHT_NOISE, compare=False)
+    contact_method: str = field(default=CONTACT_METHODS[0], compare=False)
     note: str = field(default="", compare=False)
     colour: ColourTable | None = field(default=None, compare=False)
 
@@ -98,6 +102,10 @@ class Sensor:
         )
         need(self.housing_depth is None or self.housing_depth >= 0, "housing_depth_mm must be >= 0")
         need(self.height_noise > 0, "height_noise_mm must be positive")
+        need(
+            self.contact_method in CONTACT_METHODS,
+            f"contact_method must be one of {', '.join(CONTACT_METHODS)}, got {self.contact_method!r}",
+        )
 
     @classmethod
     def load(cls, source: str | Path | Sensor) -> Sensor:
@@ -171,6 +179,7 @@ class Sensor:
                 membrane_radius=data.get("membrane_radius_mm", 0.0) / 1e3,
                 housing_depth=None if housing is None else housing / 1e3,
                 height_noise=data.get("height_noise_mm", 1e3 * HEIGHT_NOISE) / 1e3,
+                contact_method=data.get("contact_method", CONTACT_METHODS[0]),
                 note=data.get("note", ""),
                 colour=_colour(data["colour"]) if "colour" in data else None,
             )
@@ -195,6 +204,8 @@ class Sensor:
             lines.append(f"housing_depth_mm = {mm(self.housing_depth)}")
         if self.height_noise != HEIGHT_NOISE:
             lines.append(f"height_noise_mm = {mm(self.height_noise)}")
+        if self.contact_method != CONTACT_METHODS[0]:
+            lines.append(f"contact_method = {_toml_string(self.contact_method)}")
         if self.note:
             lines.append(f"note = {_toml_string(self.note)}")
         if self.colour is not None:
@@ -209,7 +220,7 @@ class Sensor:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the geometry (not of the note, nor of the colours)."""
+        """Hash of the geometry (not of the note, nor of how its readings are read)."""
         geometry = [getattr(self, f.name) for f in fields(self) if f.compare]
         return hashlib.sha256(repr(geometry).encode()).hexdigest()
 

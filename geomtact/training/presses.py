@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -16,14 +17,14 @@ from geomtact.progress import Progress
 from geomtact.se3 import transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.elastic import elastic_contact
-from geomtact.sensing.mask_network import side_shape, to_side
+from geomtact.sensing.mask_network import CHANNELS, side_shape, to_side
 from geomtact.sensing.sensor import Sensor
 from geomtact.training.numbered import made_once
 from geomtact.training.parts import random_part
-from geomtact.training.readings import random_change
+from geomtact.training.readings import random_sight
 
 SHAPE = (120, 160)  # of what the camera shows
-READINGS = 2  # of each press
+READINGS = 4  # of each press
 PITCH = 0.125e-3  # m
 PRESSES = 12  # of each part
 SIZES = (0.3, 2.5)  # longest side of a part, in long sides of the window
@@ -42,11 +43,11 @@ class Presses:
 
     Attributes
     ----------
-    change : (n, ``READINGS``, 3, h, w) float16, of colour, in readings under different lamps; in shares of the strongest
+    seen : (n, ``READINGS``, ``CHANNELS``, h, w) float16, what the network sees of readings under different lamps
     contact : (n, h, w) float16, share of each pixel in contact
     """
 
-    change: NDArray[np.float16]
+    seen: NDArray[np.float16]
     contact: NDArray[np.float16]
 
 
@@ -55,21 +56,21 @@ def make_presses(
 ) -> list[Presses]:
     """Of ``n`` parts, in order; those that ``folder`` holds already are read."""
     found = made_once(folder, n, partial(press_part, seed=seed), Presses, "pressing parts", progress, processes)
-    return [presses for presses in found if len(presses.change)]
+    return [presses for presses in found if len(presses.seen)]
 
 
 def press_part(i: int, seed: int) -> Presses:
     """Presses of the part number ``i``: turned any way, anywhere in the window, log-uniform in depth and in the gel's
-    thickness."""
+    thickness; those that lamps do not show are left out."""
     rng = np.random.default_rng([seed, 31, i])
     h, w = (n + 2 * _AROUND for n in SHAPE)
     sensor = Sensor(f"{w} x {h}", (w, h), (PITCH, PITCH), 0.0, DEPTHS[1])
     part = _part(rng, w * PITCH)
     caster = Caster(part.vertices, part.faces, threads=1)
-    changes: list[list[NDArray[np.float32]]] = []
+    sights: list[list[Any]] = []
     contacts: list[NDArray[np.float32]] = []
     for _ in range(_TRIES * PRESSES):
-        if len(changes) == PRESSES:
+        if len(sights) == PRESSES:
             break
         at = rng.uniform(-0.5, 0.5, 2) * PITCH * SHAPE[::-1]
         T = transform(_turned(part, rng), [*at, w * PITCH * SIZES[1]])
@@ -80,13 +81,16 @@ def press_part(i: int, seed: int) -> Presses:
         depth = depth - deepest + np.exp(rng.uniform(*np.log(DEPTHS)))
         contact, height = elastic_contact(depth, (PITCH, PITCH), float(np.exp(rng.uniform(*np.log(THICKNESS)))))
         shown = np.s_[_AROUND:-_AROUND, _AROUND:-_AROUND]
-        if contact[shown].sum() >= _LEAST:
-            changes.append([random_change(height[shown] / PITCH, rng) for _ in range(READINGS)])
+        if contact[shown].sum() < _LEAST:
+            continue
+        readings = [random_sight(height[shown] / PITCH, rng) for _ in range(READINGS)]
+        if all(reading is not None for reading in readings):
+            sights.append(readings)
             contacts.append(to_side(contact[shown].astype(np.float32)))
     h, w = side_shape(SHAPE)
     return Presses(
-        np.reshape(changes, (len(changes), READINGS, 3, h, w)).astype(np.float16),
-        np.reshape(contacts, (len(changes), h, w)).astype(np.float16),
+        np.reshape(sights, (len(sights), READINGS, CHANNELS, h, w)).astype(np.float16),
+        np.reshape(contacts, (len(sights), h, w)).astype(np.float16),
     )
 
 

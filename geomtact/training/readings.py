@@ -1,4 +1,4 @@
-"""Readings to learn from: presses under random lamps, on random backgrounds, with the noise of cameras and gels.
+"""Readings to learn from: presses under random lamps, with the noise of cameras and gels.
 
 How a sensor is lit is drawn anew for every reading, so that the network learns what all sensors have in common: the gel bends
 around what it is touched by.
@@ -14,82 +14,90 @@ from numpy.typing import NDArray
 
 from geomtact.se3 import Array
 from geomtact.sensing.local_shape import colour_change
-from geomtact.sensing.mask_network import seen_change
-from geomtact.sensing.render import Lamps, render
+from geomtact.sensing.mask_network import seen
+from geomtact.training.lamps import Lamps, lit
 
 Image = NDArray[np.float32]
+
+SKIN = 2.0  # px over which the gel's coating rounds it off, at most
+ELEVATION = (6.0, 45.0)  # deg of lamps above the gel
+AMBIENT = 1.5  # of what lamps make of the untouched gel, at most
+_DRAWS = 4
 
 
 def random_reading(height: NDArray[np.floating], rng: np.random.Generator) -> tuple[Image, Image]:
     """A reading (h, w, 3) of a gel pressed in by ``height`` (h, w) [px], and its background (h, w, 3)."""
-    background = _background(height.shape, rng)
-    # as the camera sees them: both blurred, the reading with a light that has drifted, and each with noise of its own
-    lamps = _lamps(rng)
-    shown = np.stack([_shadowed(render(height, (1.0, 1.0), background, lamps), background, lamps, rng), background])
-    shown[0] = _dusty(_scattered(shown[0] - background, rng) + background, rng)
-    shown = _blurred(shown @ _crosstalk(rng), float(rng.uniform(0.2, 1.5)))
-    shown[0] = shown[0] * rng.normal(1, 0.01, 3) + rng.normal(0, 0.005, 3)
+    h, w = height.shape
+    lamps = random_lamps((h, w), rng)
+    bent: Image = np.asarray(height, np.float32)
+    bent = np.asarray(cv2.GaussianBlur(bent, (0, 0), float(rng.uniform(0.01, SKIN))), np.float32)
+    light = np.stack([lit(bent, lamps), lit(np.zeros_like(bent), lamps)])
+    light[0] = _dusty(np.maximum(_scattered(light[0] - light[1], rng) + light[1], 0), rng)
+    shown = _photographed(light * _paint(bent, rng)[..., None], rng)
+    # each as the camera sees it, the reading under light that has drifted, with noise of its own
+    drift = rng.choice([0.3, 1.0, 3.0])
+    shown[0] = shown[0] * rng.normal(1, 0.01 * drift, 3) + rng.normal(0, 0.005 * drift, 3) + _uneven((h, w), rng)
     noise = rng.uniform(0.3, 2.5) / 255
     shown = np.clip(shown + noise * rng.normal(size=shown.shape), 0, 1)
     return shown[0].astype(np.float32), shown[1].astype(np.float32)
 
 
-def random_change(height: NDArray[np.floating], rng: np.random.Generator) -> Image:
-    """What the network sees (3, h', w') of a random reading of a gel pressed in by ``height`` (h, w) [px]."""
-    image, background = random_reading(height, rng)
-    return seen_change(colour_change(image.astype(float), background.astype(float))[0])
+def random_sight(height: NDArray[np.floating], rng: np.random.Generator) -> Image | None:
+    """What the network sees (``CHANNELS``, h', w') of a random reading of a gel pressed in by ``height`` (h, w) [px]; None where
+    no reading of it shows that, under a few draws of lamps."""
+    for _ in range(_DRAWS):
+        image, background = random_reading(height, rng)
+        change, felt = colour_change(image, background)
+        if felt.any():
+            return seen(change, image)
+    return None
 
 
-def _lamps(rng: np.random.Generator) -> Lamps:
-    """Of three colours around the gel, near or far, some weaker; or any."""
-    lamps = Lamps.around(rng.uniform(0, 2 * np.pi))
-    response = lamps.response * rng.uniform(0.3, 1.5, (3, 1, 1))
-    response[..., 0] += rng.normal(0, rng.choice([0.05, 0.3]), (3, 2))
-    strength = np.abs(response[..., 0]).max()
-    response[..., 1:] = rng.normal(0, 0.25 * strength, (3, 2, 2))
-    return Lamps(response[rng.permutation(3)], rng.uniform(0, 0.4, 3), float(rng.uniform(0.25, 1.5)))
+def random_lamps(shape: tuple[int, int], rng: np.random.Generator) -> Lamps:
+    """Three of one colour each, or more of any, around an image of ``shape`` (h, w): near or far, low or high."""
+    k = 3 if rng.random() < 0.6 else int(rng.integers(4, 7))
+    angle = rng.uniform(0, 2 * np.pi) + 2 * np.pi / k * np.arange(k) + rng.normal(0, rng.choice([0.05, 0.3]), k)
+    far = 0.5 * np.hypot(*shape) * np.exp(rng.uniform(0, 1.6) + rng.normal(0, 0.15, k))
+    up = far * np.tan(np.radians(rng.uniform(*ELEVATION)))
+    colour = np.eye(3)[rng.permutation(3)] if k == 3 else rng.dirichlet([0.4] * 3, k)
+    # each channel of the camera sees something of all colours
+    mix = np.eye(3) + rng.uniform(0, 0.5, (3, 3)) * (rng.random() < 0.7)
+    colour = 1e-3 + colour * rng.uniform(0.4, 1.5, (k, 1)) @ mix
+    ambient = rng.uniform(0, AMBIENT) * rng.uniform(0.6, 1.4, 3)
+    place = np.stack([far * np.cos(angle), far * np.sin(angle), up], 1)
+    return Lamps(place, colour, ambient, float(rng.uniform(0.05, 0.6)), float(rng.uniform(0, 2)))
 
 
-def _shadowed(image: Image, background: Image, lamps: Lamps, rng: np.random.Generator) -> Image:
-    """What lies behind a slope that faces away from a lamp gets darker in its colour, too: (h, w, 3)."""
-    if rng.random() < 0.5:
-        return image
-    change, length = image - background, int(rng.integers(4, 20))
-    darker = np.minimum(change, 0)
-    out = change.copy()
-    for c, away in enumerate(lamps.response[..., 0]):
-        along = away / max(float(np.linalg.norm(away)), 1e-9)
-        for t in np.linspace(0, length, 5)[1:]:
-            M = np.array([[1, 0, t * along[0]], [0, 1, t * along[1]]], np.float32)
-            tail = cv2.warpAffine(np.ascontiguousarray(darker[..., c]), M, image.shape[1::-1])
-            out[..., c] += rng.uniform(0, 0.4) * (1 - t / (length + 1)) * tail
-    return np.clip(out + background, 0, 1).astype(np.float32)
+def _photographed(light: Image, rng: np.random.Generator) -> Array:
+    """Readings 0..1 of ``light`` (2, h, w, 3): the second, without contact, of a random brightness in each channel."""
+    exposure = np.clip(rng.uniform(0.15, 0.75) + rng.normal(0, 0.1, 3), 0.08, 0.95)
+    shown = exposure * (light / np.median(light[1], (0, 1))) ** rng.uniform(0.45, 1)
+    return np.clip(_blurred(shown, float(rng.uniform(0.2, 1.5))), 0, 1).astype(float)
 
 
 def _scattered(change: Image, rng: np.random.Generator) -> Image:
-    """A change of colour (h, w, 3), some of it spread far and wide by the gel."""
+    """A change of light (h, w, 3), some of it spread far and wide by the gel."""
     spread = cv2.GaussianBlur(change, (0, 0), float(rng.uniform(5, 20)))
     return (change + rng.uniform(0, 1.0) * (rng.random() < 0.6) * spread).astype(np.float32)
 
 
-def _background(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
-    """Smooth, of any colour, darker or brighter towards any side; at times with markers."""
-    h, w = shape
+def _paint(bent: Image, rng: np.random.Generator) -> Image:
+    """What share (2, h, w) of its light the coating of a gel, ``bent`` (h, w) [px] and at rest, sends to the camera: less of it
+    towards the corners, at times with markers, which move along with the gel."""
+    h, w = bent.shape
     y, x = np.meshgrid(np.linspace(-1, 1, h), np.linspace(-1, 1, w), indexing="ij")
-    terms = np.stack([np.ones((h, w)), x, y, x * x, x * y, y * y])
-    weights = rng.normal(0, 1, (6, 3)) * np.array([0, 0.15, 0.15, 0.1, 0.1, 0.1])[:, None]
-    weights[0] = rng.uniform(0.25, 0.7, 3)
-    out = np.clip(np.einsum("phw,pc->hwc", terms, weights), 0.05, 0.95)
+    out = np.stack(2 * [1 - rng.uniform(0, 0.3) * (x**2 + y**2)])
     if rng.random() < 0.15:
-        out *= 1 - 0.6 * _markers((h, w), rng)[..., None]
+        out *= 1 - 0.6 * _markers(bent, rng)
     return out.astype(np.float32)
 
 
-def _markers(shape: tuple[int, int], rng: np.random.Generator) -> Array:
-    """Dots (h, w) on a grid, 1 within them."""
+def _markers(bent: Image, rng: np.random.Generator) -> Array:
+    """Dots (2, h, w) on a grid, 1 within them: of a gel that is ``bent`` (h, w) [px], drawn along by that, and at rest."""
     apart, radius = rng.uniform(9, 20), rng.uniform(1, 2.5)
-    y, x = np.mgrid[: shape[0], : shape[1]] + rng.uniform(0, apart, (2, 1, 1))
-    off = np.hypot(x % apart - apart / 2, y % apart - apart / 2)
+    at_rest = np.mgrid[: bent.shape[0], : bent.shape[1]] + rng.uniform(0, apart, (2, 1, 1))
+    along: Array = rng.normal(0, 0.1, 2)[:, None, None] * bent + rng.normal(0, 0.5) * np.stack([*np.gradient(bent)])
+    off = np.stack([np.hypot(*(place % apart - apart / 2)) for place in (at_rest + along, at_rest)])
     return np.asarray(1 / (1 + np.exp(3 * (off - radius))))
 
 
@@ -103,10 +111,12 @@ def _dusty(image: Image, rng: np.random.Generator) -> Image:
     return out
 
 
-def _crosstalk(rng: np.random.Generator) -> Array:
-    """(3, 3): what each colour of the lamps adds to each channel of the camera."""
-    mix = np.eye(3) + rng.uniform(0, 0.5, (3, 3)) * (rng.random() < 0.7)
-    return np.asarray(mix / mix.sum(0))
+def _uneven(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
+    """A smooth field (h, w, 3) of up to one and a half 255ths (rms): a gel that has not quite come to rest."""
+    field = cv2.GaussianBlur(
+        rng.normal(size=(*shape[:2], 3)).astype(np.float32), (0, 0), float(np.exp(rng.uniform(1, 3)))
+    )
+    return np.asarray(rng.uniform(0, 1.5) / 255 * field / field.std(), np.float32)
 
 
 def _blurred(images: Array, sigma: float) -> Image:

@@ -61,7 +61,11 @@ def save_state(
     folder.mkdir(parents=True, exist_ok=True)
     tensors = {f"network.{k}": v.contiguous() for k, v in network.state_dict().items()}
     for i, state in optimizer.state_dict()["state"].items():
-        tensors |= {f"optimizer.{i}.{k}": v.clone() for k, v in state.items() if v is not None}
+        tensors |= {
+            f"optimizer.{i}.{k}": v.clone(memory_format=torch.contiguous_format)
+            for k, v in state.items()
+            if v is not None
+        }
     meta = {"step": str(step), "settings": json.dumps(settings), "curve": json.dumps(curve)}
     write_whole(folder / _FILE, lambda temporary: save_file(tensors, temporary, meta))
 

@@ -1,0 +1,83 @@
+"""How likely the outline of a contact is at poses, as rigid and elastic gels would feel them, and a search for likelier ones.
+
+What the grid stores, and what registration casts, is where the object lies below the membrane. A real gel sinks beside what
+presses, and touches less of it, by an amount that only solving for its pressure tells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.touch import sinking
+from geomtact.registration.observability import moved
+from geomtact.registration.protocol import Problem
+from geomtact.scoring.outline import OutlineLikelihood
+from geomtact.se3 import Array
+
+SHAPE = (60, 80)  # of the casts
+GELS = (0.0, 0.5, 1.0)  # of an elastic half-space's sinking: rigid, thin and thick gels, all as likely
+# How many poses are left in each round, how many are tried around each, and in what share of the width of the first
+ROUNDS = ((200, 8, 1.0), (60, 10, 0.6), (25, 12, 0.35))
+
+
+@dataclass(frozen=True, eq=False)
+class Gel:
+    """What the sensor shows.
+
+    Attributes
+    ----------
+    space : of the object on it
+    outline : of its contact, to be compared with fields of :attr:`shape`
+    """
+
+    space: ContactSpace
+    outline: OutlineLikelihood
+
+    @classmethod
+    def showing(cls, mask: NDArray[np.bool_], space: ContactSpace) -> Gel:
+        """The contact ``mask`` (H, W)."""
+        return cls(space, OutlineLikelihood.of(mask, space.sensor, space.sensor.along(SHAPE)))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.space.sensor.along(SHAPE)
+
+    def sinking(self, T: Array) -> NDArray[np.float32]:
+        """As of ``touch.sinking`` (n, h, w), with the object at ``T`` (n, 4, 4)."""
+        return np.stack([sinking(self.space, pose, self.shape) for pose in T])
+
+    def log_likelihood(self, T: Array, sinking: NDArray[np.float32]) -> Array:
+        """Log likelihood (n, g) for each of ``GELS`` at poses ``T`` (n, 4, 4), near which a half-space sinks so (n, h, w);
+        -inf where the object does not touch, or is too deep."""
+        sensor = self.space.sensor
+        depths = self.space.caster.depths(sensor, T, self.shape)
+        deepest = depths.max((1, 2))
+        level = np.maximum(deepest, 0)[:, None, None] * sinking
+        logs = np.stack([self.outline.log_likelihood(depths - np.float32(share) * level) for share in GELS], 1)
+        logs[deepest > sensor.max_penetration] = -np.inf
+        return logs
+
+    def search(self, T: Array, width: Array, problem: Problem, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Poses (n, 4, 4) around ``T`` at which the outline is likelier, and how likely (n,), whatever the gel.
+
+        Parameters
+        ----------
+        T : (n, 4, 4), the most hopeful first
+        width : (6,) standard deviation of the motions that are tried first [m], in the axes of ``problem``
+        """
+        T, likely = T.copy(), np.full(len(T), -np.inf)
+        left = np.arange(len(T))
+        for most, around, share in ROUNDS:
+            left = left[np.argsort(-likely[left], kind="stable")][:most]
+            motion = rng.normal(size=(len(left), around, 6)) * share * width
+            tried = np.concatenate([T[left, None], moved(T[left, None], motion, problem)], 1)
+            sinks = np.repeat(self.sinking(T[left]), around + 1, 0)
+            logs = self.log_likelihood(tried.reshape(-1, 4, 4), sinks)
+            merit = (np.logaddexp.reduce(logs, 1) - np.log(len(GELS))).reshape(tried.shape[:2])
+            best = np.arange(len(left)), merit.argmax(1)
+            T[left], likely[left] = tried[best], merit[best]
+        return T, likely

@@ -1,0 +1,124 @@
+"""How likely the outline of a contact is, given where the gel should be touched.
+
+A reader finds the outline a little beside where it is, and errs alike along some length of it: a smooth displacement of unknown
+strength, over which it is marginalised. So what counts is how far the two outlines are apart, not how many pixels differ: a
+shape is told by details that have hardly any area.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.se3 import Array
+from geomtact.sensing.sensor import Sensor
+
+STRENGTHS = (0.2e-3, 0.35e-3, 0.6e-3)  # m rms of the displacement, all as likely
+_CORRELATION = 2e-3  # m along the outline over which it is alike: to 1/e, as of ``Noise.correlation``
+_ODD = 3.0  # times the strength from which on a piece of outline says nothing: dust, or a patch that was not found
+_STEEPEST = 1.0  # slope down to the pixels beside the contact, from which on it is a wall
+_FLATTEST = 0.05  # slope at least, in working out how far away the level is
+_POINTS = 150  # of the observed outline, at most
+
+
+@dataclass(frozen=True, eq=False)
+class OutlineLikelihood:
+    """Of one observed contact.
+
+    Attributes
+    ----------
+    beside : (H, W) how far each pixel is outside the observed outline [m], negative inside of it
+    pitch : of these pixels along x and y [m]
+    points : (n, 2) column and row on the observed outline
+    length : of the observed outline [m]
+    field : (dx, dy) pitch of the fields it is compared with [m]
+    """
+
+    beside: NDArray[np.float32]
+    pitch: Array
+    points: Array
+    length: float
+    field: Array
+
+    @classmethod
+    def of(cls, mask: NDArray[np.bool_], sensor: Sensor, shape: tuple[int, int]) -> OutlineLikelihood:
+        """Of a contact ``mask`` (H, W), to be compared with fields of ``shape`` (h, w) over the same window."""
+        pitch = 2 * sensor.half_window / mask.shape[::-1]
+        _, points, length = _crossings(np.where(mask, 1.0, -1.0)[None], pitch)
+        # They come row by row, left and right in turn: every other one might be the left side alone
+        most = min(len(points), _POINTS)
+        some = (np.arange(most) + np.random.default_rng(0).random(most)) * len(points) / max(most, 1)
+        return cls(
+            _beside(mask, float(np.sqrt(pitch.prod()))),
+            pitch,
+            points[some.astype(int)],
+            float(length.sum()),
+            2 * sensor.half_window / shape[::-1],
+        )
+
+    def log_likelihood(self, over: NDArray[np.floating]) -> Array:
+        """Log likelihood (n,), ``over`` (n, h, w) being how much deeper [m] the object lies than where touch begins; -inf where
+        it lies nowhere so deep."""
+        # beside a wall there is no telling how far away the level is: about halfway to the pixel beyond
+        over = np.maximum(over, -_STEEPEST * float(np.sqrt(self.field.prod())))
+        which, at, length = _crossings(over, self.field)
+        column, row = np.rint((at + 0.5) * self.field / self.pitch - 0.5).astype(int).T
+        h, w = self.beside.shape
+        from_seen = self.beside[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
+        from_told = self._from_points(over)
+        each = []
+        for strength in STRENGTHS:
+            told = np.bincount(which, _squared(from_seen, strength) * length, len(over))
+            seen = _squared(from_told, strength).mean(1) * self.length if len(self.points) else 0.0
+            each.append(-0.25 * (told + seen) - self.length * np.log(strength / STRENGTHS[0]))
+        logs = np.stack(each, 1) / (np.sqrt(np.pi) * _CORRELATION)
+        top = logs.max(1)
+        out = top + np.log(np.exp(logs - top[:, None]).mean(1))
+        return np.where((over > 0).any((1, 2)), out, -np.inf)
+
+    def _from_points(self, over: NDArray[np.floating]) -> Array:
+        """How far (n, m) [m] the level 0 of ``over`` (n, h, w) is from each observed point, by its slope there."""
+        h, w = over.shape[1:]
+        column, row = ((self.points + 0.5) * self.pitch / self.field - 0.5).T
+        i, j = (np.clip(np.floor(x).astype(int), 0, most - 2) for x, most in ((row, h), (column, w)))
+        a, b, c, d = over[:, i, j], over[:, i, j + 1], over[:, i + 1, j], over[:, i + 1, j + 1]
+        y, x = np.clip(row - i, 0, 1), np.clip(column - j, 0, 1)
+        value = (1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d)
+        slope_x = ((1 - y) * (b - a) + y * (d - c)) / self.field[0]
+        slope_y = ((1 - x) * (c - a) + x * (d - b)) / self.field[1]
+        return np.asarray(value / np.maximum(np.hypot(slope_x, slope_y), _FLATTEST))
+
+
+def _squared(distance: NDArray[np.floating], strength: float) -> Array:
+    return np.asarray(np.minimum(distance / strength, _ODD).clip(-_ODD) ** 2)
+
+
+def _beside(mask: NDArray[np.bool_], pitch: float) -> NDArray[np.float32]:
+    """How far (H, W) [m] each pixel is outside the outline of ``mask``, negative inside; the window's border is no outline."""
+    image = mask.astype(np.uint8)
+    far = float(np.hypot(*mask.shape))
+    off = [
+        cv2.distanceTransform(side, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
+        if not side.all()
+        else np.full(mask.shape, far, np.float32)
+        for side in (1 - image, image)
+    ]
+    return np.asarray(pitch * np.where(mask, -off[1], off[0]), np.float32)
+
+
+def _crossings(field: NDArray[np.floating], pitch: Array) -> tuple[NDArray[np.int64], Array, Array]:
+    """Where fields (n, h, w) change their sign between neighbours: which field (m,), column and row (m, 2), and for how much [m]
+    of the outline's length each stands (m,), whichever way that runs (Cauchy and Crofton)."""
+    which, at, length = [], [], []
+    for axis, across in ((2, pitch[1]), (1, pitch[0])):
+        along = np.moveaxis(field, axis, 2)
+        i, line, k = np.nonzero((along[..., 1:] > 0) != (along[..., :-1] > 0))
+        here, there = along[i, line, k].astype(float), along[i, line, k + 1].astype(float)
+        between = k + here / (here - there)
+        which.append(i)
+        at.append(np.stack([between, line] if axis == 2 else [line, between], 1))
+        length.append(np.full(len(i), np.pi / 4 * across))
+    return np.concatenate(which), np.concatenate(at), np.concatenate(length)
