@@ -101,7 +101,7 @@ WAYS = {
 
 _THESIS_POSES = 150_000  # of its discretisation (6.1.2)
 
-# what is modelled: (the way without it, the way with it). A known side is not among them: its nats count from another uniform
+# what is modelled: (the way without it, the way with it), both of which count nats from the same uniform
 MODELLED = {
     "every cell, not blocks": ("fast", DEFAULT),
     "pixels and 25 modes (exact)": (DEFAULT, "exact"),

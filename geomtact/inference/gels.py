@@ -51,7 +51,8 @@ class Gel:
         return np.stack([sinking(self.space, pose, self.shape) for pose in T])
 
     def log_likelihood(self, T: Array, sinking: NDArray[np.float32]) -> Array:
-        """Log likelihood (n, g) for each of ``GELS`` at poses ``T`` (n, 4, 4), near which a half-space sinks so (n, h, w);
+        """Natural log of the likelihood (n, g), up to a constant, for each of ``GELS`` at poses ``T`` (n, 4, 4) in the sensor
+        frame, near which a half-space sinks so (n, h, w);
         -inf where the object does not touch, or is too deep."""
         sensor = self.space.sensor
         depths = self.space.caster.depths(sensor, T, self.shape)

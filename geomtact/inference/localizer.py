@@ -50,7 +50,8 @@ class Effort:
         cells, their pixels counted too
     modes : that are refined
     thorough : whether each is refined by all registrations or by one
-    outlines : whether, of one mask, the outline is what tells them apart where few enough cells are left (see ``gels``)
+    outlines : whether, of one mask, the outline is what tells them apart where few enough cells are left (see
+        ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by FilterReg
     """
 
     resolved: str
@@ -159,7 +160,8 @@ class Localizer:
         prior : None, a Posterior, its path, a pair (poses, log weights), a GaussianPrior or a log density (see
             ``inference.prior``)
         effort : "fast" (the grid's blocks, nothing refined), "balanced" (its cells, five refined modes) or "exact" (every
-            cell, the pixels counted too where that tells more, twenty-five refined modes), or an Effort of one's own
+            cell, the pixels counted too where that tells more, twenty-five refined modes, by the outline where few cells are
+            left), or an Effort of one's own
         seed : of the random choices made where credible levels tie, and in refining
         rig : how well the sensors' poses relative to each other are known
 
@@ -179,9 +181,10 @@ class Localizer:
             if not touch.contact:
                 return touch
             with _timed(touch.timing_ms, "refine"):
+                # a mask is registered mode by mode; heights, and outlines where few cells are left, are searched for and weighed
                 contact = touch.observation.contact
-                heights, outlines = contact.height is not None, how.outlines and few_are_left(touch)
-                if not how.modes or not (heights or outlines):
+                heights = contact.height is not None
+                if not how.modes or not (heights or (how.outlines and few_are_left(touch))):
                     return self.refinery.refine(touch, contact, how.modes, how.thorough)
                 before = None
                 if prior is not None:

@@ -17,9 +17,9 @@ from geomtact.inference.search import Search, View
 
 _CELLS = 600  # that are looked into
 ENOUGH = 0.1  # share of the posterior that these must hold, to be worth it
-# Power of the likelihood of an outline at one pose; of what a cell had, for both speak of the same image; the share of their mass
-# that the cells weighed keep, whatever is likely within them; and that all others keep
-_TRUST, _BEFORE, _DOUBT, _ELSEWHERE = 1.0, 0.5, 0.15, 0.5
+# Power of what a cell had, for the image that told it is the outline's; the share of their mass that the cells weighed keep,
+# whatever is likely within them; and that all others keep
+_BEFORE, _DOUBT, _ELSEWHERE = 0.5, 0.15, 0.5
 _TOLD = 5  # for each mode that is asked for, cells of which it is worked out what the contact tells
 
 
@@ -53,7 +53,7 @@ def refine_by_outline(
     home, T, likely = search.by_cell(T, likely)
     possible = posterior.cell_log_density(home) > -np.inf
     home, T, likely = home[possible], T[possible], likely[possible]
-    posterior = posterior.shared_anew(home, _TRUST * likely, _DOUBT, _ELSEWHERE, _BEFORE, log_prior)
+    posterior = posterior.shared_anew(home, likely, _DOUBT, _ELSEWHERE, _BEFORE, log_prior)
     leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: _TOLD * k]
     told_at = search.told(home[leading], T[leading])
     return replace(posterior, refined=told_at, settings=posterior.settings | {"by_outline": True})

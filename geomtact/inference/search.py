@@ -42,7 +42,7 @@ _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard de
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one of several sensors shows.
+    """What a sensor shows, the only one or one of several.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Tried:
 
 
 class Search:
-    """Poses of the object in the first sensor's frame at which several sensors would show what they do.
+    """Poses of the object in the first sensor's frame at which one sensor or several would show what they do.
 
     Attributes
     ----------

@@ -34,14 +34,14 @@ class OutlineLikelihood:
     pitch : of these pixels along x and y [m]
     points : (n, 2) column and row on the observed outline
     length : of the observed outline [m]
-    field : (dx, dy) pitch of the fields it is compared with [m]
+    field_pitch : (dx, dy) of the fields it is compared with [m]
     """
 
     beside: NDArray[np.float32]
     pitch: Array
     points: Array
     length: float
-    field: Array
+    field_pitch: Array
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_], sensor: Sensor, shape: tuple[int, int]) -> OutlineLikelihood:
@@ -60,12 +60,12 @@ class OutlineLikelihood:
         )
 
     def log_likelihood(self, over: NDArray[np.floating]) -> Array:
-        """Log likelihood (n,), ``over`` (n, h, w) being how much deeper [m] the object lies than where touch begins; -inf where
-        it lies nowhere so deep."""
+        """Natural log of the likelihood (n,) up to a constant, ``over`` (n, h, w) being how much deeper [m] the object lies than
+        where touch begins; -inf where it lies nowhere so deep."""
         # beside a wall there is no telling how far away the level is: about halfway to the pixel beyond
-        over = np.maximum(over, -_STEEPEST * float(np.sqrt(self.field.prod())))
-        which, at, length = _crossings(over, self.field)
-        column, row = np.rint((at + 0.5) * self.field / self.pitch - 0.5).astype(int).T
+        over = np.maximum(over, -_STEEPEST * float(np.sqrt(self.field_pitch.prod())))
+        which, at, length = _crossings(over, self.field_pitch)
+        column, row = np.rint((at + 0.5) * self.field_pitch / self.pitch - 0.5).astype(int).T
         h, w = self.beside.shape
         from_seen = self.beside[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
         from_told = self._from_points(over)
@@ -82,13 +82,13 @@ class OutlineLikelihood:
     def _from_points(self, over: NDArray[np.floating]) -> Array:
         """How far (n, m) [m] the level 0 of ``over`` (n, h, w) is from each observed point, by its slope there."""
         h, w = over.shape[1:]
-        column, row = ((self.points + 0.5) * self.pitch / self.field - 0.5).T
+        column, row = ((self.points + 0.5) * self.pitch / self.field_pitch - 0.5).T
         i, j = (np.clip(np.floor(x).astype(int), 0, most - 2) for x, most in ((row, h), (column, w)))
         a, b, c, d = over[:, i, j], over[:, i, j + 1], over[:, i + 1, j], over[:, i + 1, j + 1]
         y, x = np.clip(row - i, 0, 1), np.clip(column - j, 0, 1)
         value = (1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d)
-        slope_x = ((1 - y) * (b - a) + y * (d - c)) / self.field[0]
-        slope_y = ((1 - x) * (c - a) + x * (d - b)) / self.field[1]
+        slope_x = ((1 - y) * (b - a) + y * (d - c)) / self.field_pitch[0]
+        slope_y = ((1 - x) * (c - a) + x * (d - b)) / self.field_pitch[1]
         return np.asarray(value / np.maximum(np.hypot(slope_x, slope_y), _FLATTEST))
 
 

@@ -53,6 +53,13 @@ def contact_mask(
     Returns
     -------
     (H, W) bool; all False where nothing stands out of the image's own noise
+
+    Raises
+    ------
+    ImageError, SensorError
+        What is given is no RGB image, not of the sensor's size or the background's, or no sensor.
+    UsageError
+        There is no such ``method``.
     """
     return find_contact(image, background, sensor, method)[0]
 

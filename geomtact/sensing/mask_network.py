@@ -19,7 +19,7 @@ from torch import nn
 WEIGHTS = Path(__file__).with_name("mask_network.safetensors")
 WIDTHS = (12, 24, 48, 64)  # channels, at each halving
 _SIDE = 60  # px of the shorter side of what it sees
-_STEP = 8  # px that sides are multiples of
+_STEP = 8  # px that sides are multiples of: they are halved three times
 CHANNELS = 6  # three of change, three of what is blown out
 _BLOWN_OUT = 0.98  # brightness from which on
 
@@ -29,12 +29,12 @@ Image = NDArray[np.float32]
 class MaskNetwork(nn.Module):
     """Log odds of contact at each pixel."""
 
-    def __init__(self, widths: tuple[int, ...] = WIDTHS):
+    def __init__(self) -> None:
         super().__init__()
-        self.down = nn.ModuleList([_block(a, b) for a, b in zip((CHANNELS, *widths), widths, strict=False)])
-        pairs = list(zip(widths, widths[1:], strict=False))
+        self.down = nn.ModuleList([_block(a, b) for a, b in zip((CHANNELS, *WIDTHS), WIDTHS, strict=False)])
+        pairs = list(zip(WIDTHS, WIDTHS[1:], strict=False))
         self.up = nn.ModuleList([_block(a + b, a) for a, b in reversed(pairs)])
-        self.out = nn.Conv2d(widths[0], 1, 1)
+        self.out = nn.Conv2d(WIDTHS[0], 1, 1)
 
     def forward(self, seen_there: torch.Tensor) -> torch.Tensor:
         """Log odds (n, h, w) of what is :func:`seen` (n, ``CHANNELS``, h, w)."""
