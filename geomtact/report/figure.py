@@ -90,7 +90,9 @@ def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummar
         _in_window(band.add_subplot(grid[row, 0]), one.sensor, _displayable(one.observation.image), f"The image{of}")
         axes = band.add_subplot(grid[row, 1])
         outline(axes, one.sensor, contact, OBSERVED)
-        title = f"The contact{of} ({_area_mm2(contact, one.sensor):.1f} mm², read as {one.observation.kind})"
+        kind = one.observation.kind
+        found = f", {one.sensor.contact_method} way" if kind == "reading" else ""
+        title = f"The contact{of} ({_area_mm2(contact, one.sensor):.1f} mm², read as {kind}{found})"
         _in_window(axes, one.sensor, np.where(contact.mask, 0.75, 0.97), title)
     words = band.add_subplot(grid[:, 2])
     words.axis("off")
