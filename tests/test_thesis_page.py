@@ -219,7 +219,8 @@ def test_the_page_says_what_the_study_found():
         share = f"{100 * open_['distinctive']:.0f} %"
         told = [f"{mean[key]:.0f} mm" for key in ("random_mm", "least_mm")]
         error = [f"{open_['table']['all'][row]['error_mm_mean']:.0f} mm" for row in ("answer", "best")]
-        assert left[1:] == [str(open_["n"]), share, f"{open_['median']['span_mm']:.0f} mm", *told, *error]
+        shares = [f"{100 * mean[key]:.0f} %" for key in ("precision", "recall")]
+        assert left[1:] == [str(open_["n"]), share, f"{open_['median']['span_mm']:.0f} mm", *told, *error, *shares]
         before, after = (part["figures"][row]["near"] for row in ("refined best", "thesis's refinement of best"))
         moved = [f"{mm:.1f} mm" for mm in (*before[1:], after[2])]
         assert _cells(page, "### Refinement alone")[name][1:] == [str(before[0]), *moved]

@@ -130,7 +130,7 @@ def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, f
 
 def _draw(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[str, Any], best: int) -> list[Named]:
     """Points (time, value) and the front, and what is to be named; ``best`` is 1 where more is better."""
-    from matplotlib.ticker import LogLocator, NullFormatter
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     front: list[tuple[float, float]] = []
     for x, y in sorted(points.values(), key=lambda p: (p[0], -best * p[1])):
@@ -142,14 +142,15 @@ def _draw(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[s
         axes.plot(x, y, shape, color=colour, ms=5, zorder=3)
         if name == _DEFAULT:
             axes.plot(x, y, "o", ms=13, mfc="none", mec="black", zorder=2)
+    axes.margins(0.12)
     axes.set_xscale("log")
     if best < 0:
         axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis) if best < 0 else (axes.xaxis,):
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high > 5 * low else MaxNLocator(5))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
-    axes.margins(0.12)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)
     return [Named(name, looks[name][0], x, y) for name, (x, y) in points.items()]

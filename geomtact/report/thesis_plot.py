@@ -10,8 +10,14 @@ import numpy as np
 
 from geomtact.report.canvas import png
 
-_ROWS = {"best": "best", "refined best": "refined\nbest", "best10": "best10", "refined best10": "refined\nbest10"}
-_COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#A6D854")
+_ROWS = {
+    "best": "best",
+    "refined best": "refined\nbest",
+    "answer": "answer",
+    "best10": "best10",
+    "refined best10": "refined\nbest10",
+}
+_COLOURS = ("#0072B2", "#56B4E9", "#D55E00", "#009E73", "#A6D854")
 _BIN, _MOST = 0.05, 1.6  # normalised error
 
 
@@ -21,7 +27,7 @@ def draw_thesis(content: Mapping[str, Any]) -> bytes:
     from matplotlib.figure import Figure
 
     parts = content["parts"]
-    figure = Figure(figsize=(3.6 * len(parts) + 0.4, 4.6), dpi=110, layout="constrained", facecolor="white")
+    figure = Figure(figsize=(4.2 * len(parts) + 0.4, 4.6), dpi=110, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
     edges = np.arange(0, _MOST + _BIN, _BIN)
     for axes, (name, part) in zip(
