@@ -11,7 +11,8 @@ import trimesh
 from typer.testing import CliRunner
 
 from geomtact import Localizer, Mesh, load_mesh
-from geomtact.cli import app
+from geomtact.cli import app, study_file
+from geomtact.errors import InputError
 from geomtact.evaluation import known_approach, proper, study
 from geomtact.evaluation.pose_error import add, add_s, coverage, mssd, random_add
 from geomtact.geometry.distance import PoseDistance, mode_radius
@@ -241,6 +242,24 @@ def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tm
     other = CliRunner().invoke(app, [*common, "--out", str(out), "--seed", "2"])
     assert other.exit_code == 3 and "other settings (seed)" in other.output
     assert asked == [2] and out.read_bytes() == held, "what was judged with other settings is kept"
+
+
+@pytest.mark.parametrize(("off", "goes_on"), [(1e-7, True), (1e-3, False)])
+def test_a_study_goes_on_on_another_processor(off, goes_on):
+    """Whose arithmetic differs in the last digits."""
+    settings = {
+        "object": "ball",
+        "calibration": {"temperature": 0.95, "floor": 0.005},
+        "levels": [0.1, 0.2],
+        "touches": 6,
+    }
+    entry = {"settings": json.loads(json.dumps(settings))}
+    entry["settings"]["calibration"]["temperature"] *= 1 + off
+    if goes_on:
+        assert study_file.begun(entry, settings)
+    else:
+        with pytest.raises(InputError, match="other settings .calibration."):
+            study_file.begun(entry, settings)
 
 
 def _as_before(part, first):
