@@ -143,7 +143,10 @@ def test_unknown_names_and_files(tmp_path):
     save(box(), tmp_path / "part.stl")
     refused(r"prat.stl: no such file; did you mean 'part.stl'\?$", tmp_path / "prat.stl")
     (tmp_path / "a.step").write_text("ISO-10303-21;")
-    refused("not a mesh format", tmp_path / "a.step", "mm")
+    refused("make a mesh of it with 'python tools/prep_mesh.py a.step'", tmp_path / "a.step", "mm")
+    refused("make a mesh of it", "part.stp", "mm")
+    (tmp_path / "a.txt").write_text("x")
+    refused("not a mesh format", tmp_path / "a.txt", "mm")
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "off", "glb", "gltf"])

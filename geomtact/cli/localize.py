@@ -240,8 +240,11 @@ def localize(
         _print(posterior, modes, out, _reports(report))
     if not posterior.contact:
         where = "the image" if len(images) == 1 else f"any of the {len(images)} images"
-        blank = posterior.observation.kind == "mask"
-        advice = "a mask's contact is what is not 0" if blank else "give a --background, or say what it is with --kind"
+        advice = "give a --background, or say what it is with --kind"
+        if posterior.observation.kind == "mask":
+            advice = "a mask's contact is what is not 0"
+        elif values["background"] is not None:
+            advice = "nothing stands out of the --background; look whether that is of the untouched gel, and touch more firmly"
         tell(f"no contact found in {where}; {advice}")
         raise typer.Exit(NO_CONTACT)
 

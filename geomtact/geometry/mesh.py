@@ -21,6 +21,7 @@ UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 UNITLESS_FORMATS = (".stl", ".obj", ".ply", ".off")
 METRE_FORMATS = (".glb", ".gltf")
 FORMATS = UNITLESS_FORMATS + METRE_FORMATS
+PREPARED = (".step", ".stp", ".3mf")  # that tools/prep_mesh.py makes meshes of
 _REEXPORT = "; if its numbers are {unit}, re-export it in metres, or save it as STL or PLY and give --unit {unit}"
 
 # Beyond these no tactile sensor is meant; they also keep squares and cubes of lengths far from overflow.
@@ -210,6 +211,8 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
             )
         return name, entry.file, entry.unit, entry.symmetry
     suffix = path.suffix.lower()
+    if suffix in PREPARED:
+        raise MeshError(f"{text}: not read as it is; make a mesh of it with 'python tools/prep_mesh.py {path.name}'")
     if suffix not in FORMATS:
         if path.exists():
             raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(FORMATS)}")
