@@ -89,7 +89,7 @@ def judge_side(
 def _answers(localizer: Localizer, touch: Touch, effort: str) -> list[Array]:
     """The poses (k, 4, 4) that each of ``ROWS`` names."""
     index, sensor = localizer.index, localizer.sensor
-    grid = localizer.touch(touch.mask, "mask", None, np.eye(4), "sensor", None, effort, 0)
+    grid, _ = localizer.touch(touch.mask, "mask", None, np.eye(4), "sensor", None, effort, 0)
     refined = localizer.localize(touch.mask, "mask", effort=effort)
     before, after = (np.stack([mode.T for mode in posterior.modes(MODES)]) for posterior in (grid, refined))
     first = grid.leading_cells(1)

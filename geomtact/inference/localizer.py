@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geomtact.contact_space.carry import RigStd
 from geomtact.contact_space.index import Index
@@ -176,7 +177,7 @@ class Localizer:
             raise UsageError(f"localize: expected one background, or {len(images)}, got {len(backgrounds)}")
         prior = opened(prior, self.cache_dir)
         if len(images) == 1:
-            touch = self.touch(images[0], kind, backgrounds[0], T_frame_sensor[0], frame, prior, effort, seed)
+            touch, before = self.touch(images[0], kind, backgrounds[0], T_frame_sensor[0], frame, prior, effort, seed)
             touch = counted_once(touch, prior)
             if not touch.contact:
                 return touch
@@ -186,9 +187,6 @@ class Localizer:
                 heights = contact.height is not None
                 if not how.modes or not (heights or (how.outlines and few_are_left(touch))):
                     return self.refinery.refine(touch, contact, how.modes, how.thorough)
-                before = None
-                if prior is not None:
-                    before = prior_log_mass(self.index, prior, T_frame_sensor[0], frame)
                 view = View(self.refinery, contact, np.eye(4))
                 if heights:
                     return refine_together(touch, [view], how.modes, seed, before)
@@ -199,7 +197,7 @@ class Localizer:
                 f"localize: prepared for {len(localizers)} sensors, got {len(images)} images; give one for each"
             )
         touches = [
-            each.touch(shown, kind, empty, T, frame, None, effort, seed)
+            each.touch(shown, kind, empty, T, frame, None, effort, seed)[0]
             for each, shown, empty, T in zip(localizers, images, backgrounds, T_frame_sensor, strict=True)
         ]
         refineries = [each.refinery for each in localizers]
@@ -215,8 +213,9 @@ class Localizer:
         prior: Any,
         effort: str | Effort,
         seed: int,
-    ) -> Posterior:
-        """What one sensor at ``T_frame_sensor`` (4, 4) tells, not refined; the rest as in :meth:`localize`."""
+    ) -> tuple[Posterior, NDArray[np.floating] | None]:
+        """What one sensor at ``T_frame_sensor`` (4, 4) tells, not refined; and the log mass of every cell (M,) before that, where
+        there is a prior and contact. The rest as in :meth:`localize`."""
         timing: dict[str, float] = {}
         resolved = _effort(effort).resolved
         settings = self._settings(effort, seed)
@@ -246,7 +245,7 @@ class Localizer:
         if not touched:
             elsewhere = prior_log_density(prior, self.mesh, frame)
             nothing = Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, **common)
-            return replace(nothing, elsewhere=elsewhere, warnings=warnings)
+            return replace(nothing, elsewhere=elsewhere, warnings=warnings), None
         log_prior = None
         with _timed(timing, "score"):
             if prior is not None:
@@ -268,7 +267,7 @@ class Localizer:
                 f"{100 * self.space.hollow:.0f} % of the part's surface lies in hollows wider than the sensor's window, and "
                 "touches in there are taken for others: touch from outside, or localize on a mesh of that wall alone"
             )
-        return replace(posterior, warnings=warnings, settings=posterior.settings | {"odd": odd})
+        return replace(posterior, warnings=warnings, settings=posterior.settings | {"odd": odd}), log_prior
 
     def simulate(self, T_sensor_object: Any) -> Contact:
         """What the sensor would see at a pose (4, 4), without noise (thesis 6.1.3)."""

@@ -20,7 +20,6 @@ ENOUGH = 0.1  # share of the posterior that these must hold, to be worth it
 # Power of what a cell had, for the image that told it is the outline's; the share of their mass that the cells weighed keep,
 # whatever is likely within them; and that all others keep
 _BEFORE, _DOUBT, _ELSEWHERE = 0.5, 0.15, 0.5
-_TOLD = 5  # for each mode that is asked for, cells of which it is worked out what the contact tells
 
 
 def few_are_left(posterior: Posterior) -> bool:
@@ -40,20 +39,15 @@ def refine_by_outline(
     k : how many modes are wanted
     log_prior : as of ``Posterior.shared_anew``
     """
-    search = Search(posterior.index, [view], np.random.default_rng(seed))
+    search = Search(posterior, [view], np.random.default_rng(seed))
     tried = search.registered(search.drawn(posterior.likeliest_cells(_CELLS)), thorough=True)
-    home, poses, likely = search.best_of_each_cell(search.around_the_best(tried))
-    possible = posterior.cell_log_density(home) > -np.inf
-    poses, likely = poses[possible], likely[possible]
+    _, poses, likely = search.best_of_each_cell(search.around_the_best(tried))
     if not len(poses):
         return posterior
     hopeful = np.argsort(-likely, kind="stable")[: ROUNDS[0][0]]
     gel = Gel.showing(view.mask, view.refinery.space)
     T, likely = gel.search(poses[hopeful], search.width, search.problem, search.rng)
     home, T, likely = search.by_cell(T, likely)
-    possible = posterior.cell_log_density(home) > -np.inf
-    home, T, likely = home[possible], T[possible], likely[possible]
     posterior = posterior.shared_anew(home, likely, _DOUBT, _ELSEWHERE, _BEFORE, log_prior)
-    leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: _TOLD * k]
-    told_at = search.told(home[leading], T[leading])
+    told_at = search.told(posterior, home, T, k)
     return replace(posterior, refined=told_at, settings=posterior.settings | {"by_outline": True})

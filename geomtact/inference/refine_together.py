@@ -17,7 +17,6 @@ from geomtact.inference.search import Search, View
 from geomtact.se3 import Array
 
 _CELLS, _PER_MODE = 200, 10  # that are looked into: so many, and more for each mode that is asked for
-_TOLD = 5  # for each mode that is asked for, cells of which it is worked out what the contacts tell
 # Power of the joint likelihood at one pose; and the share of their mass that the cells looked into keep, whatever is likely
 # within them. Chosen, as are the next, on scenes that the study does not judge (docs/several-sensors.md)
 _TRUST, _DOUBT = 0.3, 0.03
@@ -52,11 +51,9 @@ def refine_together(
     looked_into = posterior.likeliest_cells(_CELLS + _PER_MODE * k)
     if not len(looked_into):
         return posterior
-    search = Search(posterior.index, views, np.random.default_rng(seed))
+    search = Search(posterior, views, np.random.default_rng(seed))
     tried = search.around_the_best(search.registered(search.drawn(looked_into)))
     home, poses, likely = search.best_of_each_cell(tried)
-    held = posterior.cell_log_density(home) > -np.inf
-    home, poses, likely = home[held], poses[held], likely[held]
 
     unexplained = (search.most.sum() - likely.max(initial=-np.inf)) / search.felt
     explains = float(np.clip((UNLIKE - unexplained) / (UNLIKE - ALIKE), 0, 1))
@@ -70,8 +67,7 @@ def refine_together(
         posterior = replace(posterior, log_evidence=float(np.logaddexp.reduce(explained)))
     posterior = posterior.shared_anew(home, _TRUST * likely, doubt, elsewhere, _BEFORE, log_prior)
 
-    leading = np.argsort(-posterior.cell_log_density(home), kind="stable")[: _TOLD * k]
-    told_at = search.told(home[leading], poses[leading])
+    told_at = search.told(posterior, home, poses, k)
     said: dict[str, float | None] = {"unexplained_nats": float(unexplained)}
     if not any(view.measured for view in views):
         outline = np.mean([view.outline for view in search.views[: search.felt]])

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.carry import UNFELT
-from geomtact.contact_space.index import Index
-from geomtact.inference.posterior import Refined
+from geomtact.inference.posterior import Posterior, Refined
 from geomtact.inference.refine import Refinery
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
@@ -36,6 +35,7 @@ _HOPEFUL = 4  # of the poses tried for a cell, that are asked for by more than t
 _THOROUGH = 25  # cells that ICP has a try at, too
 # Of the last search, each in half the width of the one before, and for the better half of the cells
 _ROUNDS, _AROUND = 3, 12
+_TOLD = 5  # for each mode that is asked for, cells of which it is worked out what the contacts tell
 _NARROW = 0.25  # of the grid's spread: standard deviation of the motions that are tried first around a pose
 _NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
 
@@ -136,7 +136,8 @@ class Tried:
 
 
 class Search:
-    """Poses of the object in the first sensor's frame at which one sensor or several would show what they do.
+    """Poses of the object in the first sensor's frame at which one sensor or several would show what they do, in cells that
+    ``posterior`` does not rule out.
 
     Attributes
     ----------
@@ -146,8 +147,9 @@ class Search:
     width : (6,) standard deviation of the motions that are tried first around a pose [m], in the axes of ``problem``
     """
 
-    def __init__(self, index: Index, views: Sequence[View], rng: np.random.Generator):
-        self.index, self.rng = index, rng
+    def __init__(self, posterior: Posterior, views: Sequence[View], rng: np.random.Generator):
+        self.posterior, self.index, self.rng = posterior, posterior.index, rng
+        index = self.index
         self.views = sorted(views, key=lambda view: view.contact is None)
         touching = [(view, view.contact) for view in views if view.contact is not None]
         self.base, self.felt = self.views[0], len(touching)
@@ -235,11 +237,13 @@ class Search:
         return self.by_cell(*self._best(T[some], depth[some], merit[some])[1:])
 
     def by_cell(self, T: Array, merit: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """The cells (m,) that hold poses ``T`` (n, 4, 4) which touch; in each the pose (m, 4, 4) of the highest ``merit``, and
-        that merit (m,)."""
+        """The possible cells (m,) that hold poses ``T`` (n, 4, 4) which touch; in each the pose (m, 4, 4) of the highest
+        ``merit``, and that merit (m,)."""
         depth = self.first.space.penetration(T)
         touching = np.isfinite(depth)
-        return self._best(T[touching], depth[touching], merit[touching])
+        home, T, merit = self._best(T[touching], depth[touching], merit[touching])
+        possible = self.posterior.cell_log_density(home) > -np.inf
+        return home[possible], T[possible], merit[possible]
 
     def _best(self, T: Array, depth: Array, merit: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """The cells (m,) that hold poses ``T`` (n, 4, 4) so deep (n,); in each the pose (m, 4, 4) of the highest ``merit``, and
@@ -248,8 +252,11 @@ class Search:
         home, row = np.unique(self.index.lookup(T[order], depth[order]), return_index=True)
         return home, T[order[row]], merit[order[row]]
 
-    def told(self, cells: NDArray[np.int64], T: Array) -> dict[int, Refined]:
-        """What all contacts tell at poses ``T`` (n, 4, 4), by the cell (n,) that each lies in."""
+    def told(self, posterior: Posterior, cells: NDArray[np.int64], T: Array, k: int) -> dict[int, Refined]:
+        """What all contacts tell, by the cell, at those of poses ``T`` (n, 4, 4) in ``cells`` (n,) among which the first ``k``
+        modes of ``posterior`` will be."""
+        leading = np.argsort(-posterior.cell_log_density(cells), kind="stable")[: _TOLD * k]
+        cells, T = cells[leading], T[leading]
         found = self.filterreg.refine(self.problem, T)
         out = {}
         for i, cell in enumerate(cells):

@@ -86,12 +86,7 @@ def make_problem(
         # even: only where the gel drops off steeply a wall is near
         steep = _at(clear & (np.hypot(*np.gradient(depth, *pitch_xy[::-1])) > _STEEP), uv)
         rim = _on_outline(
-            lifted(uv[steep]),
-            outward[steep],
-            half,
-            np.full(steep.sum(), outline_noise),
-            spacing / (np.sqrt(np.pi) * correlation),
-            sensor,
+            lifted(uv[steep]), outward[steep], half, outline_noise, spacing / (np.sqrt(np.pi) * correlation), sensor
         )
         uv, apart = _spaced(deep & known, pitch_xy, max_points)
         gel = lifted(uv, _at(depth, uv))
@@ -116,10 +111,10 @@ def make_problem(
 
 
 def _on_outline(
-    rim: Array, outward: Array, sink: float, noise: Array, weight: float, sensor: Sensor
+    rim: Array, outward: Array, sink: float, noise: float | Array, weight: float, sensor: Sensor
 ) -> dict[str, Array]:
     """Fields of a ``Problem`` for points (n, 3) of an outline on the membrane, its normals (n, 2) in the image's plane, and its
-    noise (n,) [m]."""
+    noise [m], one or (n,)."""
     down = _down(rim, sensor)
     facing = np.concatenate([outward, np.zeros((len(outward), 1))], 1)
     return {
@@ -127,7 +122,7 @@ def _on_outline(
         "facing": facing,
         "across": unit(np.cross(down, facing)),
         "sinking": down,
-        "noise": noise,
+        "noise": np.full(len(rim), noise),
         "weight": np.full(len(rim), min(1.0, weight)),
     }
 

@@ -56,7 +56,7 @@ class PixelLikelihood:
         for p, d in enumerate(depths):
             yes = np.stack([_felt(below[p] - t * d, s) for t, s in product(THRESHOLDS, SOFTNESS)], 1)
             logs = weight * np.concatenate([np.log(yes), np.log1p(-yes)]).astype(np.float32)  # (2 (P + 1), K)
-            out[p] = _log_mean_exp(counts @ logs)
+            out[p] = log_mean_exp(counts @ logs)
         return out
 
 
@@ -72,7 +72,7 @@ def cast_log_likelihood(depths: NDArray[np.floating], seen: NDArray[np.bool_], a
     each = []
     for t, s in product(THRESHOLDS, SOFTNESS):
         each.append(weight * np.log(_felt(sign * (depths - t * deepest), s)).sum((1, 2)))
-    return np.asarray(_log_mean_exp(np.stack(each, 1)), float)
+    return np.asarray(log_mean_exp(np.stack(each, 1)), float)
 
 
 def height_log_likelihood(
@@ -113,7 +113,7 @@ def _independent(area: float) -> float:
     return min(1.0, area / _CORRELATED)
 
 
-def _log_mean_exp(x: NDArray[np.floating]) -> NDArray[np.floating]:
+def log_mean_exp(x: NDArray[np.floating]) -> NDArray[np.floating]:
     """Log of the mean over the columns of exp(``x``) (n, K)."""
     top = x.max(1)
     return top + np.log(np.exp(x - top[:, None]).mean(1))

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.scoring.likelihood import log_mean_exp
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
@@ -74,9 +75,7 @@ class OutlineLikelihood:
             told = np.bincount(which, _squared(from_seen, strength) * length, len(over))
             seen = _squared(from_told, strength).mean(1) * self.length if len(self.points) else 0.0
             each.append(-0.25 * (told + seen) - self.length * np.log(strength / STRENGTHS[0]))
-        logs = np.stack(each, 1) / (np.sqrt(np.pi) * _CORRELATION)
-        top = logs.max(1)
-        out = top + np.log(np.exp(logs - top[:, None]).mean(1))
+        out = log_mean_exp(np.stack(each, 1) / (np.sqrt(np.pi) * _CORRELATION))
         return np.where((over > 0).any((1, 2)), out, -np.inf)
 
     def _from_points(self, over: NDArray[np.floating]) -> Array:

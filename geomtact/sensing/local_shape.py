@@ -90,7 +90,7 @@ def find_contact(
             change, felt, strong, _ = _change(image, reference, sigma)
     if not felt.any():
         return np.zeros(size[::-1], bool), None
-    if method == "learned" and not _of_one_colour(change, felt):
+    if method == "learned" and not _colours(change, felt)[2]:
         probability = _by_network(change, image, felt)
         mask = _components(_filled(probability > 0.5), probability, strong, sigma)
         # what is no contact by its size or for want of change is none by its probability either
@@ -108,20 +108,20 @@ def _on_grid(image: Array) -> Array:
     return np.asarray(cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
 
 
-def _of_one_colour(change: Array, felt: Mask) -> bool:
-    """Whether all that is felt changes along one colour, as a white gel does, which tells no slope."""
+def _colours(change: Array, felt: Mask) -> tuple[Array, Array, bool]:
+    """Powers (3,), ascending, and directions (3, 3) in columns of the colours along which all that is felt changes; and whether
+    it is but one, as of a white gel, which tells no slope."""
     values = change[felt]
-    power = np.linalg.eigvalsh(values.T @ values)
-    return bool(power[1] <= _ONE_COLOUR * power[2])
+    power, colours = np.linalg.eigh(values.T @ values / len(values))
+    return power, colours, bool(power[1] <= _ONE_COLOUR * power[2])
 
 
 def _by_colour(
     change: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array, by_slope: BySlope
 ) -> tuple[Array, Mask]:
     """How much the gel is pressed in (H, W), up to a factor, and the contact: by its slope, where colours tell that."""
-    values = change[felt]
-    power, colours = np.linalg.eigh(values.T @ values / len(values))
-    if _of_one_colour(change, felt):
+    power, colours, one = _colours(change, felt)
+    if one:
         return _half_as_large(_one_way(change @ colours[:, 2], felt), felt)
     slope = _slope_field(_transformed(change, (colours[:, 1:] / np.sqrt(power[1:])).T), felt, sigma, pitch)
     if slope is None:

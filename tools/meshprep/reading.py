@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from geomtact.geometry.mesh import UNITS
+from geomtact.geometry.mesh import FORMATS as READ
+from geomtact.geometry.mesh import METRE_FORMATS, PREPARED, UNITS
 from geomtact.sensing.sensor import Sensor
 from meshprep import Refused
 from meshprep.surface import Surface
 
-UNITLESS = (".stl", ".obj", ".ply", ".off")
-METRES = (".glb", ".gltf")
 STEP = (".step", ".stp")
-FORMATS = (*UNITLESS, *METRES, *STEP, ".3mf")
+FORMATS = READ + PREPARED
 _LARGEST_FILE = 500_000_000  # bytes
 _THREE_MF = {
     "millimeter": "mm",
@@ -95,7 +94,7 @@ def _scene(path: Path):
 
 def _own_unit(suffix: str, scene) -> str | None:
     """The unit that a file states. STEP files are read in millimetres, whatever they are drawn in."""
-    if suffix in METRES:
+    if suffix in METRE_FORMATS:
         return "m"
     if suffix in STEP:
         return "mm"
