@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from typer.testing import CliRunner
 
 import geomtact
 from geomtact import ImageError, InputError, Sensor, SensorError, UsageError, contact_height
 from geomtact.cli import app
-from geomtact.sensing.calibrate import calibrate, calibrated, diameter_of, measured_diameter, membrane_curvature
+from geomtact.sensing.ball import diameter_of
+from geomtact.sensing.calibrate import calibrate, calibrated, measured_diameter, membrane_curvature
+from geomtact.sensing.cast import Caster
 from geomtact.sensing.colour import TERMS, ColourTable, fit_weights, terms
 from geomtact.sensing.image_file import read_image, write_image
 
@@ -93,6 +96,23 @@ def test_a_bulging_membrane_takes_its_own_slope_off_the_balls():
     told = [measured_diameter(press, sensor) for sensor in (found.sensor, flat.sensor)]
     assert told[0] == pytest.approx(8 * MM, rel=0.05)
     assert np.linalg.norm(np.subtract(found.sensor.colour.weights, flat.sensor.colour.weights)) > 0.05
+
+
+@pytest.mark.parametrize("distance", [0.0, 15 * MM])
+def test_presses_tell_whether_a_near_camera_sees_them(distance):
+    """Cast, not worked out as the calibration does: of 8 mm, drawn in so far that the gel meets it 1.8 mm from its middle."""
+    seen = Sensor("made", SHAPE[::-1], (PITCH, PITCH), distance, 2 * MM)
+    ball, T = trimesh.creation.icosphere(subdivisions=5, radius=4 * MM), np.tile(np.eye(4), (len(PLACES), 1, 1))
+    T[:, :2, 3] = seen.from_pixels(np.array(PLACES))
+    T[:, 2, 3] = np.sqrt(4**2 - 1.8**2) * MM
+    depths = np.maximum(Caster(ball.vertices, ball.faces).depths(seen, T), -5 * MM).astype(float)
+    rng, gel = np.random.default_rng(3), 0.1 * MM * np.logaddexp(0, depths / (0.1 * MM))
+    made = [lit(np.stack(np.gradient(each, PITCH)[::-1], -1), rng) for each in gel]
+    said = replace(seen, camera_distance=15 * MM)
+    found = calibrated([image for image, _ in made], 8 * MM, made[0][1], sensor=said)
+    assert found.sensor.camera_distance == distance
+    assert any("parallel rays" in warning for warning in found.warnings) == (distance == 0)
+    assert np.median(found.diameters) == pytest.approx(8 * MM, rel=0.03)
 
 
 def test_two_balls_tell_how_a_membrane_bulges_and_that_a_flat_one_does_not():

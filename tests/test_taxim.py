@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from geomtact import Sensor, SensorError
 from geomtact.cli import app
-from geomtact.sensing.calibrate import diameter_of
+from geomtact.sensing.ball import diameter_of
 from geomtact.sensing.image_file import write_image
 from geomtact.sensing.taxim import change_of, colours_of_taxim, read_table
 

@@ -18,6 +18,7 @@ from scipy.ndimage import binary_erosion
 
 from geomtact.errors import InputError, UsageError
 from geomtact.se3 import Array
+from geomtact.sensing.ball import OnBall, from_middle
 from geomtact.sensing.colour import ColourTable, fit_weights, terms
 from geomtact.sensing.height import relief
 from geomtact.sensing.local_shape import check_size
@@ -73,7 +74,8 @@ def calibrate(
     ball_diameter : metres
     background : the same sensor without contact
     pixel_pitch : of the images [m], or along x and along y; that of ``sensor`` by default
-    sensor : whose geometry to keep, by name, file or itself; by default an orthographic, flat one of the images' size
+    sensor : whose geometry to keep, by name, file or itself, but for its camera's distance where the presses speak for parallel
+        rays; by default an orthographic, flat one of the images' size
     name : of the new sensor
 
     Raises
@@ -124,15 +126,30 @@ def calibrated(
         )
     base = known or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
     check_size(reference, base, "background")
-    base = replace(base, name=name or base.name, pixel_pitch=pitch)
-    samples = [_samples(press, base, radius) for press in found]
-    diameters, off, beside = _left_one_out(found, samples, base, radius)
+    fitted = _fitted(found, replace(base, name=name or base.name, pixel_pitch=pitch), radius)
+    warnings = []
+    if base.camera_distance:
+        straight = _fitted(found, replace(fitted[0], camera_distance=0.0), radius)
+        near, parallel = fitted[0].height_noise, straight[0].height_noise
+        if parallel < near:
+            fitted = straight
+            warnings.append(
+                f"the presses speak for parallel rays: under the ball heights are {1e3 * parallel:.3f} mm off by these, "
+                f"{1e3 * near:.3f} mm with a camera {1e3 * base.camera_distance:g} mm away, which the result leaves out"
+            )
+    sensor, diameters = fitted
+    return Calibrated(sensor, found, left_out, diameters, warnings + _doubts(found, diameters, ball_diameter))
+
+
+def _fitted(presses: list[Press], sensor: Sensor, ball: float) -> tuple[Sensor, Array]:
+    """``sensor`` with the colours of a ball of radius ``ball`` [m], and its diameter (n,) [m] on each press by the others."""
+    samples = [_samples(press, sensor, ball) for press in presses]
+    diameters, off, beside = _left_one_out(presses, samples, sensor, ball)
     x, y = (tuple(map(float, row)) for row in _weights(samples))
     colour = ColourTable((x, y), off, 0.0, 0.0)
-    noise, depth = _at_rest(found, colour, pitch)
+    noise, depth = _at_rest(presses, colour, sensor.pixel_pitch)
     colour = replace(colour, height_rms=noise, contact_depth=depth)
-    warnings = _doubts(found, diameters, ball_diameter)
-    return Calibrated(replace(base, colour=colour, height_noise=beside), found, left_out, diameters, warnings)
+    return replace(sensor, colour=colour, height_noise=beside), diameters
 
 
 def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) -> list[str]:
@@ -163,14 +180,14 @@ def _pair(pitch: float | tuple[float, float]) -> tuple[float, float]:
 
 def _samples(press: Press, sensor: Sensor, ball: float) -> tuple[Array, Array]:
     """Terms (n, ``TERMS``) and slopes (n, 2) of pixels on a ball of radius ``ball`` [m], and of pixels far from it: at rest."""
-    inner = _inner(press, sensor, INNER)
-    some = np.random.default_rng(0).permutation(len(inner.off))[:_PIXELS]
-    apart = np.linalg.norm(_from_centre(press, sensor), axis=-1)
+    on = OnBall.within(press, sensor, INNER)
+    some = np.random.default_rng(0).permutation(len(on.xy))[:_PIXELS]
+    apart = np.linalg.norm(from_middle(press, sensor), axis=-1)
     v, u = np.nonzero(apart > _OUTER * press.radius * sensor.pixel_pitch[0])
     far = np.random.default_rng(0).permutation(len(v))[:_FLAT_PIXELS]
     flat = terms(press.change[v[far], u[far]], u[far], v[far], press.mask.shape)
-    slopes = np.concatenate([inner.slopes(ball)[some], np.zeros((len(far), 2))])
-    return np.concatenate([inner.features[some], flat]), slopes
+    slopes = np.concatenate([on.slopes(ball)[some], np.zeros((len(far), 2))])
+    return np.concatenate([on.features[some], flat]), slopes
 
 
 def _weights(samples: Sequence[tuple[Array, Array]]) -> Array:
@@ -186,15 +203,13 @@ def _left_one_out(
     for i, press in enumerate(presses):
         weights = _weights([s for k, s in enumerate(samples) if k != i])
         x, y = (tuple(map(float, row)) for row in weights)
-        inner = _inner(press, sensor, INNER)
-        off = relief(press.change, press.felt, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)[
-            inner.at
-        ] - inner.height(ball)
-        beside.append(float(off.std()))
+        on = OnBall.within(press, sensor, INNER)
+        told = relief(press.change, press.felt, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)
+        beside.append(float((told[on.at] - on.height(ball)).std()))
         features, true = samples[i]
-        on = true.any(1)
-        squares.append(((features[on] @ weights.T - true[on]) ** 2).mean())
-        diameters[i] = _diameter(_inner(press, sensor, _MEASURED), weights)
+        sloping = true.any(1)
+        squares.append(((features[sloping] @ weights.T - true[sloping]) ** 2).mean())
+        diameters[i] = _diameter(press, sensor, weights)
     return diameters, float(np.sqrt(np.mean(squares))), float(np.median(beside))
 
 
@@ -244,7 +259,7 @@ def _told_by_the_other(balls: Sequence[tuple[Sequence[Press], float]], sensor: S
     """For either ball the log of its diameter on each press, as the colours tell that the other's presses give, over its own."""
     weights = [_weights([_samples(press, sensor, ball) for press in presses]) for presses, ball in balls]
     return [
-        np.log([_diameter(_inner(press, sensor, _MEASURED), other) / (2 * ball) for press in presses])
+        np.log([_diameter(press, sensor, other) / (2 * ball) for press in presses])
         for (presses, ball), other in zip(balls, reversed(weights), strict=True)
     ]
 
@@ -252,63 +267,19 @@ def _told_by_the_other(balls: Sequence[tuple[Sequence[Press], float]], sensor: S
 def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Array, Array]:
     """Slopes (n, 2) that the colours of a calibrated sensor tell on the inner part of a press, and those of the ball."""
     assert sensor.colour is not None
-    inner = _inner(press, sensor, INNER)
-    return inner.features @ np.asarray(sensor.colour.weights).T, inner.slopes(0.5 * ball_diameter)
-
-
-@dataclass(frozen=True, eq=False)
-class _Inner:
-    """Pixels ``at`` (rows, columns) on the inner part of a press: where they lie from the imprint's centre (n, 2) [m], their
-    terms (n, ``TERMS``), and the height (n,) [m] and slope (n, 2) of the membrane at rest."""
-
-    at: tuple[NDArray[np.int64], NDArray[np.int64]]
-    off: Array
-    features: Array
-    height_at_rest: Array
-    rest: Array
-
-    def height(self, radius: float) -> Array:
-        """Depth (n,) below the membrane under a ball, up to a constant."""
-        return np.asarray(np.sqrt(radius**2 - (self.off**2).sum(-1)) - self.height_at_rest)
-
-    def slopes(self, radius: float) -> Array:
-        """Slope (n, 2) of the depth below the membrane under a ball: deepest at its centre."""
-        return -self.off / np.sqrt(radius**2 - (self.off**2).sum(-1, keepdims=True)) - self.rest
-
-
-def _inner(press: Press, sensor: Sensor, share: float) -> _Inner:
-    """Of the pixels that are within ``share`` of the imprint's radius from its centre."""
-    off = _from_centre(press, sensor)
-    v, u = np.nonzero(np.linalg.norm(off, axis=-1) < share * press.radius * sensor.pixel_pitch[0])
-    height, rest, bend = np.zeros(len(v)), np.zeros((len(v), 2)), sensor.membrane_radius
-    if bend:
-        xy = sensor.from_pixels(np.stack([u, v], 1))
-        down = np.sqrt(bend**2 - (xy**2).sum(1))
-        height, rest = -down, xy / down[:, None]
-    return _Inner((v, u), off[v, u], terms(press.change[v, u], u, v, press.mask.shape), height, rest)
-
-
-def _from_centre(press: Press, sensor: Sensor) -> Array:
-    """Where each pixel (H, W, 2) lies from the imprint's centre [m]."""
-    row, column = np.mgrid[: press.mask.shape[0], : press.mask.shape[1]]
-    return np.asarray(np.stack([column - press.centre[0], row - press.centre[1]], -1) * np.asarray(sensor.pixel_pitch))
+    on = OnBall.within(press, sensor, INNER)
+    return on.features @ np.asarray(sensor.colour.weights).T, on.slopes(0.5 * ball_diameter)
 
 
 def measured_diameter(press: Press, sensor: Sensor) -> float:
     """Diameter [m] of the ball of a press, as the colours of a calibrated sensor tell it."""
     assert sensor.colour is not None
-    return _diameter(_inner(press, sensor, _MEASURED), np.asarray(sensor.colour.weights))
+    return _diameter(press, sensor, np.asarray(sensor.colour.weights))
 
 
-def _diameter(inner: _Inner, weights: Array) -> float:
-    return diameter_of(inner.off, inner.features @ weights.T + inner.rest)
-
-
-def diameter_of(xy: Array, slope: Array) -> float:
-    """Diameter [m] of the sphere that has depths of such ``slope`` (n, 2) at ``xy`` (n, 2) [m]."""
-    sine = slope / np.sqrt(1 + (slope**2).sum(1))[:, None]  # -(xy - centre) / radius
-    xy, sine = xy - xy.mean(0), sine - sine.mean(0)
-    return float(-2 * (xy**2).sum() / (xy * sine).sum())
+def _diameter(press: Press, sensor: Sensor, weights: Array) -> float:
+    on = OnBall.within(press, sensor, _MEASURED)
+    return on.diameter(on.features @ weights.T)
 
 
 def _at_rest(presses: Sequence[Press], colour: ColourTable, pitch: tuple[float, float]) -> tuple[float, float]:
