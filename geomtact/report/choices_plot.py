@@ -10,7 +10,7 @@ from geomtact.report.canvas import COLOURS, png
 from geomtact.report.names import Named, write_names
 
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X")
-_DEFAULT = "balanced"
+_DEFAULT, _THESIS = "balanced", "the thesis's network"
 _TICKS = (-5, -2, -1, -0.5, -0.2, -0.1, 0, 0.1, 0.2, 0.5, 1, 2, 5)  # nats
 
 
@@ -18,7 +18,7 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
     """A PNG with a row for each part and, for several, one for their mean: information and error against the time of one touch
     and of three sensors, error of a known side, and information against the time of preparing.
 
-    The line joins the ways that no other is as fast and as good as; the default is ringed.
+    The line joins the ways that no other is as fast and as good as; the default is ringed, the thesis's network boxed.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -26,14 +26,15 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
     rows = {name: _points(part) for name, part in content["parts"].items()}
     if len(rows) > 1:
         rows[f"mean over {len(rows)} parts"] = _mean(list(rows.values()))
-    ways = next(iter(content["parts"].values()))["ways"]
+    ways = {name: way for part in content["parts"].values() for name, way in part["ways"].items()}
     choices = list(dict.fromkeys(way["choice"] for way in ways.values()))
     looks = dict(zip(choices, zip(cycle(COLOURS), cycle(_SHAPES), strict=False), strict=False))
-    figure = Figure(figsize=(21, 3.9 * len(rows) + 0.5), dpi=90, layout="constrained", facecolor="white")
+    figure = Figure(figsize=(25, 3.9 * len(rows) + 0.5), dpi=90, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    grid = figure.subplots(len(rows), 5, squeeze=False)
+    grid = figure.subplots(len(rows), 6, squeeze=False)
     panels = (
         ("one touch", "ms", "gain", "time of a touch [ms]", "one touch: information [nats]", 1),
+        ("one touch", "ms", "mssd", "time of a touch [ms]", "one touch: median MSSD [mm]", -1),
         ("three sensors", "ms", "gain", "time of three touches [ms]", "three sensors: information [nats]", 1),
         ("three sensors", "ms", "mssd", "time of three touches [ms]", "three sensors: median MSSD [mm]", -1),
         ("known side", "ms", "mssd", "time of a touch [ms]", "known side: median MSSD [mm]", -1),
@@ -140,8 +141,9 @@ def _draw(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[s
     for name, (x, y) in points.items():
         colour, shape = looks[name]
         axes.plot(x, y, shape, color=colour, ms=5, zorder=3)
-        if name == _DEFAULT:
-            axes.plot(x, y, "o", ms=13, mfc="none", mec="black", zorder=2)
+        around = {_DEFAULT: "o", _THESIS: "s"}.get(name)
+        if around:
+            axes.plot(x, y, around, ms=13, mfc="none", mec="black", zorder=2)
     axes.margins(0.12)
     axes.set_xscale("log")
     if best < 0:

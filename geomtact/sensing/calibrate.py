@@ -19,9 +19,9 @@ from scipy.ndimage import binary_erosion
 from geomtact.errors import InputError, UsageError
 from geomtact.se3 import Array
 from geomtact.sensing.ball import OnBall, from_middle
+from geomtact.sensing.change import check_size
 from geomtact.sensing.colour import ColourTable, fit_weights, terms
 from geomtact.sensing.height import relief
-from geomtact.sensing.local_shape import check_size
 from geomtact.sensing.press import Press, find_presses, named_image
 from geomtact.sensing.sensor import Sensor
 

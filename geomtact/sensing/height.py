@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from geomtact.errors import SensorError
 from geomtact.se3 import Array
+from geomtact.sensing.change import as_unit_rgb, check_size, colour_change, same_size
 from geomtact.sensing.colour import ColourTable
-from geomtact.sensing.local_shape import as_unit_rgb, check_size, colour_change, integrate, same_size
 from geomtact.sensing.sensor import Sensor
+from geomtact.sensing.slope import integrate
 
 _SOME = 0.02  # share of the image in which the gel must rest, to tell where it rests
 

@@ -9,30 +9,27 @@ the pressure that bends an elastic gel so is worked out, and the contact is wher
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.errors import ImageError, UsageError, nearest_name
+from geomtact.errors import UsageError, nearest_name
 from geomtact.se3 import Array
-from geomtact.sensing.image_file import read_image
+from geomtact.sensing.change import as_unit_rgb, change_from, check_size, same_size
+from geomtact.sensing.pixels import Mask, blurred, filled, opened, size_of, transformed
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
+from geomtact.sensing.slope import integrate, of_gradient, slope_field
 
-Mask = NDArray[np.bool_]
 BySlope = Callable[[Array, Mask, Mask, float, Array], tuple[Array, Mask]]  # slope, felt, strong, sigma, pitch
 
-_GREY = 1 / 255
 _GRID = 120  # pixels along an image's shorter side, which is smoothed by one of them
-_STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
 _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated readings of many gels and lamps
 _ONE_COLOUR = 0.03  # power of the second colour over that of the first, under which there is but one: a white gel's
 _EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse, from which on slopes are seen
 _SURELY = 0.501  # probability of what counts as contact, at least
-_CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like slopes
 
 
 def contact_mask(
@@ -82,17 +79,17 @@ def find_contact(
     image, reference = _on_grid(image), None if reference is None else _on_grid(reference)
     # a second look smooths more where noise asks for it
     sigma = min(image.shape[:2]) / _GRID
-    change, felt, strong, noise = _change(image, reference, sigma)
+    change, felt, strong, noise = change_from(image, reference, sigma)
     if felt.any():
-        noise_share = noise / float(np.quantile(_size(change)[felt], 0.9))
+        noise_share = noise / float(np.quantile(size_of(change)[felt], 0.9))
         if noise_share > _NOISE_SHARE:
             sigma *= min(noise_share / _NOISE_SHARE, 2.0)
-            change, felt, strong, _ = _change(image, reference, sigma)
+            change, felt, strong, _ = change_from(image, reference, sigma)
     if not felt.any():
         return np.zeros(size[::-1], bool), None
     if method == "learned" and not _colours(change, felt)[2]:
         probability = _by_network(change, image, felt)
-        mask = _components(_filled(probability > 0.5), probability, strong, sigma)
+        mask = _components(filled(probability > 0.5), probability, strong, sigma)
         # what is no contact by its size or for want of change is none by its probability either
         probability = np.where(mask, np.maximum(probability, _SURELY), np.where(probability > 0.5, 0, probability))
         full = np.asarray(cv2.resize(probability, size, interpolation=cv2.INTER_LINEAR), np.float32)
@@ -123,9 +120,9 @@ def _by_colour(
     power, colours, one = _colours(change, felt)
     if one:
         return _half_as_large(_one_way(change @ colours[:, 2], felt), felt)
-    slope = _slope_field(_transformed(change, (colours[:, 1:] / np.sqrt(power[1:])).T), felt, sigma, pitch)
+    slope = slope_field(transformed(change, (colours[:, 1:] / np.sqrt(power[1:])).T), felt, sigma, pitch)
     if slope is None:
-        return _half_as_large(_size(change), felt)
+        return _half_as_large(size_of(change), felt)
     return by_slope(slope, felt, strong, sigma, pitch)
 
 
@@ -142,10 +139,10 @@ def _by_pressure(slope: Array, felt: Mask, strong: Mask, sigma: float, pitch: Ar
     A wave of pressure of number k sinks in by 1/k of it (Johnson 1985, 13.2), so pressure is k times the height: the Riesz
     transform of the gradient, as noisy as that and no more.
     """
-    height, pressed = _of_gradient(slope, pitch, 2, 1)
+    height, pressed = of_gradient(slope, pitch, 2, 1)
     pressed *= _inwards(height, felt)
     mask = (pressed > _PRESSED * np.quantile(pressed[strong], 0.98)) & felt
-    mask = _opened(_filled(mask), max(1, round(sigma)))
+    mask = opened(filled(mask), max(1, round(sigma)))
     return np.maximum(pressed, 0) * felt, mask
 
 
@@ -161,7 +158,7 @@ def _one_way(along: Array, felt: Mask) -> Array:
 def _half_as_large(size: Array, felt: Mask) -> tuple[Array, Mask]:
     """``size`` (H, W) where it is felt, and where it is more than half of the largest."""
     size = size * felt
-    return size, _filled(size > 0.5 * np.quantile(size[felt], 0.95))
+    return size, filled(size > 0.5 * np.quantile(size[felt], 0.95))
 
 
 def _by_network(change: Array, image: Array, felt: Mask) -> Array:
@@ -169,156 +166,6 @@ def _by_network(change: Array, image: Array, felt: Mask) -> Array:
     from geomtact.sensing.mask_network import contact_probability
 
     return np.asarray(contact_probability(change, image) * felt, float)
-
-
-def smooth_background(image: Array) -> Array:
-    """A background (H, W, 3) for ``image`` (H, W, 3): the smooth surface (degree 5) that most of its pixels lie on."""
-    h, w = image.shape[:2]
-    along_y, along_x = (np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, n), 5) for n in (h, w))
-    terms = [(i, j) for i in range(6) for j in range(6 - i)]
-    basis = np.stack([np.outer(along_y[:, i], along_x[:, j]).ravel() for i, j in terms], -1)
-    values = image.reshape(-1, 3)
-    keep = np.ones(len(values), bool)
-    for _ in range(8):
-        fit = basis @ np.linalg.lstsq(basis[keep][::7], values[keep][::7], rcond=None)[0]
-        error = np.abs(values - fit).sum(1)
-        keep = error <= np.quantile(error, 0.7)
-    return fit.reshape(image.shape)
-
-
-def as_unit_rgb(image: Any, name: str) -> Array:
-    """An image (H, W, 3), uint8 or float 0..1, or its path, as float32 0..1; what is none is refused under its ``name``."""
-    if isinstance(image, str | Path):
-        image = read_image(image)[..., :3]
-    image = np.asarray(image)
-    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
-        raise ImageError(f"{name}: expected an RGB image (H, W, 3), got an array of shape {image.shape}")
-    if image.dtype == np.uint8:
-        return np.asarray(cv2.LUT(image, (np.arange(256) / 255).astype(np.float32)))
-    if image.dtype.kind != "f":
-        raise ImageError(f"{name}: expected uint8 or float 0..1, got {image.dtype}; convert it")
-    image = image.astype(np.float32)
-    if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
-        raise ImageError(f"{name}: expected finite values from 0 to 1, got NaN or others; divide by the white value")
-    return image
-
-
-def check_size(image: Array, sensor: Sensor, name: str) -> None:
-    """Refuse an image (H, W, 3) that is not of the sensor's size."""
-    if image.shape[:2] != sensor.image_size_px[::-1]:
-        raise ImageError(
-            f"{name}: expected {sensor.image_size_px[0]} x {sensor.image_size_px[1]} px for sensor {sensor.name}, "
-            f"got {image.shape[1]} x {image.shape[0]} px; name the sensor that took it"
-        )
-
-
-def same_size(background: Array, image: Array) -> Array:
-    """The background (H, W, 3); one of another size than the image is refused."""
-    if background.shape != image.shape:
-        raise ImageError(
-            f"background: expected the size of the image, {image.shape[1]} x {image.shape[0]} px, "
-            f"got {background.shape[1]} x {background.shape[0]} px; take it with the same sensor"
-        )
-    return background
-
-
-def colour_change(image: NDArray[np.floating], background: NDArray[np.floating]) -> tuple[Array, Mask]:
-    """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it is felt."""
-    change, felt, _, _ = _change(image, background, min(image.shape[:2]) / 120)
-    return change, felt
-
-
-def _change(image: Any, background: Any, sigma: float) -> tuple[Array, Mask, Mask, float]:
-    """The smoothed change (H, W, 3) from the background, where it is felt and where strongly so, and its noise."""
-    smooth = _blurred(image, sigma)
-    reference = smooth_background(smooth) if background is None else _blurred(background, sigma)
-    change = _without_light_drift(smooth, reference, max(1, round(sigma)))
-    # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
-    floor = 0.0 if background is not None else float(np.median(_size(change)))
-    return change, *_felt(change, sigma, floor)
-
-
-def _without_light_drift(image: Array, reference: Array, step: int) -> Array:
-    """``image`` minus the background, whose brightness is fitted per channel (gain, offset) to the calmer half of one in
-    ``step`` pixels each way."""
-    gains, offsets = np.empty(3, image.dtype), np.empty(3, image.dtype)
-    for c in range(3):
-        x, y = (each[::step, ::step, c].ravel() for each in (reference, image))
-        calm_x, calm_y = x, y
-        for _ in range(6):
-            mean_x, mean_y = calm_x.mean(), calm_y.mean()
-            dx = calm_x - mean_x
-            variance = dx @ dx / dx.size
-            gain = np.clip(dx @ calm_y / dx.size / variance, 0.8, 1.25) if variance > _GREY**2 else dx.dtype.type(1)
-            offset = mean_y - gain * mean_x
-            error = np.abs(y - gain * x - offset)
-            calm = np.flatnonzero(error <= np.median(error))
-            calm_x, calm_y = x[calm], y[calm]
-        gains[c], offsets[c] = gain, offset
-    return image - gains * reference - offsets
-
-
-def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]:
-    """The regions (H, W) that stand out of the noise somewhere, those places, and the noise: hysteresis."""
-    step, apart = max(1, round(3 * sigma)), _apart(sigma)
-    noise2 = 0.0
-    for c in range(3):
-        # second differences over three smoothing lengths cancel slopes, and most pixels lie outside any rim
-        lines = (a[:, ::apart] for a in (change[..., c], change[..., c].T))
-        second = [np.abs(a[2 * step :: apart] - 2 * a[step:-step:apart] + a[: -2 * step : apart]) for a in lines]
-        deviation = np.median(np.concatenate([s.ravel() for s in second])) / 0.6745 / np.sqrt(6)
-        noise2 += max(float(deviation), 0.25 * _GREY) ** 2
-    noise = max(np.sqrt(noise2), floor)
-    size = _size(change)
-    strong = _opened(size > max(_STRONG * noise, 5 * _GREY), max(1, round(sigma)))
-    weak = size > max(_WEAK * noise, 0.05 * float(size.max()))
-    weak = _filled(_closed(weak, max(1, round(2 * sigma))))
-    n, labels = cv2.connectedComponents(weak.astype(np.uint8), connectivity=4)
-    kept = np.bincount(labels[strong], minlength=n) > 0
-    kept[0] = False
-    return kept[labels], strong, float(noise)
-
-
-def _slope_field(plane: Array, felt: Mask, sigma: float, pitch: Array) -> Array | None:
-    """The gel's slope (H, W, 2) up to a factor, of a change in two colours (H, W, 2); None where these do not tell it."""
-    plane = _blurred(plane, sigma)
-    some = (slice(None, None, _apart(sigma)),) * 2
-    along_y, along_x = (np.gradient(plane, axis=axis)[some] / pitch[1 - axis] for axis in (0, 1))
-    curl = np.concatenate([along_y, -along_x], -1)[felt[some]]
-    residual, maps = np.linalg.eigh(curl.T @ curl)
-    if residual[0] > _CURL_LIMIT * residual[-1]:
-        return None
-    return _transformed(plane, maps[:, 0].reshape(2, 2))
-
-
-def integrate(slope: Array, pitch: Array) -> Array:
-    """The height (H, W) whose gradient is nearest to ``slope``, mirrored at the border (Frankot, Chellappa 1988)."""
-    return _of_gradient(slope, pitch, 2)[0]
-
-
-def _of_gradient(slope: Array, pitch: Array, *powers: int) -> list[Array]:
-    """For each of the ``powers``, the field (H, W) whose waves are those of ``slope`` along their direction, over their number to
-    that power less one; mirrored at the border: a sum of cosines, and its slope along an axis one of sines there."""
-    from scipy import fft
-
-    h, w = slope.shape[:2]
-    kx = (np.pi * np.arange(w) / (w * pitch[0])).astype(slope.dtype)
-    ky = (np.pi * np.arange(h)[:, None] / (h * pitch[1])).astype(slope.dtype)
-    along_x = _sines(fft.dct(slope[..., 0], axis=0, norm="ortho"), 1)
-    along_y = _sines(fft.dct(slope[..., 1], axis=1, norm="ortho"), 0)
-    k = np.hypot(kx, ky)
-    k[0, 0] = 1.0
-    waves = -(kx * along_x + ky * along_y)
-    return [np.asarray(fft.idctn(waves / k**power, norm="ortho")) for power in powers]
-
-
-def _sines(values: Array, axis: int) -> Array:
-    """The sine transform of ``values`` along ``axis``, in the order of the cosines, of which the first has no sine."""
-    from scipy import fft
-
-    out = np.roll(fft.dst(values, axis=axis, norm="ortho"), 1, axis)
-    out[(slice(None),) * axis + (0,)] = 0
-    return np.asarray(out)
 
 
 def _inwards(height: Array, felt: Mask) -> float:
@@ -345,11 +192,11 @@ def _inside_rim(height: Array, slope: Array, felt: Mask, sigma: float) -> Mask:
     Inside a contact the gel takes the object's shape; outside it relaxes, and the slope dies away from the rim on.
     """
     steep = np.hypot(slope[..., 0], slope[..., 1])
-    ahead = _blurred(_uphill_maximum(height, steep), 2 * sigma)
+    ahead = blurred(_uphill_maximum(height, steep), 2 * sigma)
     share = steep / np.maximum(ahead, 1e-12)
     share[height > 0.6 * float(height.max())] = 1.0
     inside = (height > 0.1 * float(height.max())) & (share >= _steepest_fall(share, felt))
-    return _opened(_filled(inside), max(1, round(2 * sigma)))
+    return opened(filled(inside), max(1, round(2 * sigma)))
 
 
 def _steepest_fall(share: Array, felt: Mask) -> float:
@@ -391,45 +238,3 @@ def _components(mask: Mask, height: Array, strong: Mask, sigma: float) -> Mask:
     keep = (area > np.pi * (2 * sigma) ** 2) & (backed > 0) & (pressed > 0)
     keep[0] = False
     return keep[labels]
-
-
-def _transformed(image: Array, matrix: Array) -> Array:
-    """``matrix`` (D, C) applied to each pixel of ``image`` (H, W, C)."""
-    return np.asarray(cv2.transform(image, matrix))
-
-
-def _size(change: Array) -> Array:
-    """Of a change of colour (H, W, 3), (H, W)."""
-    return np.sqrt(np.einsum("hwc,hwc->hw", change, change))
-
-
-def _apart(sigma: float) -> int:
-    """Pixels from one to the next that tells something else, where all are smoothed by ``sigma``."""
-    return max(1, round(1.5 * sigma))
-
-
-def _blurred(image: Array, sigma: float) -> Any:
-    """``image`` (H, W, C) smoothed by ``sigma`` [px], in single precision."""
-    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
-
-
-def _opened(mask: Mask, n: int) -> Mask:
-    """``mask`` (H, W) without what is not 2 ``n`` pixels wide."""
-    return _morphed(mask, cv2.MORPH_OPEN, n)
-
-
-def _closed(mask: Mask, n: int) -> Mask:
-    """``mask`` (H, W) with what is not 2 ``n`` pixels wide beside it."""
-    return _morphed(mask, cv2.MORPH_CLOSE, n)
-
-
-def _morphed(mask: Mask, operation: int, n: int) -> Mask:
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), operation, cross, iterations=n), bool)
-
-
-def _filled(mask: Mask) -> Mask:
-    """``mask`` (H, W) with its holes: what cannot be reached from outside the image."""
-    around = np.pad(~mask, 1, constant_values=True).astype(np.uint8)
-    _, labels = cv2.connectedComponents(around, connectivity=4)
-    return np.asarray(labels != labels[0, 0])[1:-1, 1:-1]

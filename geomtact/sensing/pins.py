@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import ImageError, UsageError
 from geomtact.se3 import Array
-from geomtact.sensing.local_shape import as_unit_rgb, same_size
+from geomtact.sensing.change import as_unit_rgb, same_size
 
 _FEWEST, _MANY = 12, 36  # pins, for a cubic over the image, and for a quintic
 _SMOOTH = 1 / 120  # of the image's shorter side, as for contacts

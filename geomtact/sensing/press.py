@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from geomtact.errors import ImageError
 from geomtact.se3 import Array
-from geomtact.sensing.local_shape import as_unit_rgb, colour_change, contact_mask
+from geomtact.sensing.change import as_unit_rgb, colour_change
+from geomtact.sensing.local_shape import contact_mask
 
 _ROUND = 0.05  # of the radius that half of an outline may stray from its circle
 _SEEN = 0.4  # share of the circle that has to be seen

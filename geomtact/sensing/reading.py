@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import ImageError, UsageError, nearest_name
+from geomtact.sensing.change import as_unit_rgb
 from geomtact.sensing.checks import faults
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.height import contact_height
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
-from geomtact.sensing.local_shape import as_unit_rgb, contact_mask, find_contact
+from geomtact.sensing.local_shape import contact_mask, find_contact
 from geomtact.sensing.sensor import Sensor
 
 __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observation", "write_image"]

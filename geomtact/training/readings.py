@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from geomtact.se3 import Array
-from geomtact.sensing.local_shape import colour_change
+from geomtact.sensing.change import colour_change
 from geomtact.sensing.mask_network import seen
 from geomtact.training.lamps import Lamps, lit
 

@@ -1,0 +1,127 @@
+"""What has changed in a reading since its background: colours, where that is felt, and images that cannot be compared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.errors import ImageError
+from geomtact.se3 import Array
+from geomtact.sensing.image_file import read_image
+from geomtact.sensing.pixels import Mask, blurred, closed, filled, opened, pixels_apart, size_of
+from geomtact.sensing.sensor import Sensor
+
+_GREY = 1 / 255
+_STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
+
+
+def colour_change(image: NDArray[np.floating], background: NDArray[np.floating]) -> tuple[Array, Mask]:
+    """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it is felt."""
+    change, felt, _, _ = change_from(image, background, min(image.shape[:2]) / 120)
+    return change, felt
+
+
+def change_from(image: Any, background: Any, sigma: float) -> tuple[Array, Mask, Mask, float]:
+    """The smoothed change (H, W, 3) from the background, where it is felt and where strongly so, and its noise."""
+    smooth = blurred(image, sigma)
+    reference = smooth_background(smooth) if background is None else blurred(background, sigma)
+    change = _without_light_drift(smooth, reference, max(1, round(sigma)))
+    # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
+    floor = 0.0 if background is not None else float(np.median(size_of(change)))
+    return change, *_felt(change, sigma, floor)
+
+
+def smooth_background(image: Array) -> Array:
+    """A background (H, W, 3) for ``image`` (H, W, 3): the smooth surface (degree 5) that most of its pixels lie on."""
+    h, w = image.shape[:2]
+    along_y, along_x = (np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, n), 5) for n in (h, w))
+    terms = [(i, j) for i in range(6) for j in range(6 - i)]
+    basis = np.stack([np.outer(along_y[:, i], along_x[:, j]).ravel() for i, j in terms], -1)
+    values = image.reshape(-1, 3)
+    keep = np.ones(len(values), bool)
+    for _ in range(8):
+        fit = basis @ np.linalg.lstsq(basis[keep][::7], values[keep][::7], rcond=None)[0]
+        error = np.abs(values - fit).sum(1)
+        keep = error <= np.quantile(error, 0.7)
+    return fit.reshape(image.shape)
+
+
+def _without_light_drift(image: Array, reference: Array, step: int) -> Array:
+    """``image`` minus the background, whose brightness is fitted per channel (gain, offset) to the calmer half of one in
+    ``step`` pixels each way."""
+    gains, offsets = np.empty(3, image.dtype), np.empty(3, image.dtype)
+    for c in range(3):
+        x, y = (each[::step, ::step, c].ravel() for each in (reference, image))
+        calm_x, calm_y = x, y
+        for _ in range(6):
+            mean_x, mean_y = calm_x.mean(), calm_y.mean()
+            dx = calm_x - mean_x
+            variance = dx @ dx / dx.size
+            gain = np.clip(dx @ calm_y / dx.size / variance, 0.8, 1.25) if variance > _GREY**2 else dx.dtype.type(1)
+            offset = mean_y - gain * mean_x
+            error = np.abs(y - gain * x - offset)
+            calm = np.flatnonzero(error <= np.median(error))
+            calm_x, calm_y = x[calm], y[calm]
+        gains[c], offsets[c] = gain, offset
+    return image - gains * reference - offsets
+
+
+def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]:
+    """The regions (H, W) that stand out of the noise somewhere, those places, and the noise: hysteresis."""
+    step, apart = max(1, round(3 * sigma)), pixels_apart(sigma)
+    noise2 = 0.0
+    for c in range(3):
+        # second differences over three smoothing lengths cancel slopes, and most pixels lie outside any rim
+        lines = (a[:, ::apart] for a in (change[..., c], change[..., c].T))
+        second = [np.abs(a[2 * step :: apart] - 2 * a[step:-step:apart] + a[: -2 * step : apart]) for a in lines]
+        deviation = np.median(np.concatenate([s.ravel() for s in second])) / 0.6745 / np.sqrt(6)
+        noise2 += max(float(deviation), 0.25 * _GREY) ** 2
+    noise = max(np.sqrt(noise2), floor)
+    size = size_of(change)
+    strong = opened(size > max(_STRONG * noise, 5 * _GREY), max(1, round(sigma)))
+    weak = size > max(_WEAK * noise, 0.05 * float(size.max()))
+    weak = filled(closed(weak, max(1, round(2 * sigma))))
+    n, labels = cv2.connectedComponents(weak.astype(np.uint8), connectivity=4)
+    kept = np.bincount(labels[strong], minlength=n) > 0
+    kept[0] = False
+    return kept[labels], strong, float(noise)
+
+
+def as_unit_rgb(image: Any, name: str) -> Array:
+    """An image (H, W, 3), uint8 or float 0..1, or its path, as float32 0..1; what is none is refused under its ``name``."""
+    if isinstance(image, str | Path):
+        image = read_image(image)[..., :3]
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
+        raise ImageError(f"{name}: expected an RGB image (H, W, 3), got an array of shape {image.shape}")
+    if image.dtype == np.uint8:
+        return np.asarray(cv2.LUT(image, (np.arange(256) / 255).astype(np.float32)))
+    if image.dtype.kind != "f":
+        raise ImageError(f"{name}: expected uint8 or float 0..1, got {image.dtype}; convert it")
+    image = image.astype(np.float32)
+    if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
+        raise ImageError(f"{name}: expected finite values from 0 to 1, got NaN or others; divide by the white value")
+    return image
+
+
+def check_size(image: Array, sensor: Sensor, name: str) -> None:
+    """Refuse an image (H, W, 3) that is not of the sensor's size."""
+    if image.shape[:2] != sensor.image_size_px[::-1]:
+        raise ImageError(
+            f"{name}: expected {sensor.image_size_px[0]} x {sensor.image_size_px[1]} px for sensor {sensor.name}, "
+            f"got {image.shape[1]} x {image.shape[0]} px; name the sensor that took it"
+        )
+
+
+def same_size(background: Array, image: Array) -> Array:
+    """The background (H, W, 3); one of another size than the image is refused."""
+    if background.shape != image.shape:
+        raise ImageError(
+            f"background: expected the size of the image, {image.shape[1]} x {image.shape[0]} px, "
+            f"got {background.shape[1]} x {background.shape[0]} px; take it with the same sensor"
+        )
+    return background
