@@ -134,6 +134,13 @@ class Tried:
         """Of each cell, the pose (n, 4, 4) of the highest merit, and that merit (n,)."""
         return self.T[np.arange(len(self.T)), self.merit.argmax(1)], self.merit.max(1)
 
+    def with_others(self, rows: NDArray[np.int64], others: Tried) -> Tried:
+        """The best of each cell alone, in its place those of ``others`` (m, 1) in the cells ``rows`` (m,)."""
+        best = np.arange(len(self.T)), self.merit.argmax(1)
+        T, depth, merit = (each[best][:, None].copy() for each in (self.T, self.depth, self.merit))
+        T[rows], depth[rows], merit[rows] = others.T, others.depth, others.merit
+        return Tried(T, depth, merit, self.hidden)
+
 
 class Search:
     """Poses of the object in the first sensor's frame at which one sensor or several would show what they do, in cells that
@@ -203,9 +210,9 @@ class Search:
         best, merit = tried.best()
         found = [tried, self.tried(self.filterreg.refine(self.rough, best).T[:, None], tried.hidden)]
         if thorough:
-            some = np.isin(np.arange(len(best)), np.argsort(-merit, kind="stable")[:_THOROUGH])
-            best[some] = Icp(self.first.surface, self.spread).refine(self.rough, best[some]).T
-            found.append(self.tried(best[:, None], tried.hidden))
+            some = np.sort(np.argsort(-merit, kind="stable")[:_THOROUGH])
+            again = Icp(self.first.surface, self.spread).refine(self.rough, best[some]).T
+            found.append(tried.with_others(some, self.tried(again[:, None], tried.hidden[some])))
         return found
 
     def around_the_best(self, tried: list[Tried]) -> list[Tried]:
