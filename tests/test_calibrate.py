@@ -136,7 +136,7 @@ def test_presses_all_in_one_place_or_few_are_doubted():
     (said,) = calibrated(images, 8 * MM, background, PITCH).warnings
     assert "presses lie within 4 % of the window's width and 4 % of its height" in said
     images, background = presses(8 * MM, PLACES[:3])
-    assert any("is measured" in warning for warning in calibrated(images, 8 * MM, background, PITCH).warnings)
+    assert any("measure the ball" in warning for warning in calibrated(images, 8 * MM, background, PITCH).warnings)
     found = calibrated([*images, images[0]], 8 * MM, background, PITCH)
     assert found.left_out == {"press 4": "it is the same image as one before"}
 

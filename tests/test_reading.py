@@ -92,6 +92,27 @@ def test_float_images_are_heights_in_metres(tmp_path, suffix):
     assert np.array_equal(seen.contact.height, HEIGHT) and np.array_equal(seen.contact.mask, MASK)
 
 
+def test_a_faint_pixel_beside_a_rigid_contact_is_no_fading():
+    height = HEIGHT.copy()
+    height[5, 5] = 5e-6
+    assert read_observation(height, MINI).warnings == []
+
+
+def test_a_colourless_float_image_of_three_channels_is_a_reading(background):
+    grey = np.repeat(background[..., :1] / 255, 3, -1)
+    seen = read_observation(grey, MINI)
+    assert seen.kind == "reading" and not seen.contact.mask.any()
+
+
+def test_whole_numbers_of_a_reading_are_0_to_255(background):
+    wide = background.astype(np.int32)
+    same = [read_observation(image, MINI, background=background).contact.mask for image in (background, wide)]
+    assert np.array_equal(*same)
+    wide[3, 4, 1] = 1000
+    with pytest.raises(ImageError, match=r"a reading of int32 must lie in 0\.\.255, got \d+ to 1000; give uint8 or uint16"):
+        read_observation(wide, MINI, background=background)
+
+
 def test_sixteen_bit_grey_is_height_in_micrometres(tmp_path):
     seen = read_observation(write(tmp_path / "height.png", np.round(HEIGHT * 1e6).astype(np.uint16)), MINI)
     assert seen.kind == "height"

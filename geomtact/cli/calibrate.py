@@ -62,7 +62,7 @@ def calibrate(
     for option, least, value in lengths:
         if value is not None and not least < value < 1000 * least:
             raise UsageError(
-                f"{option} {value:g}: expected millimetres, {least:g} to {1000 * least:g}; metres are 1000 times that"
+                f"{option} {value:g}: expected millimetres, {least:g} to {1000 * least:g}; of metres give 1000 times as many"
             )
     pitch = None if pitch_mm is None else (1e-3 * pitch_mm[0], 1e-3 * pitch_mm[1])
     if pins is not None or pin_spacing_mm is not None:

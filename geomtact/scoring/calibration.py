@@ -1,5 +1,7 @@
 """From scores to probabilities: what a score is worth as evidence, measured on simulated touches.
 
+(A sensor's colours are calibrated elsewhere: ``sensing/calibrate.py``.)
+
 A score divided by a temperature is taken as a log likelihood, and a small share of every posterior is the uniform
 distribution, for what no score foresees. Both are chosen so that the poses of touches drawn uniformly over the contact
 pose space, felt through elastic and rigid gels and noise of any strength up to heavy, come out as probable as possible:

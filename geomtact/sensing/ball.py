@@ -56,12 +56,12 @@ class OnBall:
         )
 
     def height(self, radius: float) -> Array:
-        """Depth (n,) [m] below the membrane under a ball, up to a constant."""
+        """Depth (n,) [m] below the membrane at rest under a ball of ``radius`` [m] that meets it at the imprint."""
         seen, below = self._seen(radius)
         return np.asarray(below - self.sensor.sag(*seen.T))
 
     def slopes(self, radius: float) -> Array:
-        """Slope (n, 2) of the depth below the membrane under a ball, from pixel to pixel: deepest where it looks at the ball."""
+        """Slope (n, 2) of that depth along x and y, from pixel to pixel: metres of depth per metre at z = 0."""
         seen, below = self._seen(radius)
         off = seen - self.centre
         ball = -off / np.sqrt(radius**2 - (off**2).sum(-1, keepdims=True))

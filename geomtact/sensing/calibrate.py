@@ -1,4 +1,4 @@
-"""A sensor of one's own: from presses of one ball to what its colours tell of the gel's slope.
+"""A sensor of one's own: from presses of one ball to what its colours tell of the gel's slope (photometric stereo).
 
 Under the ball the gel has the ball's shape, so the slope is known all over the contact once its centre is: that of the circle
 which the contact's outline is. The outline is that of the imprint, which is wider than the contact: only the inner part is used,
@@ -135,21 +135,21 @@ def calibrated(
             fitted = straight
             warnings.append(
                 f"the presses speak for parallel rays: under the ball heights are {1e3 * parallel:.3f} mm off by these, "
-                f"{1e3 * near:.3f} mm with a camera {1e3 * base.camera_distance:g} mm away, which the result leaves out"
+                f"{1e3 * near:.3f} mm with a camera {1e3 * base.camera_distance:g} mm away; the result has camera_distance_mm = 0"
             )
     sensor, diameters = fitted
     return Calibrated(sensor, found, left_out, diameters, warnings + _doubts(found, diameters, ball_diameter))
 
 
-def _fitted(presses: list[Press], sensor: Sensor, ball: float) -> tuple[Sensor, Array]:
-    """``sensor`` with the colours of a ball of radius ``ball`` [m], and its diameter (n,) [m] on each press by the others."""
-    samples = [_samples(press, sensor, ball) for press in presses]
-    diameters, off, beside = _left_one_out(presses, samples, sensor, ball)
+def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor, Array]:
+    """``sensor`` with the colours of a ball of ``radius`` [m], and its diameter (n,) [m] on each press by the others."""
+    samples = [_samples(press, sensor, radius) for press in presses]
+    diameters, slope_rms, height_noise = _left_one_out(presses, samples, sensor, radius)
     x, y = (tuple(map(float, row)) for row in _weights(samples))
-    colour = ColourTable((x, y), off, 0.0, 0.0)
+    colour = ColourTable((x, y), slope_rms, 0.0, 0.0)
     noise, depth = _at_rest(presses, colour, sensor.pixel_pitch)
     colour = replace(colour, height_rms=noise, contact_depth=depth)
-    return replace(sensor, colour=colour, height_noise=beside), diameters
+    return replace(sensor, colour=colour, height_noise=height_noise), diameters
 
 
 def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) -> list[str]:
@@ -165,8 +165,9 @@ def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) ->
     off = float(np.median(diameters)) / ball_diameter - 1
     if abs(off) > _AGREES:
         out.append(
-            f"a press left out is measured {100 * abs(off):.0f} % too {'large' if off > 0 else 'small'} by the others: too few "
-            "presses, or not all of one ball; a dozen all over the window are better"
+            f"colours fitted to all presses but one measure the ball {100 * abs(off):.0f} % too "
+            f"{'large' if off > 0 else 'small'} on that one: too few presses, or not all of one ball; press it in a dozen times, "
+            "all over the window"
         )
     return out
 
@@ -178,15 +179,15 @@ def _pair(pitch: float | tuple[float, float]) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def _samples(press: Press, sensor: Sensor, ball: float) -> tuple[Array, Array]:
-    """Terms (n, ``TERMS``) and slopes (n, 2) of pixels on a ball of radius ``ball`` [m], and of pixels far from it: at rest."""
+def _samples(press: Press, sensor: Sensor, radius: float) -> tuple[Array, Array]:
+    """Terms (n, ``TERMS``) and slopes (n, 2) of pixels on a ball of ``radius`` [m], and of pixels far from it: at rest."""
     on = OnBall.within(press, sensor, INNER)
     some = np.random.default_rng(0).permutation(len(on.xy))[:_PIXELS]
     apart = np.linalg.norm(from_middle(press, sensor), axis=-1)
     v, u = np.nonzero(apart > _OUTER * press.radius * sensor.pixel_pitch[0])
     far = np.random.default_rng(0).permutation(len(v))[:_FLAT_PIXELS]
     flat = terms(press.change[v[far], u[far]], u[far], v[far], press.mask.shape)
-    slopes = np.concatenate([on.slopes(ball)[some], np.zeros((len(far), 2))])
+    slopes = np.concatenate([on.slopes(radius)[some], np.zeros((len(far), 2))])
     return np.concatenate([on.features[some], flat]), slopes
 
 
@@ -195,17 +196,17 @@ def _weights(samples: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def _left_one_out(
-    presses: Sequence[Press], samples: Sequence[tuple[Array, Array]], sensor: Sensor, ball: float
+    presses: Sequence[Press], samples: Sequence[tuple[Array, Array]], sensor: Sensor, radius: float
 ) -> tuple[Array, float, float]:
     """By what the others tell: the ball's diameter (n,) [m] on each press, and how far off slopes (rms) and heights [m] (median
-    of the presses' rms, their offset aside) are on a ball of radius ``ball`` [m]."""
+    of the presses' rms, their offset aside) are on a ball of ``radius`` [m]."""
     diameters, squares, beside = np.zeros(len(presses)), [], []
     for i, press in enumerate(presses):
         weights = _weights([s for k, s in enumerate(samples) if k != i])
         x, y = (tuple(map(float, row)) for row in weights)
         on = OnBall.within(press, sensor, INNER)
         told = relief(press.change, press.felt, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)
-        beside.append(float((told[on.at] - on.height(ball)).std()))
+        beside.append(float((told[on.at] - on.height(radius)).std()))
         features, true = samples[i]
         sloping = true.any(1)
         squares.append(((features[sloping] @ weights.T - true[sloping]) ** 2).mean())

@@ -28,7 +28,7 @@ class Caster:
     ----------
     vertices : (V, 3) object frame [m]
     faces : (F, 3) indices into vertices
-    threads : how many poses are cast at once (the GIL is released)
+    threads : how many batches of poses are cast at once (the GIL is released)
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, threads: int = 2):
@@ -49,7 +49,8 @@ class Caster:
         return Contact(mask, np.where(mask, depth, 0).astype(np.float32))
 
     def depths(self, sensor: Sensor, T: ArrayLike, shape: tuple[int, int] | None = None) -> NDArray[np.float32]:
-        """How far below the membrane the object lies along each camera ray: (n, h, w) [m] for poses ``T`` (n, 4, 4).
+        """How far below the membrane the object lies along each camera ray: (n, h, w) [m] for poses ``T`` (n, 4, 4) of the object
+        in the sensor's frame.
 
         Negative where the object stays above the membrane, -inf where the ray misses it.
         """

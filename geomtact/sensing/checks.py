@@ -43,7 +43,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
     seen /= max(gain, 1e-6)
     off = _off(seen, rest)
     if off < _LEAST:
-        return _drift(gain)
+        return _light_changed(gain)
     others = {
         "channels": seen[..., ::-1],
         "half": seen[::-1, ::-1],
@@ -60,7 +60,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
             f"the background seems to be of another sensor or light: half of the image is off by more than {100 * off:.0f} % of "
             "full brightness; take one with this sensor, untouched, now"
         ]
-    return _drift(gain)
+    return _light_changed(gain)
 
 
 def exposure(image: Array, name: str) -> list[str]:
@@ -90,7 +90,7 @@ def _torn(image: Array) -> list[str]:
     ]
 
 
-def _drift(gain: float) -> list[str]:
+def _light_changed(gain: float) -> list[str]:
     if abs(gain - 1) <= _DRIFT:
         return []
     way = "brighter" if gain > 1 else "darker"

@@ -1,8 +1,8 @@
 """How a gel's colour tells its slope: photometric stereo, learned from presses of a ball.
 
-The change of colour from the background is a polynomial of second degree in the slope's stead: each component of the slope is a
-linear combination of the changes of the three channels and their products, whose weights vary over the image as a polynomial of
-second degree too, because lamps are near. Where the colour has not changed the gel is flat.
+Each component of the slope is a polynomial of second degree in the changes of the three channels from the background, and its
+weights vary over the image as polynomials of second degree too, because lamps are near. Where the colour has not changed the gel
+is flat.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ class ColourTable:
     Attributes
     ----------
     weights : 2 x ``TERMS``, of the slope along x and along y
-    slope_rms : by how much slopes, which have no unit, were off under balls that the table was not fitted to
-    height_rms : by how much heights are off where nothing touches, before they are set to 0 there [m]
-    contact_depth : how deep the gel is pressed in at the border of what counts as contact [m]
+    slope_rms : by how much slopes, which have no unit, were off where the table was not fitted: under other presses of the ball,
+        or of another's table in its other half
+    height_rms : by how much heights are off where nothing touches, before they are set to 0 there [m]; 0 where no press told
+    contact_depth : how deep the gel is pressed in at the border of what counts as contact [m]; 0 where no press told
     """
 
     weights: tuple[tuple[float, ...], tuple[float, ...]]

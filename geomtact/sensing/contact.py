@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 HALF, SURE = 0.5, 0.7
 _FADING = 0.35  # slope at the border of what is pressed in, in shares of the steepest, under which it fades away there
 _BORDER = 2  # px
-_FAINT = 0.01  # share of the deepest that is no indentation
+FAINT = 0.01  # share of the deepest that is no indentation
 
 Shown = NDArray[np.bool_] | NDArray[np.float32]  # (H, W) whether each pixel is in contact, or how probably
 
@@ -25,8 +25,10 @@ class Contact:
     Attributes
     ----------
     mask : (H, W) bool, True where the object touches (the thesis's local shape)
-    height : (H, W) float32, depth of the indentation [m], 0 outside the contact; None where only the mask is known
-    share : of the deepest, from which on the gel surely lies on the object, within the mask
+    height : (H, W) float32, how deep the gel is pressed in [m], >= 0, beside an elastic contact too; None where only the mask is
+        known
+    share : of the deepest, from which on the gel surely lies on the object, within the mask: ``HALF`` where the mask is the
+        contact already, ``SURE`` where it is guessed from heights that fade away
     probability : (H, W) float32 that each pixel is in contact, more than half within the mask; None where that is not known
     """
 
@@ -47,7 +49,7 @@ class Contact:
         A rigid gel is pressed in where it is touched. An elastic one sinks beside the object too, and that fades away: then the
         contact is taken to be where it is more than half as deep as at the deepest.
         """
-        pressed = height > _FAINT * height.max()
+        pressed = height > FAINT * height.max()
         if not pressed.any():
             return cls(pressed, height)
         slope = np.hypot(*np.gradient(height))

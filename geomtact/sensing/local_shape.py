@@ -2,7 +2,8 @@
 
 The difference from the background is taken as a linear image of the gel's slope. Its two strongest colour directions
 span the slope; the 2x2 map that is left unknown is the one that makes the slope field a gradient (free of curl). Its
-integral is the gel's indentation up to a factor; the rim of the contact is where, on the way up, the gel is steepest. Or
+integral is the gel's indentation up to a factor; the rim of the contact is where, on the way up, the gel is steepest
+(``registration/rim.py`` makes of a rim what a pose is held against). Or
 the pressure that bends an elastic gel so is worked out, and the contact is where there is any. A network does without.
 """
 
@@ -75,6 +76,14 @@ def find_contact(
         pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
         check_size(image, sensor, "image")
     reference = None if background is None else same_size(as_unit_rgb(background, "background"), image)
+    return contact_of(image, reference, method, pitch)
+
+
+def contact_of(
+    image: Array, reference: Array | None, method: str | None, pitch: Array
+) -> tuple[Mask, NDArray[np.float32] | None]:
+    """As :func:`find_contact`, of images (H, W, 3) of 0..1 whose columns and rows are as far apart as ``pitch`` (2,) says, in the
+    smaller of both."""
     size = image.shape[1::-1]
     image, reference = _on_grid(image), None if reference is None else _on_grid(reference)
     # a second look smooths more where noise asks for it

@@ -36,14 +36,14 @@ class MaskNetwork(nn.Module):
         self.up = nn.ModuleList([_block(a + b, a) for a, b in reversed(pairs)])
         self.out = nn.Conv2d(WIDTHS[0], 1, 1)
 
-    def forward(self, seen_there: torch.Tensor) -> torch.Tensor:
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Log odds (n, h, w) of what is :func:`seen` (n, ``CHANNELS``, h, w)."""
-        h, w = seen_there.shape[-2:]
-        seen, x = [], F.pad(seen_there, (0, -w % _STEP, 0, -h % _STEP))
+        h, w = images.shape[-2:]
+        passed, x = [], F.pad(images, (0, -w % _STEP, 0, -h % _STEP))
         for i, block in enumerate(self.down):
             x = block(F.avg_pool2d(x, 2) if i else x)
-            seen.append(x)
-        for block, beside in zip(self.up, reversed(seen[:-1]), strict=True):
+            passed.append(x)
+        for block, beside in zip(self.up, reversed(passed[:-1]), strict=True):
             x = block(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), beside], 1))
         out: torch.Tensor = self.out(x)[:, 0, :h, :w]
         return out

@@ -43,7 +43,7 @@ def sensor_of_yaml(text: str, origin: str) -> Sensor:
         if isinstance(data, dict) and isinstance(data.get("sensor"), dict):
             return _of_tacto(data["sensor"], name)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
-        raise SensorError(f"{origin}: expected {_KINDS}; what this one holds does not do ({error})") from None
+        raise SensorError(f"{origin}: expected {_KINDS}; what this one holds is not valid ({error})") from None
     except SensorError as error:
         raise SensorError(f"{origin}: {error}") from None
     raise SensorError(f"{origin}: expected {_KINDS}; or write a TOML file, see 'geomtact sensors'")

@@ -63,8 +63,8 @@ def pixel_pitch_of_pins(image: Any, background: Any, spacing: float) -> PinBoard
     rows, places = _in_grid(peaks, half)
     if len(rows) < _FEWEST or (np.ptp(places, axis=0) < 3).any():
         raise ImageError(
-            f"image: expected a grid of pins, four or more along each way and {_FEWEST} in all, found {len(rows)} of "
-            f"{len(peaks)} spots in one; press the board in evenly, its rows along the image's"
+            f"image: expected a grid of pins, four or more along each way and {_FEWEST} in all, found {len(peaks)} "
+            f"spots, {len(rows)} of them in one grid; press the board in evenly, its rows along the image's"
         )
     pins = peaks[rows]
     board: Array = places / float(np.abs(places).max())

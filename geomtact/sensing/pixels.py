@@ -14,7 +14,7 @@ Mask = NDArray[np.bool_]
 
 
 def blurred(image: Array, sigma: float) -> Any:
-    """``image`` (H, W, C) smoothed by ``sigma`` [px], in single precision."""
+    """``image`` (H, W) or (H, W, C) smoothed by ``sigma`` [px], in single precision."""
     return cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
 
 
@@ -24,7 +24,7 @@ def transformed(image: Array, matrix: Array) -> Array:
 
 
 def size_of(change: Array) -> Array:
-    """Of a change of colour (H, W, 3), (H, W)."""
+    """How large (H, W) a change of colour (H, W, 3) is, in all channels together."""
     return np.sqrt(np.einsum("hwc,hwc->hw", change, change))
 
 
@@ -34,12 +34,12 @@ def pixels_apart(sigma: float) -> int:
 
 
 def opened(mask: Mask, n: int) -> Mask:
-    """``mask`` (H, W) without what is not 2 ``n`` pixels wide."""
+    """``mask`` (H, W) without what is less than 2 ``n`` + 1 pixels wide."""
     return _morphed(mask, cv2.MORPH_OPEN, n)
 
 
 def closed(mask: Mask, n: int) -> Mask:
-    """``mask`` (H, W) with what is not 2 ``n`` pixels wide beside it."""
+    """``mask`` (H, W) with gaps that are less than 2 ``n`` + 1 pixels wide."""
     return _morphed(mask, cv2.MORPH_CLOSE, n)
 
 

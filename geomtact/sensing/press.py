@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geomtact.errors import ImageError
 from geomtact.se3 import Array
 from geomtact.sensing.change import as_unit_rgb, colour_change
-from geomtact.sensing.local_shape import contact_mask
+from geomtact.sensing.local_shape import contact_of
 
 _ROUND = 0.05  # of the radius that half of an outline may stray from its circle
 _SEEN = 0.4  # share of the circle that has to be seen
@@ -59,7 +59,7 @@ def find_presses(
             continue
         seen.append(image)
         change, felt = colour_change(image, reference)
-        mask = contact_mask(image, reference, method="classical")
+        mask, _ = contact_of(image, reference, "classical", np.array([1.0, stretch]) / min(1.0, stretch))
         if not mask.any():
             left_out[name] = "no contact was found"
             continue

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.sensing.change import as_unit_rgb
 from geomtact.sensing.checks import faults
-from geomtact.sensing.contact import Contact
+from geomtact.sensing.contact import FAINT, Contact
 from geomtact.sensing.height import contact_height
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 from geomtact.sensing.local_shape import contact_mask, find_contact
@@ -70,6 +70,8 @@ def read_observation(
     _check_size(array, sensor, name)
     if kind == "auto":
         kind = _decide(array, name, warnings)
+    if kind != "reading":
+        array = _grey(array)
     if background is not None and kind != "reading":
         warnings.append(f"the background is not used: a {kind} needs none")
     if kind == "mask":
@@ -77,7 +79,7 @@ def read_observation(
     elif kind == "height":
         height = _height(array, name, sensor, warnings)
         contact = Contact.of_height(height)
-        if not np.array_equal(contact.mask, height > 0):
+        if not np.array_equal(contact.mask, height > FAINT * height.max()):
             warnings.append(
                 f"{name}: the heights fade away, as beside a contact; what is over half as deep counts as contact"
             )
@@ -113,9 +115,14 @@ def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any
         raise ImageError(
             f"{name}: {int((~np.isfinite(array)).sum())} values are NaN or infinite; fill them or set them to 0"
         )
-    if array.ndim == 3 and (array == array[..., :1]).all():
-        array = array[..., 0]
+    if array.dtype.kind != "f":
+        array = _grey(array)
     return name, array
+
+
+def _grey(array: NDArray[Any]) -> NDArray[Any]:
+    """(H, W) of an image whose channels are alike; any other as it is."""
+    return array[..., 0] if array.ndim == 3 and (array == array[..., :1]).all() else array
 
 
 def _check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = None) -> None:
@@ -214,7 +221,8 @@ def _height(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str])
 def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, warnings: list[str]) -> Contact:
     reference = None
     if background is None:
-        warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself")
+        untold = "" if sensor.colour is None else ", and heights are not told without one"
+        warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself{untold}")
     else:
         label, reference = _load(background, "background", warnings)
         _check_size(reference, sensor, label, "take it with the camera settings of the reading")
@@ -229,8 +237,14 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
 
 def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:
     """(H, W, 3) uint8 or float 0..1; grey is repeated."""
-    if array.dtype.kind in "ui" and array.dtype.itemsize > 1:
-        array = array / float(np.iinfo(np.uint16).max if array.dtype == np.uint16 else max(255, int(array.max())))
+    if array.dtype == np.uint16:
+        array = array / float(np.iinfo(np.uint16).max)
+    elif array.dtype.kind in "ui" and array.dtype != np.uint8:
+        if array.min() < 0 or array.max() > 255:
+            raise ImageError(
+                f"{name}: a reading of {array.dtype} must lie in 0..255, got {array.min()} to {array.max()}; give uint8 or uint16"
+            )
+        array = array.astype(np.uint8)
     elif array.dtype == bool:
         array = array.astype(float)
     if array.dtype.kind == "f" and (array.min() < 0 or array.max() > 1):

@@ -7,6 +7,7 @@ image columns, +y along rows, +z out towards the object. The camera sits at (0, 
 from __future__ import annotations
 
 import hashlib
+import json
 import tomllib
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -85,7 +86,10 @@ class Sensor:
             self.membrane_radius,
             self.height_noise,
         )
-        need(not np.isinf([*lengths, self.housing_depth or 0]).any(), "a length is infinite; give millimetres")
+        need(
+            not np.isinf([*lengths, self.housing_depth or 0]).any(),
+            "a length is infinite; a file gives millimetres, Python metres",
+        )
         need(all(n >= 8 for n in self.image_size_px), f"image_size_px must be at least 8, got {self.image_size_px}")
         pitch_mm = [round(1e3 * p, 9) for p in self.pixel_pitch]
         need(all(p > 0 for p in self.pixel_pitch), f"pixel_pitch_mm must be positive, got {pitch_mm}")
@@ -187,7 +191,7 @@ class Sensor:
             raise SensorError(f"{origin}: {error}") from None
 
     def to_toml(self) -> str:
-        """The TOML text that :meth:`from_toml` reads back to an equal sensor."""
+        """The TOML text that :meth:`from_toml` reads back to the same sensor."""
 
         def mm(metres: float) -> str:
             return repr(float(f"{metres * 1e3:.12g}"))
@@ -326,5 +330,5 @@ def _colour(data: dict[str, Any]) -> ColourTable:
 
 
 def _toml_string(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-    return f'"{escaped}"'
+    # a string of JSON is one of TOML, but that TOML wants DEL escaped too
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

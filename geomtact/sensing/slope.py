@@ -23,13 +23,17 @@ def slope_field(plane: Array, felt: Mask, sigma: float, pitch: Array) -> Array |
 
 
 def integrate(slope: Array, pitch: Array) -> Array:
-    """The height (H, W) whose gradient is nearest to ``slope``, mirrored at the border (Frankot, Chellappa 1988)."""
+    """The height (H, W) whose gradient is nearest to ``slope`` (H, W, 2), mirrored at the border (Frankot, Chellappa 1988).
+
+    ``pitch`` (2,) is that of columns and rows, of any unit, which is the height's too where the slope has none.
+    """
     return of_gradient(slope, pitch, 2)[0]
 
 
 def of_gradient(slope: Array, pitch: Array, *powers: int) -> list[Array]:
-    """For each of the ``powers``, the field (H, W) whose waves are those of ``slope`` along their direction, over their number to
-    that power less one; mirrored at the border: a sum of cosines, and its slope along an axis one of sines there."""
+    """For each of the ``powers`` p, the field (H, W) with the waves -i k . g(k) / |k|^p, where g(k) are those of ``slope``
+    (H, W, 2): the height for 2, the pressure for 1. Mirrored at the border: a sum of cosines, and its slope along an axis one of
+    sines there. ``pitch`` (2,) as of :func:`integrate`."""
     from scipy import fft
 
     h, w = slope.shape[:2]
