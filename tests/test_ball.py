@@ -21,25 +21,48 @@ def sensor(request):
 
 
 @pytest.fixture
-def on_ball(sensor):
-    """Beside the window's middle, where a near camera looks askance."""
+def middle(sensor):
+    """Of the imprint, (3,) on the membrane at rest: beside the window's middle, where a near camera looks askance."""
+    x, y = 4.2 * MM, -1.9 * MM
+    return np.array([x, y, -float(sensor.sag(x, y))])
+
+
+@pytest.fixture
+def centre(sensor, middle):
+    """Of the ball, (3,): along the membrane's normal, so that both meet in a circle of the imprint's radius, which is the same
+    whichever way one looks."""
+    above, bend = np.sqrt(BALL**2 - IMPRINT**2), sensor.membrane_radius
+    if not bend:
+        return middle + [0, 0, above]
+    inner = np.array([0, 0, -bend])
+    normal = (middle - inner) / np.linalg.norm(middle - inner)
+    return inner + normal * (np.sqrt(bend**2 - IMPRINT**2) + above)
+
+
+@pytest.fixture
+def on_ball(sensor, middle):
     none = np.zeros((*SHAPE, 3))
-    press = Press("made", none, none[..., 0] > 0, none[..., 0] > 0, np.array([122.3, 41.0]), IMPRINT / PITCH)
+    size = 1 - middle[2] / sensor.camera_distance if sensor.camera_distance else 1.0  # as it is seen at z = 0
+    at = sensor.to_pixels(sensor.project(middle))
+    press = Press("made", none, none[..., 0] > 0, none[..., 0] > 0, at, IMPRINT / PITCH * size)
     return OnBall.within(press, sensor, 0.6)
 
 
 @pytest.fixture
-def depths(sensor, on_ball):
-    """Of a mesh of the ball, (H, W) [m]: its middle over the imprint's, so deep that it would cut the membrane at the imprint."""
+def depths(sensor, centre):
+    """Of a mesh of the ball, (H, W) [m]."""
     ball = trimesh.creation.icosphere(subdivisions=6, radius=BALL)
     T = np.eye(4)
-    T[:2, 3] = on_ball.centre
-    T[2, 3] = np.sqrt(BALL**2 - on_ball.imprint**2) - sensor.sag(*on_ball.centre)
+    T[:3, 3] = centre
     return Caster(ball.vertices, ball.faces).depths(sensor, T)[0]
 
 
+def test_the_ball_lies_over_its_imprint_along_the_membranes_normal(on_ball, centre):
+    assert on_ball.centre(BALL) == pytest.approx(centre, abs=0.01 * MM)
+
+
 def test_heights_and_slopes_are_those_that_rays_find(on_ball, depths):
-    assert on_ball.height(BALL) == pytest.approx(depths[on_ball.at], abs=1e-3 * MM)
+    assert on_ball.height(BALL) == pytest.approx(depths[on_ball.at], abs=5e-3 * MM)
     slopes = np.stack(np.gradient(np.maximum(depths, -1), PITCH)[::-1], -1)
     assert on_ball.slopes(BALL) == pytest.approx(slopes[on_ball.at], abs=0.01)
 
@@ -51,7 +74,13 @@ def test_the_diameter_of_its_own_slopes_is_the_balls(on_ball):
 
 def test_a_near_camera_sees_the_deepest_point_farther_out_than_the_imprints_middle(sensor, on_ball, depths):
     v, u = np.unravel_index(depths.argmax(), SHAPE)
-    apart = sensor.from_pixels(np.array([u, v])) - on_ball.centre
     share = depths.max() / sensor.camera_distance if sensor.camera_distance else 0.0
     if not sensor.membrane_radius:
-        assert apart == pytest.approx(share * on_ball.centre, abs=0.7 * PITCH)
+        apart = sensor.from_pixels(np.array([u, v])) - on_ball.middle[:2]
+        assert apart == pytest.approx(share * on_ball.middle[:2], abs=0.7 * PITCH)
+
+
+def test_what_does_not_dip_has_no_diameter(on_ball):
+    assert np.isnan(on_ball.diameter(-on_ball.slopes(BALL))) and np.isnan(
+        on_ball.diameter(np.zeros((len(on_ball.xy), 2)))
+    )

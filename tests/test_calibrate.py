@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 from typer.testing import CliRunner
 
 import geomtact
@@ -12,7 +11,6 @@ from geomtact import ImageError, InputError, Sensor, SensorError, UsageError, co
 from geomtact.cli import app
 from geomtact.sensing.ball import diameter_of
 from geomtact.sensing.calibrate import calibrate, calibrated, measured_diameter, membrane_curvature
-from geomtact.sensing.cast import Caster
 from geomtact.sensing.colour import TERMS, ColourTable, fit_weights, terms
 from geomtact.sensing.image_file import read_image, write_image
 
@@ -25,17 +23,19 @@ PLACES += [(25, 90), (100, 100), (130, 60), (75, 30), (60, 60), (95, 75)]
 
 def pressed(diameter, centre, contact=1.6 * MM, bend=0.0):
     """Depth (H, W) [m] of a gel under a ball, and its slope (H, W, 2): the ball's shape, then an exponential rise. A membrane
-    that bulges with radius ``bend`` has been that much nearer to the ball around its middle."""
+    that bulges with radius ``bend`` has been that much nearer to the ball around its middle, which lies along its normal."""
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     off = (np.stack([u, v], -1) - centre) * PITCH
     far, ball = np.linalg.norm(off, axis=-1), diameter / 2
+    if bend:
+        middle = (np.array(centre) + 0.5 - np.array(SHAPE[::-1]) / 2) * PITCH
+        off = off - middle * ((np.sqrt(bend**2 - contact**2) + np.sqrt(ball**2 - contact**2)) / bend - 1)
     steep = contact / np.sqrt(ball**2 - contact**2)
-    sphere = np.sqrt(np.maximum(ball**2 - far**2, 0)) - np.sqrt(ball**2 - contact**2) + SUNK
+    r2 = np.minimum((off**2).sum(-1), 0.999 * ball**2)
+    sphere = np.sqrt(ball**2 - r2) - np.sqrt(ball**2 - contact**2) + SUNK
     fall = SUNK * np.exp(-(far - contact) * steep / SUNK)
     inside = far < contact
-    down = np.where(
-        inside, -1 / np.sqrt(np.maximum(ball**2 - far**2, 1e-9)), -fall * steep / SUNK / np.maximum(far, 1e-9)
-    )
+    down = np.where(inside, -1 / np.sqrt(ball**2 - r2), -fall * steep / SUNK / np.maximum(far, 1e-9))
     slope = off * down[..., None]
     if bend:
         xy = (np.stack([u, v], -1) + 0.5 - np.array(SHAPE[::-1]) / 2) * PITCH
@@ -98,25 +98,8 @@ def test_a_bulging_membrane_takes_its_own_slope_off_the_balls():
     assert np.linalg.norm(np.subtract(found.sensor.colour.weights, flat.sensor.colour.weights)) > 0.05
 
 
-@pytest.mark.parametrize("distance", [0.0, 15 * MM])
-def test_presses_tell_whether_a_near_camera_sees_them(distance):
-    """Cast, not worked out as the calibration does: of 8 mm, drawn in so far that the gel meets it 1.8 mm from its middle."""
-    seen = Sensor("made", SHAPE[::-1], (PITCH, PITCH), distance, 2 * MM)
-    ball, T = trimesh.creation.icosphere(subdivisions=5, radius=4 * MM), np.tile(np.eye(4), (len(PLACES), 1, 1))
-    T[:, :2, 3] = seen.from_pixels(np.array(PLACES))
-    T[:, 2, 3] = np.sqrt(4**2 - 1.8**2) * MM
-    depths = np.maximum(Caster(ball.vertices, ball.faces).depths(seen, T), -5 * MM).astype(float)
-    rng, gel = np.random.default_rng(3), 0.1 * MM * np.logaddexp(0, depths / (0.1 * MM))
-    made = [lit(np.stack(np.gradient(each, PITCH)[::-1], -1), rng) for each in gel]
-    said = replace(seen, camera_distance=15 * MM)
-    found = calibrated([image for image, _ in made], 8 * MM, made[0][1], sensor=said)
-    assert found.sensor.camera_distance == distance
-    assert any("parallel rays" in warning for warning in found.warnings) == (distance == 0)
-    assert np.median(found.diameters) == pytest.approx(8 * MM, rel=0.03)
-
-
 def test_two_balls_tell_how_a_membrane_bulges_and_that_a_flat_one_does_not():
-    """The curvature comes out a tenth to a third too small: imprints on a bulge are not quite round."""
+    """The curvature comes out somewhat too small: imprints on a bulge are not quite round."""
     for bend in (0.0, 35 * MM, 100 * MM):
         found = []
         for diameter, seed in ((6 * MM, 1), (10 * MM, 2)):
@@ -124,11 +107,13 @@ def test_two_balls_tell_how_a_membrane_bulges_and_that_a_flat_one_does_not():
             found += [calibrated(images, diameter, background, PITCH), diameter]
         curvature, std = membrane_curvature(*found)
         if bend:
-            assert 0.6 < curvature * bend < 1.1 and curvature > 3 * std
+            assert 0.7 < curvature * bend < 1.1 and curvature > 3 * std
         else:
             assert abs(curvature) < 2.5 and std < 1
     with pytest.raises(InputError, match="tell nothing of the membrane"):
         membrane_curvature(*found[:3], 7 * MM)
+    with pytest.raises(InputError, match="the balls contradict each other"):
+        membrane_curvature(*found[:3], 20 * MM)
 
 
 def test_presses_all_in_one_place_or_few_are_doubted():

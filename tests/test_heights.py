@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from geomtact import Localizer, Mesh, Sensor, contact_mask
 from geomtact.cli import app
 from geomtact.contact_space.touch import felt_height, felt_mask
-from geomtact.evaluation.readings import BALLS, calibrations, circles_of, localize_balls, read_scan
+from geomtact.evaluation.readings import BALLS, calibrations, cameras, circles_of, localize_balls, read_scan
 from geomtact.scoring.fitted import _deeper
 from geomtact.scoring.likelihood import height_log_likelihood
 from geomtact.se3 import transform
@@ -170,7 +170,8 @@ def test_simulated_readings_are_localized_as_they_come(tmp_path):
 def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp_path, cache_dir, few_touches):
     """Every sixth press that lies wholly in the window; the calibration saw presses of the other ball alone."""
     folder = data_folder / "gelslam_gsmini_balls"
-    sensors = calibrations(data_folder)
+    found = calibrations(data_folder, cameras()["parallel rays"])
+    sensors = {ball: each.sensor for ball, each in found.items()}
     assert all(0.01 * MM < sensor.height_noise < 0.05 * MM for sensor in sensors.values())
     observation = read_observation(
         folder / "9.500mm" / "10.png", sensors[BALLS[0]], background=folder / "background.png"

@@ -109,7 +109,9 @@ def test_whole_numbers_of_a_reading_are_0_to_255(background):
     same = [read_observation(image, MINI, background=background).contact.mask for image in (background, wide)]
     assert np.array_equal(*same)
     wide[3, 4, 1] = 1000
-    with pytest.raises(ImageError, match=r"a reading of int32 must lie in 0\.\.255, got \d+ to 1000; give uint8 or uint16"):
+    with pytest.raises(
+        ImageError, match=r"a reading of int32 must lie in 0\.\.255, got \d+ to 1000; give uint8 or uint16"
+    ):
         read_observation(wide, MINI, background=background)
 
 

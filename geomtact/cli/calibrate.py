@@ -168,7 +168,7 @@ def _print(found: Calibrated, ball_mm: float) -> None:
 
     colour, mm = found.sensor.colour, 1e3 * found.diameters
     assert colour is not None
-    low, middle, high = np.quantile(mm, [0.25, 0.5, 0.75])
+    low, middle, high = np.nanquantile(mm, [0.25, 0.5, 0.75])
     typer.echo(
         f"{len(mm)} presses of {len(mm) + len(found.left_out)}; each measured by a table fitted to the others:\n"
         f"  the ball's diameter   {middle:.2f} mm (half of the presses {low:.2f} to {high:.2f}), {ball_mm:g} was said\n"

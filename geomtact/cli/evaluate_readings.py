@@ -56,21 +56,12 @@ def judge_readings(
     if sheet is not None:
         _draw(sheet, sets, methods[default], {name: content["parts"][name]["figures"][default] for name in sets})
 
-    sensors = readings.calibrations(folder)
-    measured = readings.measure_balls(folder, sensors)
-    noise = {f"{used:.3f}": 1e3 * sensor.height_noise for used, sensor in sensors.items()}
-    study_file.keep(
-        out, content, "calibration", settings={"sensor": "gelsight-mini"}, figures=measured, outcomes=[noise]
-    )
-    rows = [
-        [f"{m['used_mm']:.3f}", f"{m['ball_mm']:.3f}", f"{m['told_mm']:.2f}", f"{100 * m['off']:+.1f} %"]
-        for m in measured
-    ]
-    typer.echo("Diameters [mm] measured by the colours, with the presses of one ball as calibration")
-    print_table(("calibrated with", "ball", "measured", "off"), rows, ("calibrated with", "ball", "measured", "off"))
-
-    if circles is not None:
-        _judge_balls(folder, circles, sensors, out, content, cache_dir)
+    for camera, base in readings.cameras().items():
+        by_ball = readings.calibrations(folder, base)
+        _measure_balls(by_ball, camera, out, content)
+        if circles is not None:
+            sensors = {ball: each.sensor for ball, each in by_ball.items()}
+            _judge_balls(folder, circles, sensors, camera, out, content, cache_dir)
     with progress_bar("localizing a groove"):
         density, modes = readings.localize_groove(folder, cache_dir)
     figures = {"log_density_at_truth": density, "modes": [asdict(m) for m in modes]}
@@ -80,20 +71,37 @@ def judge_readings(
     print_table(headings, [_mode(m) for m in modes], headings)
 
 
-def _judge_balls(folder: Path, circles: Path, sensors: Any, out: Path | None, content: dict, cache_dir: Any) -> None:
+def _measure_balls(found: Any, camera: str, out: Path | None, content: dict[str, Any]) -> None:
+    """Diameters by the calibrations ``found``, by their ball, of a sensor with a ``camera``."""
+    from geomtact.evaluation import readings
+
+    measured = readings.measure_balls(found)
+    noise = {f"{used:.3f}": 1e3 * each.sensor.height_noise for used, each in found.items()}
+    settings = {"sensor": "gelsight-mini", "camera": camera}
+    study_file.keep(out, content, f"calibration, {camera}", settings=settings, figures=measured, outcomes=[noise])
+    rows = [
+        [f"{m['used_mm']:.3f}", f"{m['ball_mm']:.3f}", f"{m['told_mm']:.2f}", f"{100 * m['off']:+.1f} %"]
+        for m in measured
+    ]
+    typer.echo(f"Diameters [mm] measured by the colours, with the presses of one ball as calibration; {camera}")
+    print_table(("calibrated with", "ball", "measured", "off"), rows, ("calibrated with", "ball", "measured", "off"))
+
+
+def _judge_balls(
+    folder: Path, circles: Path, sensors: Any, camera: str, out: Path | None, content: dict, cache_dir: Any
+) -> None:
     import hashlib
 
     from geomtact.evaluation import readings
 
-    settings = {"sensor": "gelsight-mini", "circles_sha256": hashlib.sha256(circles.read_bytes()).hexdigest()}
-    done = study_file.earlier(content["parts"].get("balls"), settings, readings.Pressed)
+    digest, part = hashlib.sha256(circles.read_bytes()).hexdigest(), f"balls, {camera}"
+    settings = {"sensor": "gelsight-mini", "camera": camera, "circles_sha256": digest}
+    done = study_file.earlier(content["parts"].get(part), settings, readings.Pressed)
     total = len(readings.circles_of(circles))
 
     def keep(outcomes: list) -> None:
         figures = readings.summarise_balls(outcomes)
-        study_file.keep(
-            out, content, "balls", settings=settings, figures=figures, outcomes=[asdict(o) for o in outcomes]
-        )
+        study_file.keep(out, content, part, settings=settings, figures=figures, outcomes=[asdict(o) for o in outcomes])
 
     if len(done) < total:
         more = readings.localize_balls(folder, circles, sensors, cache_dir, first=len(done))
@@ -110,10 +118,12 @@ def _judge_balls(folder: Path, circles: Path, sensors: Any, out: Path | None, co
             f"{100 * f['within_0.3_mm']:.0f} %",
             f"{f['off_mm_largest']:.2f}",
         ]
-        for f in content["parts"]["balls"]["figures"]
+        for f in content["parts"][part]["figures"]
     ]
     headings = ("ball", "n", "right ball", "nats", "whole", "off [mm]", "within 0.3", "largest")
-    typer.echo("Balls localized by heights, calibrated with the other ball; off: where the whole contact is seen")
+    typer.echo(
+        f"Balls localized by heights, calibrated with the other ball; off: where the whole contact is seen; {camera}"
+    )
     print_table(headings, rows, headings)
 
 

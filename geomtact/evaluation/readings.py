@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from geomtact.evaluation.study import mean_with_interval
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
 from geomtact.se3 import inverse
-from geomtact.sensing.calibrate import calibrated, measured_diameter
+from geomtact.sensing.calibrate import Calibrated, calibrated, measured_diameter
 from geomtact.sensing.image_file import read_image
 from geomtact.sensing.local_shape import contact_mask
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
@@ -210,18 +210,35 @@ def summarise_contacts(found: Sequence[Found]) -> dict[str, Any]:
     }
 
 
-def calibrations(folder: Path) -> dict[float, Sensor]:
-    """The GelSight Mini calibrated with the presses of each ball [mm]."""
-    return {ball: _calibrated(folder, ball).sensor for ball in BALLS}
+def cameras() -> dict[str, Sensor]:
+    """The GelSight Mini as the makers of the presses publish it, with a pitch and no more, and as its file has it: the camera's
+    distance there is nominal."""
+    stated = Sensor.load("gelsight-mini")
+    return {
+        "parallel rays": replace(stated, camera_distance=0.0),
+        f"camera at {stated.camera_distance / MM:g} mm": stated,
+    }
 
 
-def measure_balls(folder: Path, sensors: Mapping[float, Sensor]) -> list[dict[str, float]]:
+def calibrations(folder: Path, sensor: Sensor) -> dict[float, Calibrated]:
+    """``sensor`` calibrated with the presses of each ball [mm]."""
+    presses = _presses(folder)
+    return {
+        ball: calibrated(
+            sorted((presses / f"{ball:.3f}mm").glob("*.png")), ball * MM, presses / "background.png", sensor=sensor
+        )
+        for ball in BALLS
+    }
+
+
+def measure_balls(found: Mapping[float, Calibrated]) -> list[dict[str, float]]:
     """Each ball's diameter [mm] by its own calibration and by the other's: median, and share by which it is off."""
     out = []
+    sensors = {ball: each.sensor for ball, each in found.items()}
     for ball in BALLS:
-        presses = _calibrated(folder, ball).presses
+        presses = found[ball].presses
         for used, sensor in sensors.items():
-            told = float(np.median([measured_diameter(press, sensor) for press in presses])) / MM
+            told = float(np.nanmedian([measured_diameter(press, sensor) for press in presses])) / MM
             out.append({"used_mm": used, "ball_mm": ball, "told_mm": told, "off": told / ball - 1})
     return out
 
@@ -365,11 +382,6 @@ def _plate(height: Any, pitch: tuple[float, float]) -> Mesh:
 
 def _presses(folder: Path) -> Path:
     return folder / "gelslam_gsmini_balls"
-
-
-def _calibrated(folder: Path, ball: float) -> Any:
-    images = sorted((_presses(folder) / f"{ball:.3f}mm").glob("*.png"))
-    return calibrated(images, ball * MM, _presses(folder) / "background.png", sensor="gelsight-mini")
 
 
 def _ball(diameter_mm: float) -> Mesh:

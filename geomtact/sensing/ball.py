@@ -28,15 +28,15 @@ class OnBall:
     at : rows and columns (n,) each
     features : (n, ``TERMS``) of their changes of colour
     xy : (n, 2) of each pixel at z = 0 [m]
-    centre : (2,) of the ball [m]
-    imprint : radius of the imprint, where the ball meets the membrane at rest [m]
+    middle : (3,) of the imprint, on the membrane at rest [m]
+    imprint : its radius, where the ball meets the membrane at rest [m]
     sensor : that sees them
     """
 
     at: tuple[NDArray[np.int64], NDArray[np.int64]]
     features: Array
     xy: Array
-    centre: Array
+    middle: Array
     imprint: float
     sensor: Sensor
 
@@ -50,10 +50,19 @@ class OnBall:
             (v, u),
             terms(press.change[v, u], u, v, press.mask.shape),
             sensor.from_pixels(np.stack([u, v], 1)),
-            middle[:2],
+            middle,
             press.radius * sensor.pixel_pitch[0] * (1 + middle[2] * _nearness(sensor)),
             sensor,
         )
+
+    def centre(self, radius: float) -> Array:
+        """Centre (3,) [m] of a ball of ``radius`` [m]: over the imprint's middle, along the membrane's normal there."""
+        rim, bend = min(self.imprint, 0.99 * radius), self.sensor.membrane_radius
+        above = float(np.sqrt(radius**2 - rim**2))
+        if not bend:
+            return np.array([*self.middle[:2], above])
+        inner = np.array([0.0, 0.0, -bend])  # centre of the membrane's sphere
+        return np.asarray(inner + (self.middle - inner) / bend * (np.sqrt(bend**2 - rim**2) + above))
 
     def height(self, radius: float) -> Array:
         """Depth (n,) [m] below the membrane at rest under a ball of ``radius`` [m] that meets it at the imprint."""
@@ -63,18 +72,18 @@ class OnBall:
     def slopes(self, radius: float) -> Array:
         """Slope (n, 2) of that depth along x and y, from pixel to pixel: metres of depth per metre at z = 0."""
         seen, below = self._seen(radius)
-        off = seen - self.centre
+        off = seen - self.centre(radius)[:2]
         ball = -off / np.sqrt(radius**2 - (off**2).sum(-1, keepdims=True))
         return self._as_seen(below, ball, ball - self._rest(seen))
 
     def diameter(self, slopes: Array) -> float:
-        """Diameter [m] of the ball that the membrane slopes so (n, 2) under, from pixel to pixel."""
+        """Diameter [m] of the ball that the membrane slopes so (n, 2) under, from pixel to pixel; NaN where it does not dip."""
         seen, below = self.xy, np.zeros(len(self.xy))
         out = self._diameter(slopes, seen, below)
         if not self.sensor.camera_distance:
             return out
         for _ in range(_STEPS):  # how deep a pixel looks is told by the ball that it looks at
-            if not 0.5 * out > 1.01 * np.linalg.norm(self.xy - self.centre, axis=1).max():
+            if not 0.5 * out > 1.01 * np.linalg.norm(self.xy - self.middle[:2], axis=1).max():
                 break
             out = self._diameter(slopes, *self._seen(0.5 * out))
         return out
@@ -90,12 +99,11 @@ class OnBall:
 
     def _seen(self, radius: float) -> tuple[Array, Array]:
         """Where (n, 2) each pixel's ray meets the ball, and how far below z = 0 (n,) [m]."""
-        rim = min(self.imprint, 0.99 * radius)
-        above = np.sqrt(radius**2 - rim**2) - float(self.sensor.sag(*self.centre))
+        *centre, above = self.centre(radius)
         below = np.zeros(len(self.xy))
         for _ in range(_STEPS if self.sensor.camera_distance else 1):
             seen = self.xy * (1 - _nearness(self.sensor) * below[:, None])
-            off2 = np.minimum(((seen - self.centre) ** 2).sum(1), (0.99 * radius) ** 2)
+            off2 = np.minimum(((seen - centre) ** 2).sum(1), (0.99 * radius) ** 2)
             below = np.sqrt(radius**2 - off2) - above
         return seen, below
 
@@ -121,10 +129,11 @@ def from_middle(press: Press, sensor: Sensor) -> Array:
 
 
 def diameter_of(xy: Array, slope: Array) -> float:
-    """Diameter [m] of the sphere that has depths of such ``slope`` (n, 2) at ``xy`` (n, 2) [m]."""
+    """Diameter [m] of the sphere that has depths of such ``slope`` (n, 2) at ``xy`` (n, 2) [m]; NaN where they do not dip."""
     sine = slope / np.sqrt(1 + (slope**2).sum(1))[:, None]  # -(xy - centre) / radius
     xy, sine = xy - xy.mean(0), sine - sine.mean(0)
-    return float(-2 * (xy**2).sum() / (xy * sine).sum())
+    dips = -float((xy * sine).sum())
+    return float(2 * (xy**2).sum() / dips) if dips > 0 else float("nan")
 
 
 def _nearness(sensor: Sensor) -> float:

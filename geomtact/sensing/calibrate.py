@@ -1,8 +1,8 @@
 """A sensor of one's own: from presses of one ball to what its colours tell of the gel's slope (photometric stereo).
 
-Under the ball the gel has the ball's shape, so the slope is known all over the contact once its centre is: that of the circle
-which the contact's outline is. The outline is that of the imprint, which is wider than the contact: only the inner part is used,
-and no depth need be known. The pixel pitch must be known: a ball of another size, seen by another pitch, looks the same.
+Under the ball the gel has the ball's shape (``ball``), so the slope is known all over the contact once its centre is: that of the
+circle which the contact's outline is (``press``). The outline is that of the imprint, which is wider than the contact: only the
+inner part is used, and no depth need be known, but for a near camera. The pixel pitch must be known: a ball of another size, seen by another pitch, looks the same.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ _SPAN = 0.5  # of the window along each side, over which presses should be sprea
 _UNLIKE = 1.3  # times as large has one of two balls to be
 _BEND = 5.0  # half diagonals of the window: radius of a membrane that is tried
 _STEPS = 3  # towards the one that is found
+_LEAST_BEND = 1.1  # half diagonals that the membrane's radius has at least
 _RESAMPLED = 400
 _AGREES = 0.1  # by which presses may measure the ball wrongly, in the median
 
@@ -74,8 +75,7 @@ def calibrate(
     ball_diameter : metres
     background : the same sensor without contact
     pixel_pitch : of the images [m], or along x and along y; that of ``sensor`` by default
-    sensor : whose geometry to keep, by name, file or itself, but for its camera's distance where the presses speak for parallel
-        rays; by default an orthographic, flat one of the images' size
+    sensor : whose geometry to keep, by name, file or itself; by default an orthographic, flat one of the images' size
     name : of the new sensor
 
     Raises
@@ -126,19 +126,8 @@ def calibrated(
         )
     base = known or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
     check_size(reference, base, "background")
-    fitted = _fitted(found, replace(base, name=name or base.name, pixel_pitch=pitch), radius)
-    warnings = []
-    if base.camera_distance:
-        straight = _fitted(found, replace(fitted[0], camera_distance=0.0), radius)
-        near, parallel = fitted[0].height_noise, straight[0].height_noise
-        if parallel < near:
-            fitted = straight
-            warnings.append(
-                f"the presses speak for parallel rays: under the ball heights are {1e3 * parallel:.3f} mm off by these, "
-                f"{1e3 * near:.3f} mm with a camera {1e3 * base.camera_distance:g} mm away; the result has camera_distance_mm = 0"
-            )
-    sensor, diameters = fitted
-    return Calibrated(sensor, found, left_out, diameters, warnings + _doubts(found, diameters, ball_diameter))
+    sensor, diameters = _fitted(found, replace(base, name=name or base.name, pixel_pitch=pitch), radius)
+    return Calibrated(sensor, found, left_out, diameters, _doubts(found, diameters, ball_diameter))
 
 
 def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor, Array]:
@@ -162,7 +151,7 @@ def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) ->
             f"the presses lie within {100 * spans[0]:.0f} % of the window's width and {100 * spans[1]:.0f} % of its height: "
             "elsewhere heights may be far off; press the ball in all over"
         )
-    off = float(np.median(diameters)) / ball_diameter - 1
+    off = float(np.nanmedian(diameters)) / ball_diameter - 1
     if abs(off) > _AGREES:
         out.append(
             f"colours fitted to all presses but one measure the ball {100 * abs(off):.0f} % too "
@@ -231,7 +220,7 @@ def membrane_curvature(
     Raises
     ------
     InputError
-        The balls are of nearly one size, which tells nothing.
+        The balls are of nearly one size, which tells nothing; or tell a bulge that no window of this size has.
     """
     if max(first_ball, second_ball) < _UNLIKE * min(first_ball, second_ball):
         raise InputError(
@@ -240,17 +229,24 @@ def membrane_curvature(
         )
     balls = ((first.presses, 0.5 * first_ball), (second.presses, 0.5 * second_ball))
     flat = _told_by_the_other(balls, replace(first.sensor, membrane_radius=0.0))
-    bend = gained = _BEND * float(np.hypot(*first.sensor.half_window))
+    half_diagonal = float(np.hypot(*first.sensor.half_window))
+    bend = gained = _BEND * half_diagonal
 
     def curvature(rows: Sequence[NDArray[np.int64]]) -> float:
-        return float(np.median(flat[0][rows[0]]) - np.median(flat[1][rows[1]])) / gained
+        return float(np.nanmedian(flat[0][rows[0]]) - np.nanmedian(flat[1][rows[1]])) / gained
 
     every = [np.arange(len(each)) for each in flat]
     for _ in range(_STEPS):
         bent = _told_by_the_other(balls, replace(first.sensor, membrane_radius=bend))
         a, b = (there - here for here, there in zip(flat, bent, strict=True))
-        gained = float(np.median(b) - np.median(a)) * bend  # by what is told of the larger ball, for a curvature of one
+        # by what is told of the larger ball, for a curvature of one
+        gained = float(np.nanmedian(b) - np.nanmedian(a)) * bend
         bend = 1 / max(curvature(every), 1 / bend / _STEPS)
+        if not bend > _LEAST_BEND * half_diagonal:
+            raise InputError(
+                f"the balls contradict each other: they would have the membrane bulge by 1/{1e3 * bend:.1f} mm, more than a "
+                "window of this size can; check both diameters and the pixel pitch"
+            )
     rng = np.random.default_rng(0)
     drawn = [curvature([rng.integers(len(each), size=len(each)) for each in flat]) for _ in range(_RESAMPLED)]
     return curvature(every), float(np.std(drawn))

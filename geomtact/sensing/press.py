@@ -95,7 +95,7 @@ def _circle(mask: NDArray[np.bool_], stretch: float) -> tuple[Array, float] | st
         return "its outline is no circle"
     if len(np.unique(np.arctan2(*(points - solved[:2]).T) // (np.pi / 18))) < _SEEN * 36:
         return "less than two fifths of its circle are seen"
-    return np.array([solved[0], solved[1] / stretch]), radius
+    return np.array([solved[0], solved[1] / stretch]), radius + 0.5  # a contour runs through the middles of its pixels
 
 
 def named_image(source: Any, role: str) -> tuple[str, Array]:
