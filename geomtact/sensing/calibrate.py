@@ -2,7 +2,8 @@
 
 Under the ball the gel has the ball's shape (``ball``), so the slope is known all over the contact once its centre is: that of the
 circle which the contact's outline is (``press``). The outline is that of the imprint, which is wider than the contact: only the
-inner part is used, and no depth need be known, but for a near camera. The pixel pitch must be known: a ball of another size, seen by another pitch, looks the same.
+inner part is used, and no depth need be known, but for a near camera. The pixel pitch must be known: a ball of another size, seen
+by another pitch, looks the same.
 """
 
 from __future__ import annotations
