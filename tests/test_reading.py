@@ -98,6 +98,17 @@ def test_a_faint_pixel_beside_a_rigid_contact_is_no_fading():
     assert read_observation(height, MINI).warnings == []
 
 
+def test_noise_all_over_a_soft_gel_is_no_contact(rng):
+    """A ball under which the gel is half as deep at the contact's border, and 0.1 mm of noise wherever it is pressed in."""
+    rows, columns = np.mgrid[:240, :320]
+    far = np.hypot(columns - 200, rows - 90) / 40
+    ball = np.where(far < 1, 1 - far**2 / 2, np.exp(-(far - 1)) / 2) * 1e-3
+    noise = cv2.GaussianBlur(rng.normal(size=ball.shape), (0, 0), 8)
+    height = np.maximum(ball + 1e-4 * noise / noise.std(), 0).astype(np.float32)
+    found = read_observation(height, MINI).contact.mask
+    assert (found & disk(200, 90, 40)).sum() > 0.7 * (found | disk(200, 90, 40)).sum()
+
+
 def test_a_colourless_float_image_of_three_channels_is_a_reading(background):
     grey = np.repeat(background[..., :1] / 255, 3, -1)
     seen = read_observation(grey, MINI)

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 HALF, SURE = 0.5, 0.7
 _FADING = 0.35  # slope at the border of what is pressed in, in shares of the steepest, under which it fades away there
 _BORDER = 2  # px
+# Share of the deepest that the median of what is pressed in falls short of where most of that is the gel beside the contact, or
+# noise: it is 0.29 under a cone, 0.5 under a ball
+_SHALLOW = 0.22
 FAINT = 0.01  # share of the deepest that is no indentation
 
 Shown = NDArray[np.bool_] | NDArray[np.float32]  # (H, W) whether each pixel is in contact, or how probably
@@ -57,6 +60,7 @@ class Contact:
         border = slope[pressed & (within == 0)]
         if border.size:
             fades = np.median(border) < _FADING * np.quantile(slope[pressed], 0.95)
+            fades |= np.median(height[pressed]) < _SHALLOW * height.max()
         else:  # all of the gel is pressed in: by what fills the window, or less and less towards its border
             fades = np.median(np.r_[height[0], height[-1], height[:, 0], height[:, -1]]) < HALF * height.max()
         return cls(height > HALF * height.max(), height, SURE) if fades else cls(pressed, height)
