@@ -156,7 +156,8 @@ def _draw(axes: Any, points: Mapping[str, tuple[float, float]], looks: Mapping[s
         axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis) if best < 0 else (axes.xaxis,):
         low, high = axis.get_view_interval()
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high > 5 * low else MaxNLocator(5))
+        ticks = (1,) if high > 1000 * low else (1, 3) if high > 100 * low else (1, 2, 5)
+        axis.set_major_locator(LogLocator(subs=ticks) if high > 5 * low else MaxNLocator(5))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
     axes.spines[["top", "right"]].set_visible(False)
