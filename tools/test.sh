@@ -4,4 +4,6 @@ set -eu
 cd "$(dirname "$0")/.."
 . tools/setup.sh
 set_up dev
-exec .venv/bin/python -m pytest -n 2 "$@"
+# two workers, each on one core: threads of both would only wait for each other
+export OMP_NUM_THREADS=1
+exec .venv/bin/python -m pytest -n 2 --dist worksteal "$@"
