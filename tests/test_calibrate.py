@@ -10,9 +10,10 @@ import geomtact
 from geomtact import ImageError, InputError, Sensor, SensorError, UsageError, contact_height
 from geomtact.cli import app
 from geomtact.sensing.ball import diameter_of
-from geomtact.sensing.calibrate import calibrate, calibrated, measured_diameter, membrane_curvature
+from geomtact.sensing.calibrate import calibrate, calibrated, measured_diameter
 from geomtact.sensing.colour import TERMS, ColourTable, fit_weights, terms
 from geomtact.sensing.image_file import read_image, write_image
+from geomtact.sensing.membrane import membrane_curvature
 
 MM = 1e-3
 SHAPE, PITCH = (120, 160), 0.1 * MM

@@ -132,7 +132,8 @@ def _of_taxim(
 
 def _print_membrane(found: Calibrated, ball_mm: float, folder: Path, other_mm: float, background: Path) -> None:
     """Print how the membrane bulges, by presses of another ball."""
-    from geomtact.sensing.calibrate import calibrated, membrane_curvature
+    from geomtact.sensing.calibrate import calibrated
+    from geomtact.sensing.membrane import membrane_curvature
 
     if not folder.is_dir():
         raise UsageError(f"--other-presses {folder}: no such folder; give the one that holds presses of the other ball")

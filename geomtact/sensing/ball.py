@@ -73,7 +73,7 @@ class OnBall:
         """Slope (n, 2) of that depth along x and y, from pixel to pixel: metres of depth per metre at z = 0."""
         seen, below = self._seen(radius)
         off = seen - self.centre(radius)[:2]
-        ball = -off / np.sqrt(radius**2 - (off**2).sum(-1, keepdims=True))
+        ball = -off / np.sqrt(radius**2 - np.minimum((off**2).sum(-1, keepdims=True), (0.99 * radius) ** 2))
         return self._as_seen(below, ball, ball - self._rest(seen))
 
     def diameter(self, slopes: Array) -> float:

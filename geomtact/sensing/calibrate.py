@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from geomtact.errors import InputError, UsageError
@@ -32,11 +31,6 @@ _MEASURED = 0.5  # share of it within which the ball is measured
 _OUTER = 2.2  # times the imprint's radius, beyond which the gel is flat
 _PIXELS, _FLAT_PIXELS = 3000, 1000  # of a press that are used, at most
 _SPAN = 0.5  # of the window along each side, over which presses should be spread
-_UNLIKE = 1.3  # times as large has one of two balls to be
-_BEND = 5.0  # half diagonals of the window: radius of a membrane that is tried
-_STEPS = 3  # towards the one that is found
-_LEAST_BEND = 1.1  # half diagonals that the membrane's radius has at least
-_RESAMPLED = 400
 _AGREES = 0.1  # by which presses may measure the ball wrongly, in the median
 
 
@@ -133,9 +127,9 @@ def calibrated(
 
 def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor, Array]:
     """``sensor`` with the colours of a ball of ``radius`` [m], and its diameter (n,) [m] on each press by the others."""
-    samples = [_samples(press, sensor, radius) for press in presses]
+    samples = [samples_on(press, sensor, radius) for press in presses]
     diameters, slope_rms, height_noise = _left_one_out(presses, samples, sensor, radius)
-    x, y = (tuple(map(float, row)) for row in _weights(samples))
+    x, y = (tuple(map(float, row)) for row in weights_of(samples))
     colour = ColourTable((x, y), slope_rms, 0.0, 0.0)
     noise, depth = _at_rest(presses, colour, sensor.pixel_pitch)
     colour = replace(colour, height_rms=noise, contact_depth=depth)
@@ -169,7 +163,7 @@ def _pair(pitch: float | tuple[float, float]) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def _samples(press: Press, sensor: Sensor, radius: float) -> tuple[Array, Array]:
+def samples_on(press: Press, sensor: Sensor, radius: float) -> tuple[Array, Array]:
     """Terms (n, ``TERMS``) and slopes (n, 2) of pixels on a ball of ``radius`` [m], and of pixels far from it: at rest."""
     on = OnBall.within(press, sensor, INNER)
     some = np.random.default_rng(0).permutation(len(on.xy))[:_PIXELS]
@@ -181,7 +175,8 @@ def _samples(press: Press, sensor: Sensor, radius: float) -> tuple[Array, Array]
     return np.concatenate([on.features[some], flat]), slopes
 
 
-def _weights(samples: Sequence[tuple[Array, Array]]) -> Array:
+def weights_of(samples: Sequence[tuple[Array, Array]]) -> Array:
+    """Weights (2, ``TERMS``) fitted to terms and slopes of several presses."""
     return fit_weights(np.concatenate([f for f, _ in samples]), np.concatenate([s for _, s in samples]))
 
 
@@ -192,7 +187,7 @@ def _left_one_out(
     of the presses' rms, their offset aside) are on a ball of ``radius`` [m]."""
     diameters, squares, beside = np.zeros(len(presses)), [], []
     for i, press in enumerate(presses):
-        weights = _weights([s for k, s in enumerate(samples) if k != i])
+        weights = weights_of([s for k, s in enumerate(samples) if k != i])
         x, y = (tuple(map(float, row)) for row in weights)
         on = OnBall.within(press, sensor, INNER)
         told = relief(press.change, press.felt, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)
@@ -200,66 +195,8 @@ def _left_one_out(
         features, true = samples[i]
         sloping = true.any(1)
         squares.append(((features[sloping] @ weights.T - true[sloping]) ** 2).mean())
-        diameters[i] = _diameter(press, sensor, weights)
+        diameters[i] = told_diameter(press, sensor, weights)
     return diameters, float(np.sqrt(np.mean(squares))), float(np.median(beside))
-
-
-def membrane_curvature(
-    first: Calibrated, first_ball: float, second: Calibrated, second_ball: float
-) -> tuple[float, float]:
-    """How a membrane bulges, from presses of two balls of different size: its curvature [1/m], and the standard deviation.
-
-    Taken for flat, a membrane that bulges takes so much off the curvature of every ball, which one ball alone leaves unnoticed:
-    its colours are fitted to what they are said to show. Of two balls each is then measured wrongly by the other's colours, the
-    larger one as too large. The curvature sought is that with which neither is.
-
-    Parameters
-    ----------
-    first, second : presses of either ball by one sensor, calibrated each by its own
-    first_ball, second_ball : their diameters [m]
-
-    Raises
-    ------
-    InputError
-        The balls are of nearly one size, which tells nothing; or tell a bulge that no window of this size has.
-    """
-    if max(first_ball, second_ball) < _UNLIKE * min(first_ball, second_ball):
-        raise InputError(
-            f"balls of {1e3 * first_ball:g} and {1e3 * second_ball:g} mm tell nothing of the membrane: one should be "
-            f"{_UNLIKE:g} times as large as the other, or larger"
-        )
-    balls = ((first.presses, 0.5 * first_ball), (second.presses, 0.5 * second_ball))
-    flat = _told_by_the_other(balls, replace(first.sensor, membrane_radius=0.0))
-    half_diagonal = float(np.hypot(*first.sensor.half_window))
-    bend = gained = _BEND * half_diagonal
-
-    def curvature(rows: Sequence[NDArray[np.int64]]) -> float:
-        return float(np.nanmedian(flat[0][rows[0]]) - np.nanmedian(flat[1][rows[1]])) / gained
-
-    every = [np.arange(len(each)) for each in flat]
-    for _ in range(_STEPS):
-        bent = _told_by_the_other(balls, replace(first.sensor, membrane_radius=bend))
-        a, b = (there - here for here, there in zip(flat, bent, strict=True))
-        # by what is told of the larger ball, for a curvature of one
-        gained = float(np.nanmedian(b) - np.nanmedian(a)) * bend
-        bend = 1 / max(curvature(every), 1 / bend / _STEPS)
-        if not bend > _LEAST_BEND * half_diagonal:
-            raise InputError(
-                f"the balls contradict each other: they would have the membrane bulge by 1/{1e3 * bend:.1f} mm, more than a "
-                "window of this size can; check both diameters and the pixel pitch"
-            )
-    rng = np.random.default_rng(0)
-    drawn = [curvature([rng.integers(len(each), size=len(each)) for each in flat]) for _ in range(_RESAMPLED)]
-    return curvature(every), float(np.std(drawn))
-
-
-def _told_by_the_other(balls: Sequence[tuple[Sequence[Press], float]], sensor: Sensor) -> list[Array]:
-    """For either ball the log of its diameter on each press, as the colours tell that the other's presses give, over its own."""
-    weights = [_weights([_samples(press, sensor, ball) for press in presses]) for presses, ball in balls]
-    return [
-        np.log([_diameter(press, sensor, other) / (2 * ball) for press in presses])
-        for (presses, ball), other in zip(balls, reversed(weights), strict=True)
-    ]
 
 
 def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Array, Array]:
@@ -272,10 +209,11 @@ def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Arr
 def measured_diameter(press: Press, sensor: Sensor) -> float:
     """Diameter [m] of the ball of a press, as the colours of a calibrated sensor tell it."""
     assert sensor.colour is not None
-    return _diameter(press, sensor, np.asarray(sensor.colour.weights))
+    return told_diameter(press, sensor, np.asarray(sensor.colour.weights))
 
 
-def _diameter(press: Press, sensor: Sensor, weights: Array) -> float:
+def told_diameter(press: Press, sensor: Sensor, weights: Array) -> float:
+    """Diameter [m] of the ball of a press, as ``weights`` (2, ``TERMS``) of colours tell it."""
     on = OnBall.within(press, sensor, _MEASURED)
     return on.diameter(on.features @ weights.T)
 
