@@ -115,6 +115,13 @@ def test_two_balls_tell_how_a_membrane_bulges_and_that_a_flat_one_does_not():
         membrane_curvature(*found[:3], 7 * MM)
     with pytest.raises(InputError, match="the balls contradict each other"):
         membrane_curvature(*found[:3], 20 * MM)
+    swapped = [
+        one
+        for diameter, said in ((6 * MM, 10 * MM), (10 * MM, 6 * MM))
+        for one in (calibrated(*presses(diameter)[:1], said, presses(diameter)[1], PITCH), said)
+    ]
+    with pytest.raises(InputError, match="be hollow.*not exchanged"):
+        membrane_curvature(*swapped)
 
 
 def test_presses_all_in_one_place_or_few_are_doubted():

@@ -115,6 +115,11 @@ def test_a_colourless_float_image_of_three_channels_is_a_reading(background):
     assert seen.kind == "reading" and not seen.contact.mask.any()
 
 
+def test_a_grey_image_does_not_go_with_a_background_in_colour(background):
+    with pytest.raises(ImageError, match="one of image and background has colours, the other is grey"):
+        read_observation(background[..., 0], MINI, "reading", background)
+
+
 def test_whole_numbers_of_a_reading_are_0_to_255(background):
     wide = background.astype(np.int32)
     same = [read_observation(image, MINI, background=background).contact.mask for image in (background, wide)]

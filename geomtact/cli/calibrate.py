@@ -100,7 +100,8 @@ def _write(calibrated: Sensor, geometry: str | None, out: Path) -> None:
     typer.echo(f"wrote {out}: geomtact.contact_height(image, background, {str(out)!r}) tells heights")
     if geometry is None:
         typer.echo(
-            "its geometry is a camera with parallel rays before a flat gel, 2 mm deep: write in what you know of it"
+            "its geometry is a camera with parallel rays before a flat gel, 2 mm deep; if you know better, "
+            "write a sensor file and calibrate again with --sensor"
         )
 
 
@@ -172,7 +173,8 @@ def _print(found: Calibrated, ball_mm: float) -> None:
     low, middle, high = np.nanquantile(mm, [0.25, 0.5, 0.75])
     typer.echo(
         f"{len(mm)} presses of {len(mm) + len(found.left_out)}; each measured by a table fitted to the others:\n"
-        f"  the ball's diameter   {middle:.2f} mm (half of the presses {low:.2f} to {high:.2f}), {ball_mm:g} was said\n"
+        f"  the ball's diameter   {middle:.2f} mm (half of the presses {low:.2f} to {high:.2f}), {ball_mm:g} was said:\n"
+        "                        how well the presses agree, which is no check of what was said\n"
         f"  slopes                off by {colour.slope_rms:.3f} rms (1 is 45 degrees)\n"
         f"  heights               off by {1e3 * colour.height_rms:.3f} mm rms where nothing touches\n"
         f"  contact               shows where the gel is pressed in by {1e3 * colour.contact_depth:.2f} mm"

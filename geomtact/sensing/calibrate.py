@@ -31,7 +31,7 @@ _MEASURED = 0.5  # share of it within which the ball is measured
 _OUTER = 2.2  # times the imprint's radius, beyond which the gel is flat
 _PIXELS, _FLAT_PIXELS = 3000, 1000  # of a press that are used, at most
 _SPAN = 0.5  # of the window along each side, over which presses should be spread
-_AGREES = 0.1  # by which presses may measure the ball wrongly, in the median
+_AGREES, _HOPELESS = 0.1, 2.0  # by which presses may measure the ball wrongly, in the median: unnoticed, and at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def calibrate(
     UsageError
         Neither a pitch nor a sensor was given: presses of unknown depth do not tell the pitch. The largest possible is named.
     InputError
-        Fewer than three images show the whole round imprint of a ball that may be so large.
+        Fewer than three images show the whole round imprint of a ball that may be so large; or what they show is contradictory.
     """
     return calibrated(presses, ball_diameter, background, pixel_pitch, sensor, name).sensor
 
@@ -122,6 +122,12 @@ def calibrated(
     base = known or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
     check_size(reference, base, "background")
     sensor, diameters = _fitted(found, replace(base, name=name or base.name, pixel_pitch=pitch), radius)
+    off = abs(float(np.nanmedian(diameters)) / ball_diameter - 1) if np.isfinite(diameters).any() else np.inf
+    if not off < _HOPELESS:
+        raise InputError(
+            f"calibrate: {len(found)} presses contradict each other: colours fitted to all but one measure the ball "
+            f"{100 * off:.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
+        )
     return Calibrated(sensor, found, left_out, diameters, _doubts(found, diameters, ball_diameter))
 
 

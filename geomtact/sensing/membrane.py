@@ -17,6 +17,7 @@ from geomtact.sensing.sensor import Sensor
 _UNLIKE = 1.3  # times as large has one of two balls to be
 _BEND = 5.0  # half diagonals of the window: radius of a membrane that is tried
 _STEPS = 3  # towards the one that is found
+_HOLLOW = 4.0  # standard deviations by which a curvature is negative beyond doubt
 _LEAST_BEND = 1.1  # half diagonals that the membrane's radius has at least
 _RESAMPLED = 400
 
@@ -38,7 +39,7 @@ def membrane_curvature(
     Raises
     ------
     InputError
-        The balls are of nearly one size, which tells nothing; or tell a bulge that no window of this size has.
+        The balls are of nearly one size, which tells nothing; or tell a bulge that no window of this size has, or a hollow.
     """
     if max(first_ball, second_ball) < _UNLIKE * min(first_ball, second_ball):
         raise InputError(
@@ -65,9 +66,15 @@ def membrane_curvature(
                 f"the balls contradict each other: they would have the membrane bulge by 1/{1e3 * bend:.1f} mm, more than a "
                 "window of this size can; check both diameters and the pixel pitch"
             )
-    rng = np.random.default_rng(0)
+    rng, found = np.random.default_rng(0), curvature(every)
     drawn = [curvature([rng.integers(len(each), size=len(each)) for each in flat]) for _ in range(_RESAMPLED)]
-    return curvature(every), float(np.std(drawn))
+    std = float(np.std(drawn))
+    if found < -_HOLLOW * std:
+        raise InputError(
+            f"the balls contradict each other: they would have the membrane be hollow, with a curvature of {1e-3 * found:.3f} "
+            f"1/mm, give or take {1e-3 * std:.3f}; check that the two diameters are not exchanged"
+        )
+    return found, std
 
 
 def _told_by_the_other(balls: Sequence[tuple[Sequence[Press], float]], sensor: Sensor) -> list[Array]:

@@ -228,10 +228,18 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
         _check_size(reference, sensor, label, "take it with the camera settings of the reading")
         reference = _rgb(reference, label)
     seen = _rgb(array, name)
+    grey = [(each == each[..., :1]).all() for each in (seen, reference) if each is not None]
+    if len(set(grey)) > 1:
+        raise ImageError(
+            f"{name}: one of image and background has colours, the other is grey; give both as the camera made them"
+        )
     found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))
     warnings.extend(f"{name}: {fault}" for fault in found)
     mask, probability = find_contact(seen, reference, sensor)
     height = None if sensor.colour is None or reference is None else contact_height(seen, reference, sensor)
+    if height is not None and grey[0]:
+        height = None
+        warnings.append(f"{name}: the image is grey, so the sensor's colours tell no heights: give it in colour")
     return Contact(mask, height, probability=probability)
 
 
@@ -242,7 +250,8 @@ def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:
     elif array.dtype.kind in "ui" and array.dtype != np.uint8:
         if array.min() < 0 or array.max() > 255:
             raise ImageError(
-                f"{name}: a reading of {array.dtype} must lie in 0..255, got {array.min()} to {array.max()}; give uint8 or uint16"
+                f"{name}: a reading of {array.dtype} must lie in 0..255, got {array.min()} to {array.max()}; give uint8 or "
+                "uint16, or heights as uint16 (micrometres) with --kind height"
             )
         array = array.astype(np.uint8)
     elif array.dtype == bool:
