@@ -238,6 +238,9 @@ def test_the_command_writes_a_sensor_and_a_picture(tmp_path):
     assert read_image(tmp_path / "fit.png").ndim == 3
     told = geomtact.contact_height(images[0], background, tmp_path / "mine.toml")
     assert told.max() == pytest.approx(pressed(8 * MM, PLACES[0])[0].max(), rel=0.1)
+    options = ["--ball-mm", "8", "--background", str(tmp_path / "background.png")]
+    folder = CliRunner().invoke(app, ["calibrate", str(tmp_path), *options])
+    assert folder.exit_code == 2 and "expected images, got a folder; give" in folder.output
     other = tmp_path / "other"
     other.mkdir()
     for k, image in enumerate(presses(12 * MM)[0]):

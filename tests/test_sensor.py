@@ -80,6 +80,11 @@ def test_what_is_added_wrongly_is_named(change, message):
         ("[320, 240]", "[320.5, 240]", "image_size_px must be whole numbers"),
         ("[320, 240]", "[4, 240]", "image_size_px must be at least 8"),
         ("[0.06, 0.05]", "[0.06, 0]", "pixel_pitch_mm must be positive, got [0.06, 0.0]"),
+        (
+            "[0.06, 0.05]",
+            "[6e-5, 5e-5]",
+            "pixel_pitch_mm [6e-05, 5e-05] is under a micrometre; give millimetres a pixel",
+        ),
         ("[0.06, 0.05]", "['a', 'b']", "pixel_pitch_mm must be two numbers"),
     ],
 )

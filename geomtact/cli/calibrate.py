@@ -57,6 +57,9 @@ def calibrate(
             raise UsageError(f"{path}: expected a name that ends in {suffix}; give one")
         if path is not None and not path.parent.is_dir():
             raise UsageError(f"{path}: there is no folder {path.parent}; make it, or give another")
+    folder = next((path for path in presses if path.is_dir()), None)
+    if folder is not None:
+        raise UsageError(f"{folder}: expected images, got a folder; give {folder}/*.png")
     balls = (("--ball-mm", ball_mm), ("--other-ball-mm", other_ball_mm))
     lengths = [(option, 0.1, value) for option, value in balls] + [("--pitch-mm", 0.001, pitch_mm and min(pitch_mm))]
     for option, least, value in lengths:

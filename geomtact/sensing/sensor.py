@@ -93,6 +93,7 @@ class Sensor:
         need(all(n >= 8 for n in self.image_size_px), f"image_size_px must be at least 8, got {self.image_size_px}")
         pitch_mm = [round(1e3 * p, 9) for p in self.pixel_pitch]
         need(all(p > 0 for p in self.pixel_pitch), f"pixel_pitch_mm must be positive, got {pitch_mm}")
+        need(min(self.pixel_pitch) > 1e-6, f"pixel_pitch_mm {pitch_mm} is under a micrometre; give millimetres a pixel")
         need(self.max_penetration > 0, "max_penetration_mm must be positive")
         need(self.camera_distance >= 0, "camera_distance_mm must be >= 0 (0 means orthographic)")
         need(
