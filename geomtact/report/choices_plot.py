@@ -11,6 +11,7 @@ from geomtact.report.names import Named, write_names
 
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X")
 _DEFAULT, _THESIS = "balanced", "the thesis's network"
+_SAME = "calibration"  # a choice that takes the default's time
 _TICKS = (-5, -2, -1, -0.5, -0.2, -0.1, 0, 0.1, 0.2, 0.5, 1, 2, 5)  # nats
 
 
@@ -23,11 +24,11 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows = {name: _without_calibrations(_points(part), part) for name, part in content["parts"].items()}
+    rows = {name: _points(part) for name, part in content["parts"].items()}
     if len(rows) > 1:
         rows[f"mean over {len(rows)} parts"] = _mean(list(rows.values()))
     ways = {name: way for part in content["parts"].values() for name, way in part["ways"].items()}
-    choices = list(dict.fromkeys(way["choice"] for way in ways.values() if way["choice"] != "calibration"))
+    choices = list(dict.fromkeys(way["choice"] for way in ways.values() if way["choice"] != _SAME))
     looks = dict(zip(choices, zip(cycle(COLOURS), cycle(_SHAPES), strict=False), strict=False))
     figure = Figure(figsize=(25, 3.9 * len(rows) + 0.5), dpi=90, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
@@ -102,7 +103,7 @@ def draw_modelled(content: Mapping[str, Any]) -> bytes:
 
 
 def _points(part: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float | None]]]:
-    """For each kind of scene what each way takes and tells."""
+    """For each kind of scene what each way takes and tells, but for those calibrated otherwise: they lie on the default."""
     return {
         scene: {
             name: {
@@ -112,15 +113,10 @@ def _points(part: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float | No
                 "ready": part["ways"][name]["prepare_s"],
             }
             for name, f in entry["figures"].items()
+            if part["ways"][name]["choice"] != _SAME
         }
         for scene, entry in part["scenes"].items()
     }
-
-
-def _without_calibrations(points: dict[str, dict[str, Any]], part: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """``points`` without the ways that differ in nothing that takes time: they would lie on the default."""
-    same = {name for name, way in part["ways"].items() if way["choice"] == "calibration"}
-    return {scene: {n: p for n, p in ways.items() if n not in same} for scene, ways in points.items()}
 
 
 def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float | None]]]:

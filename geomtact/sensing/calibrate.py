@@ -122,13 +122,13 @@ def calibrated(
     base = known or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
     check_size(reference, base, "background")
     sensor, diameters = _fitted(found, replace(base, name=name or base.name, pixel_pitch=pitch), radius)
-    off = abs(float(np.nanmedian(diameters)) / ball_diameter - 1) if np.isfinite(diameters).any() else np.inf
-    if not off < _HOPELESS:
+    off = float(np.nanmedian(diameters)) / ball_diameter - 1 if np.isfinite(diameters).any() else np.inf
+    if not abs(off) < _HOPELESS:
         raise InputError(
             f"calibrate: {len(found)} presses contradict each other: colours fitted to all but one measure the ball "
-            f"{100 * off:.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
+            f"{100 * abs(off):.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
         )
-    return Calibrated(sensor, found, left_out, diameters, _doubts(found, diameters, ball_diameter))
+    return Calibrated(sensor, found, left_out, diameters, _doubts(found, off))
 
 
 def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor, Array]:
@@ -142,8 +142,8 @@ def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor
     return replace(sensor, colour=colour, height_noise=height_noise), diameters
 
 
-def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) -> list[str]:
-    """What speaks against a calibration by these presses."""
+def _doubts(presses: Sequence[Press], off: float) -> list[str]:
+    """What speaks against a calibration by these presses, by which the ball is measured wrongly by a share ``off``."""
     out = []
     window = np.array(presses[0].mask.shape[::-1])
     spans = np.ptp([press.centre for press in presses], axis=0) / window
@@ -152,7 +152,6 @@ def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) ->
             f"the presses lie within {100 * spans[0]:.0f} % of the window's width and {100 * spans[1]:.0f} % of its height: "
             "elsewhere heights may be far off; press the ball in all over"
         )
-    off = float(np.nanmedian(diameters)) / ball_diameter - 1
     if abs(off) > _AGREES:
         out.append(
             f"colours fitted to all presses but one measure the ball {100 * abs(off):.0f} % too "

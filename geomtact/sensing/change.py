@@ -15,13 +15,14 @@ from geomtact.sensing.image_file import read_image
 from geomtact.sensing.pixels import Mask, blurred, closed, filled, opened, pixels_apart, size_of
 from geomtact.sensing.sensor import Sensor
 
+GRID = 120  # smoothing lengths along an image's shorter side
 _GREY = 1 / 255
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 
 
 def colour_change(image: NDArray[np.floating], background: NDArray[np.floating]) -> tuple[Array, Mask]:
     """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it is felt."""
-    change, felt, _, _ = change_from(image, background, min(image.shape[:2]) / 120)
+    change, felt, _, _ = change_from(image, background, min(image.shape[:2]) / GRID)
     return change, felt
 
 

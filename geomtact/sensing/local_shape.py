@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 
 from geomtact.errors import UsageError, nearest_name
 from geomtact.se3 import Array
-from geomtact.sensing.change import as_unit_rgb, change_from, check_size, same_size
+from geomtact.sensing.change import GRID, as_unit_rgb, change_from, check_size, same_size
 from geomtact.sensing.pixels import Mask, blurred, filled, opened, size_of, transformed
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 from geomtact.sensing.slope import integrate, of_gradient, slope_field
 
 BySlope = Callable[[Array, Mask, Mask, float, Array], tuple[Array, Mask]]  # slope, felt, strong, sigma, pitch
 
-_GRID = 120  # pixels along an image's shorter side, which is smoothed by one of them
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
 _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated readings of many gels and lamps
 _ONE_COLOUR = 0.03  # power of the second colour over that of the first, under which there is but one: a white gel's
@@ -87,7 +86,7 @@ def contact_of(
     size = image.shape[1::-1]
     image, reference = _on_grid(image), None if reference is None else _on_grid(reference)
     # a second look smooths more where noise asks for it
-    sigma = min(image.shape[:2]) / _GRID
+    sigma = min(image.shape[:2]) / GRID
     change, felt, strong, noise = change_from(image, reference, sigma)
     if felt.any():
         noise_share = noise / float(np.quantile(size_of(change)[felt], 0.9))
@@ -109,8 +108,8 @@ def contact_of(
 
 
 def _on_grid(image: Array) -> Array:
-    """``image`` (H, W, 3) on ``_GRID`` pixels along its shorter side: finer ones tell nothing that smoothing leaves."""
-    share = min(1.0, _GRID / min(image.shape[:2]))
+    """``image`` (H, W, 3) on ``GRID`` pixels along its shorter side: finer ones tell nothing that smoothing leaves."""
+    share = min(1.0, GRID / min(image.shape[:2]))
     return np.asarray(cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
 
 

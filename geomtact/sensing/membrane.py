@@ -79,8 +79,8 @@ def membrane_curvature(
 
 def _told_by_the_other(balls: Sequence[tuple[Sequence[Press], float]], sensor: Sensor) -> list[Array]:
     """For either ball the log of its diameter on each press, as the colours tell that the other's presses give, over its own."""
-    weights = [weights_of([samples_on(press, sensor, ball) for press in presses]) for presses, ball in balls]
+    weights = [weights_of([samples_on(press, sensor, radius) for press in presses]) for presses, radius in balls]
     return [
-        np.log([told_diameter(press, sensor, other) / (2 * ball) for press in presses])
-        for (presses, ball), other in zip(balls, reversed(weights), strict=True)
+        np.log([told_diameter(press, sensor, other) / (2 * radius) for press in presses])
+        for (presses, radius), other in zip(balls, reversed(weights), strict=True)
     ]

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from geomtact.errors import ImageError, UsageError
 from geomtact.se3 import Array
-from geomtact.sensing.change import as_unit_rgb, same_size
+from geomtact.sensing.change import GRID, as_unit_rgb, same_size
 
 _FEWEST, _MANY = 12, 36  # pins, for a cubic over the image, and for a quintic
-_SMOOTH = 1 / 120  # of the image's shorter side, as for contacts
+_SMOOTH = 1 / GRID  # of the image's shorter side, as for contacts
 _CLEAR = 0.25  # of the strongest pin's change of brightness that a pin shows at least
 _BESIDE = 0.3  # of the way from pin to pin by which the next one may be off where it is expected
 _SPACINGS = 1e-4, 2e-2  # m that pins may be apart

@@ -122,7 +122,12 @@ def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any
 
 def _grey(array: NDArray[Any]) -> NDArray[Any]:
     """(H, W) of an image whose channels are alike; any other as it is."""
-    return array[..., 0] if array.ndim == 3 and (array == array[..., :1]).all() else array
+    return array[..., 0] if array.ndim == 3 and _colourless(array) else array
+
+
+def _colourless(array: NDArray[Any]) -> bool:
+    """Whether the channels of an image (H, W, C) are alike."""
+    return bool((array == array[..., :1]).all())
 
 
 def _check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = None) -> None:
@@ -228,18 +233,20 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
         _check_size(reference, sensor, label, "take it with the camera settings of the reading")
         reference = _rgb(reference, label)
     seen = _rgb(array, name)
-    grey = [(each == each[..., :1]).all() for each in (seen, reference) if each is not None]
-    if len(set(grey)) > 1:
+    grey = _colourless(seen)
+    if reference is not None and _colourless(reference) != grey:
         raise ImageError(
             f"{name}: one of image and background has colours, the other is grey; give both as the camera made them"
         )
     found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))
     warnings.extend(f"{name}: {fault}" for fault in found)
     mask, probability = find_contact(seen, reference, sensor)
-    height = None if sensor.colour is None or reference is None else contact_height(seen, reference, sensor)
-    if height is not None and grey[0]:
-        height = None
-        warnings.append(f"{name}: the image is grey, so the sensor's colours tell no heights: give it in colour")
+    height = None
+    if sensor.colour is not None and reference is not None:
+        if grey:
+            warnings.append(f"{name}: the image is grey, so the sensor's colours tell no heights: give it in colour")
+        else:
+            height = contact_height(seen, reference, sensor)
     return Contact(mask, height, probability=probability)
 
 
