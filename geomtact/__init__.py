@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from geomtact.contact_space.carry import RigStd
     from geomtact.geometry.mesh import Mesh, load_mesh
     from geomtact.inference.localizer import Localizer
-    from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.inference.modes import Mode
+    from geomtact.inference.posterior import Posterior
     from geomtact.inference.prior import GaussianPrior
     from geomtact.planning.actions import Probe, Touch
     from geomtact.planning.next_touch import Action
@@ -41,7 +42,7 @@ _MODULE_OF = {
     "GaussianPrior": "geomtact.inference.prior",
     "Localizer": "geomtact.inference.localizer",
     "Mesh": "geomtact.geometry.mesh",
-    "Mode": "geomtact.inference.posterior",
+    "Mode": "geomtact.inference.modes",
     "Posterior": "geomtact.inference.posterior",
     "Probe": "geomtact.planning.actions",
     "RigStd": "geomtact.contact_space.carry",

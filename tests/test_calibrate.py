@@ -125,13 +125,22 @@ def test_two_balls_tell_how_a_membrane_bulges_and_that_a_flat_one_does_not():
 
 
 def test_presses_all_in_one_place_or_few_are_doubted():
-    images, background = presses(8 * MM, [(70, 55), (73, 60), (76, 58)])
-    (said,) = calibrated(images, 8 * MM, background, PITCH).warnings
-    assert "presses lie within 4 % of the window's width and 4 % of its height" in said
+    images, background = presses(8 * MM, [(40, 35), (70, 60), (50, 70)])
+    said = calibrated(images, 8 * MM, background, PITCH).warnings
+    assert "presses lie within 19 % of the window's width and 29 % of its height" in said[0]
     images, background = presses(8 * MM, PLACES[:3])
     assert any("measure the ball" in warning for warning in calibrated(images, 8 * MM, background, PITCH).warnings)
     found = calibrated([*images, images[0]], 8 * MM, background, PITCH)
     assert found.left_out == {"press 4": "it is the same image as one before"}
+
+
+def test_a_background_in_which_the_ball_is_pressed_in_is_refused_as_is_one_place_alone():
+    images, background = presses(8 * MM, PLACES)
+    with pytest.raises(InputError, match="nearly all presses differ from the background around column .* without contact"):
+        calibrated(images[1:], 8 * MM, images[0], PITCH)
+    images, background = presses(8 * MM, [(70, 55), (73, 60), (76, 58)])
+    with pytest.raises(InputError, match="or all presses lie there"):
+        calibrated(images, 8 * MM, background, PITCH)
 
 
 def test_large_images_take_no_more_memory_at_a_time(found):

@@ -76,6 +76,8 @@ def calibrate(
         pitch = _pitch_of(pins, background, 1e-3 * pin_spacing_mm)
     if (other_presses is None) != (other_ball_mm is None):
         raise UsageError("--other-presses and --other-ball-mm belong together; give both")
+    if other_presses is not None and not other_presses.is_dir():
+        raise UsageError(f"--other-presses {other_presses}: expected the folder of another ball's presses; give it")
     if presses[0].suffix == ".npz":
         if len(presses) > 1 or ball_mm is not None or plot is not None or other_presses is not None:
             raise UsageError(f"{presses[0]}: a table of Taxim stands alone; leave out other presses, balls and --plot")
@@ -139,8 +141,6 @@ def _print_membrane(found: Calibrated, ball_mm: float, folder: Path, other_mm: f
     from geomtact.sensing.calibrate import calibrated
     from geomtact.sensing.membrane import membrane_curvature
 
-    if not folder.is_dir():
-        raise UsageError(f"--other-presses {folder}: no such folder; give the one that holds presses of the other ball")
     others = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp"))
     second = calibrated(others, 1e-3 * other_mm, background, sensor=found.sensor)
     curvature, std = membrane_curvature(found, 1e-3 * ball_mm, second, 1e-3 * other_mm)

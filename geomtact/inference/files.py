@@ -16,7 +16,8 @@ from geomtact.errors import InputError
 from geomtact.files import write_whole
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
-from geomtact.inference.posterior import Posterior, Refined
+from geomtact.inference.modes import Refined
+from geomtact.inference.posterior import Posterior
 from geomtact.sensing.sensor import Sensor
 
 _KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many

@@ -14,52 +14,12 @@ from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index, spelled_out
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import UsageError
-from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
+from geomtact.inference.modes import Mode, Refined, grown, mode_at
 from geomtact.se3 import Array, check_transforms, inverse
 from geomtact.sensing.sensor import Sensor
 
 _SEEDS = 400  # of the most probable cells, from which modes are grown
-_LEAST, _SPARE = 6, 2  # modes grown at least, and beyond those asked for
-_POINTS = 128  # of the surface, for distances between modes
-
-
-@dataclass(frozen=True)
-class Mode:
-    """One place where the object may be.
-
-    Attributes
-    ----------
-    T : (4, 4), the object in the posterior's frame
-    probability : mass within 5 mm or 5 % of the object's diameter, the smaller, of T (mean point distance modulo
-        symmetry); each pose counts for its most probable mode only
-    covariance : (6, 6) of xi = (rx, ry, rz, tx, ty, tz) in T exp(xi^), radians and metres
-    observable : (r, 6) orthonormal rows: directions of xi, rotations scaled by ``length``, that the contact tells
-    length : metres by which rotations are scaled before directions are compared
-    refined : whether T was moved off the grid, because the contact simulated there agrees better with the observed one
-    """
-
-    T: Array
-    probability: float
-    covariance: Array
-    observable: Array
-    length: float
-    refined: bool
-
-    def __repr__(self) -> str:
-        x, y, z = 1e3 * self.T[:3, 3] + 0.0
-        return f"Mode({100 * self.probability:.2g} %, object's origin at ({x:.2f}, {y:.2f}, {z:.2f}) mm)"
-
-
-@dataclass(frozen=True)
-class Refined:
-    """What registration found at one cell: its pose in the sensor frame, and what the contact tells there."""
-
-    T: Array
-    covariance: Array
-    observable: Array
-    length: float
-    moved: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,11 +109,11 @@ class Posterior:
         """The ``k`` most probable modes, most probable first; none without contact."""
         if not self.contact or k < 1:
             return []
-        return [self._mode(cell, mass) for cell, mass in self._grown(k)]
+        return [mode_at(self, cell, mass) for cell, mass in grown(self, k)]
 
     def leading_cells(self, k: int) -> NDArray[np.int64]:
         """Pose ids (m,) of the index at the heart of the ``k`` leading modes, weighed by the most probable cells alone."""
-        found = self._grown(k, full=False) if self.contact and k > 0 else []
+        found = grown(self, k, full=False) if self.contact and k > 0 else []
         return np.array([cell for cell, _ in found], np.int64)
 
     def likeliest_cells(self, n: int) -> NDArray[np.int64]:
@@ -340,28 +300,6 @@ class Posterior:
         cells[many] = self.index.within_runs(cells[many], runs[many], rng.random(int(many.sum())))
         return cells
 
-    def _grown(self, k: int, full: bool = True) -> list[tuple[int, float]]:
-        """The cell at the heart of each of the ``k`` leading modes and the mass of the mode, most probable first.
-
-        A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most. Unless
-        ``full``, the mass is that of the mode's most probable cells.
-        """
-        moved = np.array(sorted(self.refined), np.int64)
-        seeds = np.union1d(moved, self._heart(self._top_rows()))
-        seeds = seeds[np.argsort(-self.cell_log_density(seeds) - self.index.log_weight[seeds], kind="stable")]
-        poses = self._poses_of_cells(seeds)
-        distance, radius = PoseDistance(self.mesh, _POINTS), mode_radius(self.mesh)
-        members: list[tuple[int, NDArray[np.int64]]] = []
-        covered: set[int] = set()
-        for cell, T in zip(seeds.tolist(), poses, strict=True):
-            if len(members) == max(k, _LEAST) + _SPARE:
-                break
-            if cell not in covered:
-                inside = self._within(T, distance, radius, moved) if full else seeds[distance.within(T, poses, radius)]
-                members.append((cell, np.union1d(inside, [cell])))
-                covered.update(inside.tolist())
-        return self._share_out(members)[:k]
-
     def _top_rows(self, n: int = _SEEDS) -> NDArray[np.int64]:
         """The ``n`` rows (m,) with the most mass a cell, where there are as many."""
         p = self.log_prob
@@ -379,42 +317,10 @@ class Posterior:
             rows = rows[np.argpartition(p[rows], -n)[-n:]]
         return rows[p[rows] > -np.inf]
 
-    def _within(self, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Cells whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""
-        cells = np.union1d(self.index.perhaps_within(T, distance, radius), moved)
-        return cells[distance.within(T, self._poses_of_cells(cells), radius)]
-
-    def _mass_of(self, cells: NDArray[np.int64]) -> Array:
-        """Probability (m,) of the run that each of ``cells`` (m,) stands for; 0 where it stands for none."""
-        row, held = self._rows_of(cells)
-        return np.where(held & (self._heart(row) == cells), np.exp(self.log_prob[row]), 0.0)
-
     def _rows_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """The row (n,) whose run may hold each pose id (n,), and whether it does."""
         row = np.maximum(np.searchsorted(self.cells, ids, "right") - 1, 0)
         return row, (ids >= self.cells[row]) & (ids < self.cells[row] + self._runs_of(row))
-
-    def _share_out(self, members: list[tuple[int, NDArray[np.int64]]]) -> list[tuple[int, float]]:
-        """Modes with the cells within reach of each, made exclusive: a cell belongs to its most probable mode."""
-        todo = [(cell, inside, self._mass_of(inside)) for cell, inside in members]
-        out: list[tuple[int, float]] = []
-        while todo:
-            best = int(np.argmax([mass.sum() for _, _, mass in todo]))
-            cell, taken, mass = todo.pop(best)
-            if mass.sum() <= 0:
-                break
-            out.append((int(cell), float(mass.sum())))
-            for _, inside, left in todo:
-                left[np.isin(inside, taken)] = 0
-        return out
-
-    def _mode(self, cell: int, mass: float) -> Mode:
-        found = self.refined.get(cell)
-        T = self._poses_of_cells(np.array([cell]))[0]
-        if found is None:
-            found = Refined(T, self.index.cell_covariance(T), np.zeros((0, 6)), self.mesh.radius_rms, False)
-        T = self.T_frame_sensor @ T
-        return Mode(T, mass, found.covariance, found.observable, found.length, found.moved)
 
 
 def _share(T: Array, seed: int) -> float:

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
-from geomtact.inference.posterior import Posterior, Refined
+from geomtact.inference.modes import Refined
+from geomtact.inference.posterior import Posterior
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread

@@ -16,7 +16,7 @@ from geomtact.inference.posterior import Posterior
 from geomtact.inference.search import Search, View
 from geomtact.se3 import Array
 
-_CELLS, _PER_MODE = 200, 10  # that are looked into: so many, and more for each mode that is asked for
+_CELLS = 250  # that are looked into, however many modes are asked for: more of them blur more often than they find
 # Power of the joint likelihood at one pose; and the share of their mass that the cells looked into keep, whatever is likely
 # within them. Chosen, as are the next, on scenes that the study does not judge (docs/several-sensors.md)
 _TRUST, _DOUBT = 0.3, 0.03
@@ -48,7 +48,7 @@ def refine_together(
     many nats a contact the likeliest pose falls short: ``unexplained_nats``, of the poses that suit each sensor best, and, of
     masks alone, ``misfit_nats``, of what is left to chance by the length of the outlines.
     """
-    looked_into = posterior.likeliest_cells(_CELLS + _PER_MODE * k)
+    looked_into = posterior.likeliest_cells(_CELLS)
     if not len(looked_into):
         return posterior
     search = Search(posterior, views, np.random.default_rng(seed))

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.carry import UNFELT
-from geomtact.inference.posterior import Posterior, Refined
+from geomtact.inference.modes import Refined
+from geomtact.inference.posterior import Posterior
 from geomtact.inference.refine import Refinery
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp

@@ -15,7 +15,8 @@ from geomtact.files import write_text
 from geomtact.se3 import Array, check_transforms, quat_xyzw, transform
 
 if TYPE_CHECKING:
-    from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.inference.modes import Mode
+    from geomtact.inference.posterior import Posterior
 
 BOP = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import SubFigure
 
-    from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.inference.modes import Mode
+    from geomtact.inference.posterior import Posterior
 
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 OBSERVED, SIMULATED, FIRST, BARS = "#D55E00", "#56B4E9", "#000000", "#0072B2"

@@ -12,7 +12,8 @@ from geomtact.se3 import quat_xyzw
 from geomtact.versions import versions
 
 if TYPE_CHECKING:
-    from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.inference.modes import Mode
+    from geomtact.inference.posterior import Posterior
 
 SCHEMA = "geomtact/localization/1"
 

@@ -15,7 +15,8 @@ from geomtact.sensing.contact import Contact
 from geomtact.sensing.sensor import Sensor
 
 if TYPE_CHECKING:
-    from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.inference.modes import Mode
+    from geomtact.inference.posterior import Posterior
 
 # Motions of the part in the sensor frame about and along x, y and z through the contact's centre, in the order of a
 # twist (rotations first).

@@ -16,7 +16,8 @@ from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.sensor import Sensor
 
 if TYPE_CHECKING:
-    from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.inference.modes import Mode
+    from geomtact.inference.posterior import Posterior
 
 _FACES = 20_000  # that are drawn; finer meshes are made coarser
 _POINTS, _POSES, _SHAPE = 4000, 200, (24, 32)  # of the surface, of the posterior, and rays of each

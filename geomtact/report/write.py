@@ -16,7 +16,8 @@ from geomtact.report.summary import caution, facts, summaries_of, table
 from geomtact.report.turnable import turnable
 
 if TYPE_CHECKING:
-    from geomtact.inference.posterior import Mode, Posterior
+    from geomtact.inference.modes import Mode
+    from geomtact.inference.posterior import Posterior
 
 REPORTS = ("html", "png")
 

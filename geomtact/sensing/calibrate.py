@@ -30,6 +30,9 @@ INNER = 0.6  # share of the imprint's radius within which the gel surely lies on
 _MEASURED = 0.5  # share of it within which the ball is measured
 _OUTER = 2.2  # times the imprint's radius, beyond which the gel is flat
 _PIXELS, _FLAT_PIXELS = 3000, 1000  # of a press that are used, at most
+_EVERYWHERE = (
+    0.9  # share of the presses that at most change one place, if they are spread and the background shows none
+)
 _SPAN = 0.5  # of the window along each side, over which presses should be spread
 _AGREES, _HOPELESS = 0.1, 2.0  # by which presses may measure the ball wrongly, in the median: unnoticed, and at most
 
@@ -119,6 +122,7 @@ def calibrated(
         raise InputError(
             f"calibrate: {_FEWEST} presses or more are needed, {len(found)} of {len(presses)} serve ({why})"
         )
+    _check_rest(found)
     base = known or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
     check_size(reference, base, "background")
     sensor, diameters = _fitted(found, replace(base, name=name or base.name, pixel_pitch=pitch), radius)
@@ -129,6 +133,17 @@ def calibrated(
             f"{100 * abs(off):.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
         )
     return Calibrated(sensor, found, left_out, diameters, _doubts(found, off))
+
+
+def _check_rest(presses: Sequence[Press]) -> None:
+    """Refuse presses of which nearly all change one place, as they do against a background in which something is pressed in."""
+    everywhere = np.mean([press.felt for press in presses], axis=0) >= _EVERYWHERE
+    if everywhere.sum() > np.pi * np.median([press.radius for press in presses]) ** 2:
+        v, u = (int(np.median(each)) for each in np.nonzero(everywhere))
+        raise InputError(
+            f"calibrate: nearly all presses differ from the background around column {u}, row {v}: it was taken with something "
+            "pressed in there, or all presses lie there; take it without contact, and press all over the window"
+        )
 
 
 def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor, Array]:

@@ -1,0 +1,118 @@
+"""The modes of a posterior: grown around its most probable cells, each cell counting for one of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.se3 import Array
+
+if TYPE_CHECKING:
+    from geomtact.inference.posterior import Posterior
+
+_LEAST, _SPARE = 6, 2  # modes grown at least, and beyond those asked for
+_POINTS = 128  # of the surface, for distances between modes
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One place where the object may be.
+
+    Attributes
+    ----------
+    T : (4, 4), the object in the posterior's frame
+    probability : mass within 5 mm or 5 % of the object's diameter, the smaller, of T (mean point distance modulo
+        symmetry); each pose counts for its most probable mode only
+    covariance : (6, 6) of xi = (rx, ry, rz, tx, ty, tz) in T exp(xi^), radians and metres
+    observable : (r, 6) orthonormal rows: directions of xi, rotations scaled by ``length``, that the contact tells
+    length : metres by which rotations are scaled before directions are compared
+    refined : whether T was moved off the grid, because the contact simulated there agrees better with the observed one
+    """
+
+    T: Array
+    probability: float
+    covariance: Array
+    observable: Array
+    length: float
+    refined: bool
+
+    def __repr__(self) -> str:
+        x, y, z = 1e3 * self.T[:3, 3] + 0.0
+        return f"Mode({100 * self.probability:.2g} %, object's origin at ({x:.2f}, {y:.2f}, {z:.2f}) mm)"
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What registration found at one cell: its pose in the sensor frame, and what the contact tells there."""
+
+    T: Array
+    covariance: Array
+    observable: Array
+    length: float
+    moved: bool
+
+
+def grown(posterior: Posterior, k: int, full: bool = True) -> list[tuple[int, float]]:
+    """The cell at the heart of each of the ``k`` leading modes and the mass of the mode, most probable first.
+
+    A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most. Unless
+    ``full``, the mass is that of the mode's most probable cells.
+    """
+    moved = np.array(sorted(posterior.refined), np.int64)
+    seeds = np.union1d(moved, posterior._heart(posterior._top_rows()))
+    seeds = seeds[np.argsort(-posterior.cell_log_density(seeds) - posterior.index.log_weight[seeds], kind="stable")]
+    poses = posterior._poses_of_cells(seeds)
+    distance, radius = PoseDistance(posterior.mesh, _POINTS), mode_radius(posterior.mesh)
+    members: list[tuple[int, NDArray[np.int64]]] = []
+    covered: set[int] = set()
+    for cell, T in zip(seeds.tolist(), poses, strict=True):
+        if len(members) == max(k, _LEAST) + _SPARE:
+            break
+        if cell not in covered:
+            near = _within(posterior, T, distance, radius, moved) if full else seeds[distance.within(T, poses, radius)]
+            members.append((cell, np.union1d(near, [cell])))
+            covered.update(near.tolist())
+    return _share_out(posterior, members)[:k]
+
+
+def mode_at(posterior: Posterior, cell: int, mass: float) -> Mode:
+    """The mode with its heart at ``cell`` that holds ``mass``, in the posterior's frame."""
+    found = posterior.refined.get(cell)
+    T = posterior._poses_of_cells(np.array([cell]))[0]
+    if found is None:
+        found = Refined(T, posterior.index.cell_covariance(T), np.zeros((0, 6)), posterior.mesh.radius_rms, False)
+    T = posterior.T_frame_sensor @ T
+    return Mode(T, mass, found.covariance, found.observable, found.length, found.moved)
+
+
+def _share_out(posterior: Posterior, members: list[tuple[int, NDArray[np.int64]]]) -> list[tuple[int, float]]:
+    """Modes with the cells within reach of each, made exclusive: a cell belongs to its most probable mode."""
+    todo = [(cell, inside, _mass_of(posterior, inside)) for cell, inside in members]
+    out: list[tuple[int, float]] = []
+    while todo:
+        best = int(np.argmax([mass.sum() for _, _, mass in todo]))
+        cell, taken, mass = todo.pop(best)
+        if mass.sum() <= 0:
+            break
+        out.append((int(cell), float(mass.sum())))
+        for _, inside, left in todo:
+            left[np.isin(inside, taken)] = 0
+    return out
+
+
+def _within(
+    posterior: Posterior, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Cells whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""
+    cells = np.union1d(posterior.index.perhaps_within(T, distance, radius), moved)
+    return cells[distance.within(T, posterior._poses_of_cells(cells), radius)]
+
+
+def _mass_of(posterior: Posterior, cells: NDArray[np.int64]) -> Array:
+    """Probability (m,) of the run that each of ``cells`` (m,) stands for; 0 where it stands for none."""
+    row, held = posterior._rows_of(cells)
+    return np.where(held & (posterior._heart(row) == cells), np.exp(posterior.log_prob[row]), 0.0)
