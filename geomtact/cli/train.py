@@ -16,11 +16,11 @@ from geomtact.errors import InputError, UsageError
 
 MASK = "mask"  # a name for --architecture, beside those of encoders
 # options that say nothing to an architecture
-_OF_RESNET, _OF_ENCODER = ("pairs", "side"), ("start", "width", "dimension")
+_OF_RESNET, _OF_ENCODER = ("pairs", "side"), ("width", "dimension")
 _UNSUITED = {
     "encoder": _OF_RESNET,
     MASK: ("object_name", "unit", *_OF_RESNET, *_OF_ENCODER),
-    "resnet50": ("scenes", "steps", *_OF_ENCODER),
+    "resnet50": ("scenes", "steps", "start", *_OF_ENCODER),
 }
 _TUNING_RATE = 3e-4  # a step of fine-tuning must not undo what many parts taught
 
@@ -93,7 +93,7 @@ def train(
             raise UsageError(f"{option} does not go with --architecture {architecture}; leave it out")
     work = work or out.with_name(f"{out.stem}.training")
     if architecture == MASK:
-        _train_mask(out, work, scenes or 600, steps or 6000, rate, seed)
+        _train_mask(out, work, scenes or 600, steps or 6000, rate, seed, start)
         return
     if architecture == THESIS:
         if object_name is None:
@@ -177,20 +177,24 @@ def _sha256(path: Path | None) -> str | None:
         raise InputError(f"--start {path}: no such file; give a file that 'geomtact train' wrote") from None
 
 
-def _train_mask(out: Path, work: Path, parts: int, steps: int, rate: float | None, seed: int) -> None:
+def _train_mask(
+    out: Path, work: Path, parts: int, steps: int, rate: float | None, seed: int, start: Path | None
+) -> None:
     """The network that finds the contact in a reading."""
     from geomtact.training.presses import make_presses
-    from geomtact.training.state import claim
+    from geomtact.training.state import claim, weights_of
     from geomtact.training.train_mask import Settings, train_mask, write_mask_network
 
     settings = Settings(steps=steps, seed=seed)
     if rate is not None:
         settings = replace(settings, rate=rate)
-    claim(work, {"architecture": MASK, "seed": seed})
+    began = _sha256(start)
+    claim(work, {"architecture": MASK, "seed": seed, "start": began})
     with progress_bar("training") as progress:
         made = make_presses(work / "presses", parts, seed, progress)
-        network, curve = train_mask(made, settings, work, progress)
-    write_mask_network(out, network, curve, settings, sum(len(p.seen) for p in made))
+        weights = None if start is None else weights_of(start)
+        network, curve = train_mask(made, settings, work, progress, start=weights)
+    write_mask_network(out, network, curve, settings, sum(len(p.seen) for p in made), began)
     tell(f"overlaps the contact by {curve['validation'][-1]:.2f} on parts that it never saw")
     typer.echo(f"written: {out} and {out.with_suffix('.json').name}")
 

@@ -104,7 +104,7 @@ _THESIS_POSES = 150_000  # of its discretisation (6.1.2)
 # what is modelled: (the way without it, the way with it), both of which count nats from the same uniform
 MODELLED = {
     "every cell, not blocks": ("fast", DEFAULT),
-    "pixels and 25 modes (exact)": (DEFAULT, "exact"),
+    "outlines, pixels and 25 modes (exact)": (DEFAULT, "exact"),
     "a mode refined": ("no mode refined", "1 mode"),
     "5 modes refined": ("1 mode", DEFAULT),
     "15 modes refined": (DEFAULT, "15 modes"),

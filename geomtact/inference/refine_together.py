@@ -16,7 +16,7 @@ from geomtact.inference.posterior import Posterior
 from geomtact.inference.search import Search, View
 from geomtact.se3 import Array
 
-_CELLS = 250  # that are looked into, however many modes are asked for: more of them blur more often than they find
+_CELLS = 250  # that are looked into, however many modes are asked for: more of them take time and tell no more
 # Power of the joint likelihood at one pose; and the share of their mass that the cells looked into keep, whatever is likely
 # within them. Chosen, as are the next, on scenes that the study does not judge (docs/several-sensors.md)
 _TRUST, _DOUBT = 0.3, 0.03

@@ -54,6 +54,24 @@ def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(wanted, indent=1) + "\n")
 
 
+def weights_of(path: Path) -> dict[str, torch.Tensor]:
+    """The weights in a safetensors file, in single precision, to go on training from."""
+    try:
+        return {name: value.float() for name, value in load_file(path).items()}
+    except (OSError, SafetensorError) as error:
+        raise InputError(
+            f"--start {path}: not a whole safetensors file ({error}); give one that 'geomtact train' wrote"
+        ) from None
+
+
+def begin_with(network: nn.Module, weights: Mapping[str, torch.Tensor]) -> None:
+    """Give ``network`` the ``weights`` to start from; those of another one are refused."""
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError:
+        raise InputError("--start: the weights of another network; give a file that 'geomtact train' wrote") from None
+
+
 def save_state(
     folder: Path, network: nn.Module, optimizer: Optimizer, settings: Mapping[str, Any], step: int, curve: Curve
 ) -> None:

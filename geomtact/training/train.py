@@ -28,7 +28,7 @@ from geomtact.scoring.network import Encoder
 from geomtact.sensing.moments import without_specks
 from geomtact.training.augment import augmented
 from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, Scene
-from geomtact.training.state import not_a_number, resume, save_state
+from geomtact.training.state import begin_with, not_a_number, resume, save_state
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,7 @@ def train(
     torch.manual_seed(settings.seed)
     network = Encoder(settings.width, settings.dimension)
     if start is not None:
-        try:
-            network.load_state_dict(start)
-        except RuntimeError:
-            raise InputError(
-                "--start: the weights of another network; give a file that 'geomtact train' wrote"
-            ) from None
+        begin_with(network, start)
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay)
     curve = Curve([], [], [])
     first, earlier = resume(folder, network, optimizer, asdict(settings))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from geomtact.sensing.mask_network import MaskNetwork
 from geomtact.training import presses as made
 from geomtact.training.card import write_network
 from geomtact.training.presses import Presses
-from geomtact.training.state import not_a_number, resume, save_state
+from geomtact.training.state import begin_with, not_a_number, resume, save_state
 from geomtact.training.train import schedule
 
 SCHEMA = "geomtact/mask-network/1"
@@ -36,16 +36,22 @@ class Settings:
 
 
 def train_mask(
-    parts: Sequence[Presses], settings: Settings, folder: Path, progress: Progress | None = None, check_every: int = 500
+    parts: Sequence[Presses],
+    settings: Settings,
+    folder: Path,
+    progress: Progress | None = None,
+    check_every: int = 500,
+    start: Mapping[str, torch.Tensor] | None = None,
 ) -> tuple[MaskNetwork, dict[str, list[float]]]:
-    """Train on all ``parts`` but the last ``settings.validation``; a stopped run goes on from ``folder``.
+    """Train on all ``parts`` but the last ``settings.validation``; a stopped run goes on from ``folder``. ``start`` holds weights
+    to start from.
 
     Returns the network and its curve: cross entropy over the steps, and overlap (IoU) with the contact on parts never seen.
 
     Raises
     ------
     InputError
-        Too few parts.
+        Too few parts, or weights of another network to start from.
     GeomtactError
         The loss is not a number any more; the last good state stays in ``folder``.
     """
@@ -53,7 +59,10 @@ def train_mask(
         raise InputError(f"training: expected more than {settings.validation} parts, got {len(parts)}")
     (seen, contact), judged = (_tensors(p) for p in (parts[: -settings.validation], parts[-settings.validation :]))
     torch.manual_seed(settings.seed)
-    network = MaskNetwork().to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast
+    network = MaskNetwork()
+    if start is not None:
+        begin_with(network, start)
+    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay)
     first, curve = resume(folder, network, optimizer, asdict(settings))
     curve = curve or {"step": [], "training": [], "validation": []}
@@ -97,13 +106,20 @@ def validate(network: MaskNetwork, seen: torch.Tensor, contact: torch.Tensor) ->
 
 
 def write_mask_network(
-    path: Path, network: MaskNetwork, curve: dict[str, list[float]], settings: Settings, presses: int
+    path: Path,
+    network: MaskNetwork,
+    curve: dict[str, list[float]],
+    settings: Settings,
+    presses: int,
+    start: str | None = None,
 ) -> None:
-    """Write ``path`` (safetensors, half precision) and beside it the card (.json)."""
+    """Write ``path`` (safetensors, half precision) and beside it the card (.json); ``start`` is the SHA-256 of the weights that
+    training began with."""
     ranges = ("SHAPE", "PITCH", "READINGS", "SIZES", "BALLS", "RADII", "FLAT", "TILT", "DEPTHS", "THICKNESS")
     card = {
         "data": {"presses": presses} | {name.lower(): getattr(made, name) for name in ranges},
         "settings": asdict(settings),
+        "start_sha256": start,
         "curve": curve,
     }
     write_network(path, network, SCHEMA, card)
