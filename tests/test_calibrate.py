@@ -136,7 +136,9 @@ def test_presses_all_in_one_place_or_few_are_doubted():
 
 def test_a_background_in_which_the_ball_is_pressed_in_is_refused_as_is_one_place_alone():
     images, background = presses(8 * MM, PLACES)
-    with pytest.raises(InputError, match="nearly all presses differ from the background around column .* without contact"):
+    with pytest.raises(
+        InputError, match="nearly all presses differ from the background around column .* without contact"
+    ):
         calibrated(images[1:], 8 * MM, images[0], PITCH)
     images, background = presses(8 * MM, [(70, 55), (73, 60), (76, 58)])
     with pytest.raises(InputError, match="or all presses lie there"):

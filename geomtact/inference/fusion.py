@@ -36,6 +36,8 @@ _NEGLIGIBLE = 25.0  # nats below the most probable place
 # Density relative to the uniform distribution below which the first sensor's places are carried roughly
 _DOUBTFUL = 0.1
 _DISAGREES = -2.0  # nats by which the other sensors may make a reading less likely than chance does
+# nats a contact that the likeliest pose may leave unexplained: of well known rigs, 2 scenes of 100 leave more (pin, head)
+_UNEXPLAINED = 1.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +174,18 @@ def fused_posterior(
         began = time.perf_counter()
         posterior = refine_together(posterior, views, modes, first.seed, log_prior)
         timing["refine"] = 1e3 * (time.perf_counter() - began)
+        left = posterior.settings.get("unexplained_nats") or 0.0
+        if against is None and rig is None and left > _UNEXPLAINED and sum(t.contact for t in touches) > 1:
+            posterior = replace(posterior, warnings=[*posterior.warnings, _unexplained(left)])
     return posterior
+
+
+def _unexplained(nats: float) -> str:
+    """What is said where no pose explains all sensors' readings as well as others explain each of them."""
+    return (
+        f"the sensors agree badly: the likeliest pose leaves {nats:.1f} nats a contact unexplained, {_UNEXPLAINED} at most where "
+        "a rig is well known; check the sensors' poses, or say how well they are known (std_mm and std_deg, or rig)"
+    )
 
 
 def _nothing_felt(touches: Sequence[Posterior], prior: Any) -> Posterior:
