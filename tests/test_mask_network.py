@@ -25,7 +25,7 @@ from geomtact.sensing.mask_network import CHANNELS, WEIGHTS, MaskNetwork, contac
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
 from geomtact.training.presses import PRESSES, READINGS, make_presses, press_part
-from geomtact.training.state import weights_of
+from geomtact.training.state import read_weights
 from geomtact.training.train_mask import Settings, train_mask, validate, write_mask_network
 
 
@@ -90,7 +90,7 @@ def test_a_step_of_training_lowers_the_loss(parts, tmp_path):
 def test_training_goes_on_from_weights_that_are_given(parts, tmp_path):
     first, _ = train_mask(parts, Settings(steps=10, batch=8, validation=1), tmp_path / "first")
     write_mask_network(tmp_path / "first.safetensors", first, {}, Settings(), 0)
-    weights = weights_of(tmp_path / "first.safetensors")
+    weights = read_weights(tmp_path / "first.safetensors")
     still = Settings(steps=1, rate=0.0, batch=8, validation=1)
     same, _ = train_mask(parts, still, tmp_path / "still", start=weights)
     for name, value in same.state_dict().items():
@@ -98,7 +98,7 @@ def test_training_goes_on_from_weights_that_are_given(parts, tmp_path):
     with pytest.raises(InputError, match="--start: the weights of another network"):
         train_mask(parts, still, tmp_path / "other", start={"a": torch.zeros(1)})
     with pytest.raises(InputError, match="not a whole safetensors file"):
-        weights_of(tmp_path / "none.safetensors")
+        read_weights(tmp_path / "none.safetensors")
 
 
 def test_what_is_written_says_what_it_was_made_of(tmp_path):

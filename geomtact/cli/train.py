@@ -101,8 +101,8 @@ def train(
         _train_thesis(out, work, object_name, unit, sensor, pairs or 100_000, side or 224, rate, seed)
         return
     from geomtact.training import dataset
-    from geomtact.training.card import read_weights, write_encoder
-    from geomtact.training.state import claim, whose
+    from geomtact.training.card import write_encoder
+    from geomtact.training.state import claim, read_weights, whose
     from geomtact.training.train import Settings
     from geomtact.training.train import train as run
 
@@ -182,17 +182,16 @@ def _train_mask(
 ) -> None:
     """The network that finds the contact in a reading."""
     from geomtact.training.presses import make_presses
-    from geomtact.training.state import claim, weights_of
+    from geomtact.training.state import claim, read_weights
     from geomtact.training.train_mask import Settings, train_mask, write_mask_network
 
     settings = Settings(steps=steps, seed=seed)
     if rate is not None:
         settings = replace(settings, rate=rate)
-    began = _sha256(start)
+    began, weights = _sha256(start), None if start is None else read_weights(start)
     claim(work, {"architecture": MASK, "seed": seed, "start": began})
     with progress_bar("training") as progress:
         made = make_presses(work / "presses", parts, seed, progress)
-        weights = None if start is None else weights_of(start)
         network, curve = train_mask(made, settings, work, progress, start=weights)
     write_mask_network(out, network, curve, settings, sum(len(p.seen) for p in made), began)
     tell(f"overlaps the contact by {curve['validation'][-1]:.2f} on parts that it never saw")

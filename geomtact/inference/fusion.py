@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,8 +36,9 @@ _NEGLIGIBLE = 25.0  # nats below the most probable place
 # Density relative to the uniform distribution below which the first sensor's places are carried roughly
 _DOUBTFUL = 0.1
 _DISAGREES = -2.0  # nats by which the other sensors may make a reading less likely than chance does
-# nats a contact that the likeliest pose may leave unexplained: of well known rigs, 2 scenes of 100 leave more (pin, head)
-_UNEXPLAINED = 1.75
+_UNEXPLAINED = (
+    1.75  # nats a contact that the likeliest pose leaves unexplained in 2 of 100 scenes of right rigs (pin, head)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,18 +175,21 @@ def fused_posterior(
         began = time.perf_counter()
         posterior = refine_together(posterior, views, modes, first.seed, log_prior)
         timing["refine"] = 1e3 * (time.perf_counter() - began)
-        left = posterior.settings.get("unexplained_nats") or 0.0
-        if against is None and rig is None and left > _UNEXPLAINED and sum(t.contact for t in touches) > 1:
-            posterior = replace(posterior, warnings=[*posterior.warnings, _unexplained(left)])
+        if against is None and rig in (None, RigStd()) and sum(touch.contact for touch in touches) > 1:
+            posterior = replace(posterior, warnings=posterior.warnings + _badly_agreed(posterior.settings))
     return posterior
 
 
-def _unexplained(nats: float) -> str:
-    """What is said where no pose explains all sensors' readings as well as others explain each of them."""
-    return (
-        f"the sensors agree badly: the likeliest pose leaves {nats:.1f} nats a contact unexplained, {_UNEXPLAINED} at most where "
-        "a rig is well known; check the sensors' poses, or say how well they are known (std_mm and std_deg, or rig)"
-    )
+def _badly_agreed(settings: Mapping[str, Any]) -> list[str]:
+    """What is said where no pose explains all sensors' readings nearly as well as others explain each of them."""
+    nats = settings.get("unexplained_nats", 0.0)  # None: no pose that was looked into suits them all
+    if nats is not None and nats <= _UNEXPLAINED:
+        return []
+    left = "does not suit all of them" if nats is None else f"leaves {nats:.1f} nats a contact unexplained"
+    return [
+        f"the sensors agree badly: the likeliest pose {left}, rarely more than {_UNEXPLAINED} where the rig is right; check "
+        "T_world_sensor, or whether one of them touches something else, or say how well the rig is known (std_mm, std_deg)"
+    ]
 
 
 def _nothing_felt(touches: Sequence[Posterior], prior: Any) -> Posterior:

@@ -37,7 +37,7 @@ def refine_together(
     seed: int,
     log_prior: NDArray[np.floating] | None = None,
 ) -> Posterior:
-    """``posterior``, on the first sensor's cells, with its leading modes refined against all ``views`` and weighed anew.
+    """``posterior``, on the first sensor's cells, with its ``k`` leading modes refined against all ``views`` and weighed anew.
 
     As in ``Refinery.refine``, each cell keeps the pose at which what is seen is likeliest, and what the cells hold together
     is shared out anew by these likelihoods: but only as far as the likeliest pose explains what all sensors show, in the mean

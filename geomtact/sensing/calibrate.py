@@ -30,9 +30,7 @@ INNER = 0.6  # share of the imprint's radius within which the gel surely lies on
 _MEASURED = 0.5  # share of it within which the ball is measured
 _OUTER = 2.2  # times the imprint's radius, beyond which the gel is flat
 _PIXELS, _FLAT_PIXELS = 3000, 1000  # of a press that are used, at most
-_EVERYWHERE = (
-    0.9  # share of the presses that at most change one place, if they are spread and the background shows none
-)
+_EVERYWHERE = 0.9  # share of presses that may change one place: more, and all lie there or the background shows one
 _SPAN = 0.5  # of the window along each side, over which presses should be spread
 _AGREES, _HOPELESS = 0.1, 2.0  # by which presses may measure the ball wrongly, in the median: unnoticed, and at most
 

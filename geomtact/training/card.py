@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors.torch import save_file
 from torch import nn
 
@@ -76,10 +75,3 @@ def draw_curve(curve: Curve, path: Path) -> None:
     axes.legend(frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=120)
-
-
-def read_weights(path: Path) -> dict[str, torch.Tensor]:
-    """The weights of an encoder file, to go on training from."""
-    from geomtact.scoring.encoder import load_weights
-
-    return {name: torch.from_numpy(value) for name, value in load_weights(path).items()}

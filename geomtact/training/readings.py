@@ -22,7 +22,7 @@ Image = NDArray[np.float32]
 SKIN = 2.0  # px over which the gel's coating rounds it off, at most
 ELEVATION = (6.0, 45.0)  # deg of lamps above the gel
 AMBIENT = 1.5  # of what lamps make of the untouched gel, at most
-BLOWN_OUT = 0.25  # share of readings of which one channel is
+BRIGHT = 0.25  # share of readings of which one channel is so bright that it may be blown out
 _DRAWS = 4
 
 
@@ -55,7 +55,8 @@ def random_sight(height: NDArray[np.floating], rng: np.random.Generator) -> Imag
 
 
 def random_lamps(shape: tuple[int, int], rng: np.random.Generator) -> Lamps:
-    """Three of one colour each, or more of any, around an image of ``shape`` (h, w): near or far, low or high."""
+    """Three of one colour each, or more of any, around an image of ``shape`` (h, w) or on three of its sides: near or far, low or
+    high."""
     k = 3 if rng.random() < 0.6 else int(rng.integers(4, 7))
     around = 2 * np.pi / k * np.arange(k)
     if k == 3 and rng.random() < 0.5:  # on three sides of a square gel
@@ -74,9 +75,9 @@ def random_lamps(shape: tuple[int, int], rng: np.random.Generator) -> Lamps:
 
 def _photographed(light: Image, rng: np.random.Generator) -> Array:
     """Readings 0..1 of ``light`` (2, h, w, 3): the second, without contact, of a random brightness in each channel, at times so
-    bright in one that half of the image or more is blown out."""
+    bright in one that much of the image is blown out."""
     exposure = np.clip(rng.uniform(0.15, 0.75) + rng.normal(0, 0.1, 3), 0.08, 0.95)
-    if rng.random() < BLOWN_OUT:
+    if rng.random() < BRIGHT:
         exposure[rng.integers(3)] = rng.uniform(0.8, 1.2)
     shown = exposure * (light / np.median(light[1], (0, 1))) ** rng.uniform(0.45, 1)
     return np.clip(_blurred(shown, float(rng.uniform(0.2, 1.5))), 0, 1).astype(float)

@@ -54,7 +54,7 @@ def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(wanted, indent=1) + "\n")
 
 
-def weights_of(path: Path) -> dict[str, torch.Tensor]:
+def read_weights(path: Path) -> dict[str, torch.Tensor]:
     """The weights in a safetensors file, in single precision, to go on training from."""
     try:
         return {name: value.float() for name, value in load_file(path).items()}
