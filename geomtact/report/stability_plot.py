@@ -10,6 +10,8 @@ from geomtact.report.canvas import COLOURS, png
 
 _ACROSS = 4
 _TOGETHER = "all parts"
+_SEVENTH = "#8C564B"  # colour, of as many parts
+_IN_A_ROW = 6  # of the legend
 
 
 def draw_stability(content: Mapping[str, Any]) -> bytes:
@@ -22,7 +24,7 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
     from matplotlib.figure import Figure
 
     sweeps = {part: told["sweeps"] for part, told in content["parts"].items()}
-    colours = dict(zip(sweeps, cycle(COLOURS), strict=False))
+    colours = dict(zip(sweeps, cycle((*COLOURS, _SEVENTH)), strict=False))
     names = list(dict.fromkeys(name for some in sweeps.values() for name in some))
     if len(sweeps) > 1:
         sweeps[_TOGETHER], colours[_TOGETHER] = content["together"], "black"
@@ -45,7 +47,7 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
     )
     handles += [figure.axes[0].plot([], [], style, color="0.4", label=label)[0] for style, label in styles]
     handles.append(figure.axes[0].fill_between([], [], color="0.94", label="promised to hold"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    figure.legend(handles=handles, loc="outside upper center", ncols=_IN_A_ROW, frameon=False)
     return png(canvas)
 
 
