@@ -36,9 +36,8 @@ _NEGLIGIBLE = 25.0  # nats below the most probable place
 # Density relative to the uniform distribution below which the first sensor's places are carried roughly
 _DOUBTFUL = 0.1
 _DISAGREES = -2.0  # nats by which the other sensors may make a reading less likely than chance does
-_UNEXPLAINED = (
-    1.75  # nats a contact that the likeliest pose leaves unexplained in 2 of 100 scenes of right rigs (pin, head)
-)
+# Nats a contact above which the likeliest pose leaves what is seen unexplained: so do 2 of 100 scenes of right rigs (pin, head)
+_UNEXPLAINED = 1.75
 
 
 @dataclass(frozen=True, eq=False)
