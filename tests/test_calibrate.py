@@ -215,7 +215,7 @@ def test_what_is_missing_or_wrong_is_said(found):
         contact_height(images[0], background, replace(found.sensor, colour=None))
     with pytest.raises(ImageError, match="expected the size of the image"):
         contact_height(images[0], background[:-1], found.sensor)
-    with pytest.raises(ImageError, match="expected 160 x 120 px for sensor made, got 80 x 60"):
+    with pytest.raises(ImageError, match="expected 160 x 120 px for sensor made .width x height., got 80 x 60"):
         contact_height(images[0][::2, ::2], background[::2, ::2], found.sensor)
     with pytest.raises(ImageError, match="press 2: expected the background's size, 160 x 120 px, got 160 x 119"):
         calibrate([images[0], images[1][:-1], images[2]], 8 * MM, background, PITCH)
@@ -225,7 +225,9 @@ def test_what_is_missing_or_wrong_is_said(found):
         calibrate(images, 8, background, PITCH)
     with pytest.raises(UsageError, match="pixel_pitch: expected metres"):
         calibrate(images, 8 * MM, background, 0.1)
-    with pytest.raises(ImageError, match="expected 320 x 240 px for sensor gelsight-mini, got 160 x 120"):
+    with pytest.raises(
+        ImageError, match="expected 320 x 240 px for sensor gelsight-mini .width x height., got 160 x 120"
+    ):
         calibrate(images, 8 * MM, background, sensor="gelsight-mini")
     with pytest.raises(SensorError, match="weights"):
         ColourTable(((0.0,) * 3, (0.0,) * TERMS), 0, 0, 0)

@@ -259,7 +259,10 @@ def test_a_background_of_another_size_is_refused(background, tmp_path):
         read_observation(background, MINI, background=path)
     with pytest.raises(ImageError, match="background: expected the size of the image, 320 x 240 px, got 320 x 200 px"):
         contact_mask(background, background[:200])
-    with pytest.raises(ImageError, match="expected 240 x 320 px for sensor digit, got 320 x 240 px"):
+    with pytest.raises(
+        ImageError,
+        match="expected 240 x 320 px for sensor digit .*, got 320 x 240 px; the image is transposed",
+    ):
         contact_mask(background, background, "digit")
     with pytest.raises(ImageError, match=r"image: expected an RGB image \(H, W, 3\)"):
         contact_mask(background[..., 0])

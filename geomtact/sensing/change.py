@@ -109,13 +109,25 @@ def as_unit_rgb(image: Any, name: str) -> Array:
     return image
 
 
-def check_size(image: Array, sensor: Sensor, name: str) -> None:
-    """Refuse an image (H, W, 3) that is not of the sensor's size."""
-    if image.shape[:2] != sensor.image_size_px[::-1]:
-        raise ImageError(
-            f"{name}: expected {sensor.image_size_px[0]} x {sensor.image_size_px[1]} px for sensor {sensor.name}, "
-            f"got {image.shape[1]} x {image.shape[0]} px; name the sensor that took it"
+def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = None) -> None:
+    """Refuse an image (H, W, ...) of another size than the sensor's; ``do`` says what to do, where it is not transposed."""
+    height, width = array.shape[:2]
+    if (width, height) == sensor.image_size_px:
+        return
+    wanted, given = "{} x {} px".format(*sensor.image_size_px), f"{width} x {height} px"
+    if (height, width) == sensor.image_size_px:
+        turned = "array.T" if array.ndim == 2 else "array.swapaxes(0, 1)"
+        hint = f"the image is transposed: transpose it ({turned}) or rotate it by 90 degrees, as it was taken"
+    elif do is not None:
+        hint = do
+    elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
+        hint = "the shape agrees: scale a mask to that, or describe this resolution in a sensor file of its own"
+    else:
+        hint = (
+            "name the sensor that took it; crop or scale nothing: give the image as the camera made it, "
+            "or a sensor file of its resolution"
         )
+    raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
 
 
 def same_size(background: Array, image: Array) -> Array:

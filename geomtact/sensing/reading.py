@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import ImageError, UsageError, nearest_name
-from geomtact.sensing.change import as_unit_rgb
+from geomtact.sensing.change import as_unit_rgb, check_size
 from geomtact.sensing.checks import faults
 from geomtact.sensing.contact import FAINT, Contact
 from geomtact.sensing.height import contact_height
@@ -67,7 +67,7 @@ def read_observation(
         raise UsageError(f"unknown kind {kind!r}{nearest_name(str(kind), KINDS)}")
     warnings: list[str] = []
     name, array = _load(image, "image", warnings)
-    _check_size(array, sensor, name)
+    check_size(array, sensor, name)
     if kind == "auto":
         kind = _decide(array, name, warnings)
     if kind != "reading":
@@ -128,27 +128,6 @@ def _grey(array: NDArray[Any]) -> NDArray[Any]:
 def _colourless(array: NDArray[Any]) -> bool:
     """Whether the channels of an image (H, W, C) are alike."""
     return bool((array == array[..., :1]).all())
-
-
-def _check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = None) -> None:
-    """Refuse an image (H, W, ...) of another size than the sensor's; ``do`` says what to do, where it is not transposed."""
-    height, width = array.shape[:2]
-    if (width, height) == sensor.image_size_px:
-        return
-    wanted, given = "{} x {} px".format(*sensor.image_size_px), f"{width} x {height} px"
-    if (height, width) == sensor.image_size_px:
-        turned = "array.T" if array.ndim == 2 else "array.swapaxes(0, 1)"
-        hint = f"the image is transposed: transpose it ({turned}) or rotate it by 90 degrees, as it was taken"
-    elif do is not None:
-        hint = do
-    elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
-        hint = "the shape agrees: scale a mask to that, or describe this resolution in a sensor file of its own"
-    else:
-        hint = (
-            "name the sensor that took it; crop or scale nothing: give the image as the camera made it, "
-            "or a sensor file of its resolution"
-        )
-    raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
 
 
 def _decide(array: NDArray[Any], name: str, warnings: list[str]) -> str:
@@ -230,7 +209,7 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
         warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself{untold}")
     else:
         label, reference = _load(background, "background", warnings)
-        _check_size(reference, sensor, label, "take it with the camera settings of the reading")
+        check_size(reference, sensor, label, "take it with the camera settings of the reading")
         reference = _rgb(reference, label)
     seen = _rgb(array, name)
     grey = _colourless(seen)
