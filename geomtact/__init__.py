@@ -14,6 +14,7 @@ from geomtact.errors import (
     ImageError,
     InputError,
     MeshError,
+    NoPoseAgreesError,
     PoseError,
     SensorError,
     UsageError,
@@ -22,8 +23,10 @@ from geomtact.errors import (
 if TYPE_CHECKING:
     from geomtact.contact_space.carry import RigStd
     from geomtact.geometry.mesh import Mesh, load_mesh
-    from geomtact.inference.localizer import Localizer
+    from geomtact.inference.identify import identify
+    from geomtact.inference.localizer import Effort, Localizer
     from geomtact.inference.modes import Mode
+    from geomtact.inference.motion import GaussianTwist
     from geomtact.inference.posterior import Posterior
     from geomtact.inference.prior import GaussianPrior
     from geomtact.planning.actions import Probe, Touch
@@ -39,7 +42,9 @@ if TYPE_CHECKING:
 _MODULE_OF = {
     "Action": "geomtact.planning.next_touch",
     "Contact": "geomtact.sensing.contact",
+    "Effort": "geomtact.inference.localizer",
     "GaussianPrior": "geomtact.inference.prior",
+    "GaussianTwist": "geomtact.inference.motion",
     "Localizer": "geomtact.inference.localizer",
     "Mesh": "geomtact.geometry.mesh",
     "Mode": "geomtact.inference.modes",
@@ -51,6 +56,7 @@ _MODULE_OF = {
     "calibrate": "geomtact.sensing.calibrate",
     "contact_height": "geomtact.sensing.height",
     "contact_mask": "geomtact.sensing.local_shape",
+    "identify": "geomtact.inference.identify",
     "load_mesh": "geomtact.geometry.mesh",
 }
 
@@ -58,7 +64,9 @@ __all__ = [
     "Action",
     "CacheError",
     "Contact",
+    "Effort",
     "GaussianPrior",
+    "GaussianTwist",
     "GeomtactError",
     "ImageError",
     "InputError",
@@ -66,6 +74,7 @@ __all__ = [
     "Mesh",
     "MeshError",
     "Mode",
+    "NoPoseAgreesError",
     "PoseError",
     "Posterior",
     "Probe",
@@ -78,6 +87,7 @@ __all__ = [
     "calibrate",
     "contact_height",
     "contact_mask",
+    "identify",
     "load_mesh",
 ]
 

@@ -2,6 +2,8 @@
 
 import ast
 import configparser
+import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +29,7 @@ STAGES = [
     ["cli"],
 ]
 HEIGHT = {name: k for k, names in enumerate(STAGES) for name in names}
+WRITERS = {"write_text", "write_bytes", "savefig"}
 FORBIDDEN = {"pymeshlab", "tamaas", "pickle", "cloudpickle", "joblib"}
 HEAVY = {"torch", "open3d", "matplotlib", "trimesh", "skimage", "cv2", "kornia", "scipy.spatial", "numpy", "PIL"}
 SHOW_HELP = "import sys; sys.argv = ['geomtact', '--help']; from geomtact.cli import main; main()"
@@ -70,6 +73,25 @@ def test_library_does_not_print(path):
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         printed = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
         assert not printed, f"{path}:{node.lineno} prints; return it, or say it in geomtact/cli"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_files_are_written_whole_or_not_at_all(path):
+    """Under a temporary name (``geomtact.files``), or within a folder that is renamed as a whole."""
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in WRITERS:
+            into = ast.unparse(node.args[0] if node.func.attr == "savefig" else node.func.value)
+            assert into.split(" ")[0] in ("temporary", "building"), f"{path}:{node.lineno} writes {into} in place"
+
+
+def test_committed_results_are_of_studies_as_they_are_now():
+    """By their schema: what is written today would be resumed, and its fields are those that the pages tell of."""
+    sources = [*MODULES, *(ROOT / "tools").rglob("*.py")]
+    known = {name for path in sources for name in re.findall(r'"(geomtact/[a-z-]+/\d+)"', path.read_text("utf-8"))}
+    files = sorted((ROOT / "docs" / "results").glob("*.json"))
+    schemas = {path.name: json.loads(path.read_text("utf-8")).get("schema") for path in files}
+    assert len(schemas) > 10
+    assert {name: schema for name, schema in schemas.items() if schema is not None and schema not in known} == {}
 
 
 @pytest.mark.parametrize("command", ["import geomtact", SHOW_HELP])

@@ -10,6 +10,7 @@ import typer
 from geomtact.cli.prepare import SensorName
 from geomtact.cli.shell import tell
 from geomtact.errors import UsageError
+from geomtact.files import write_text, write_whole
 
 if TYPE_CHECKING:
     from geomtact.sensing.calibrate import Calibrated
@@ -95,13 +96,14 @@ def calibrate(
         _print_membrane(found, ball_mm, other_presses, other_ball_mm, background)
     _write(found.sensor, sensor, out)
     if plot is not None:
-        plot.write_bytes(draw_calibration(found, 1e-3 * ball_mm))
+        picture = draw_calibration(found, 1e-3 * ball_mm)
+        write_whole(plot, lambda temporary: temporary.write_bytes(picture))
         typer.echo(f"wrote {plot}")
 
 
 def _write(calibrated: Sensor, geometry: str | None, out: Path) -> None:
     """Write a sensor's file; ``geometry`` is whose it has."""
-    out.write_text(calibrated.to_toml(), "utf-8")
+    write_text(out, calibrated.to_toml())
     typer.echo(f"wrote {out}: geomtact.contact_height(image, background, {str(out)!r}) tells heights")
     if geometry is None:
         typer.echo(
@@ -138,10 +140,11 @@ def _of_taxim(
 
 def _print_membrane(found: Calibrated, ball_mm: float, folder: Path, other_mm: float, background: Path) -> None:
     """Print how the membrane bulges, by presses of another ball."""
+    from geomtact.cli.frames import IMAGES
     from geomtact.sensing.calibrate import calibrated
     from geomtact.sensing.membrane import membrane_curvature
 
-    others = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp"))
+    others = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
     second = calibrated(others, 1e-3 * other_mm, background, sensor=found.sensor)
     curvature, std = membrane_curvature(found, 1e-3 * ball_mm, second, 1e-3 * other_mm)
     said = f"bulges by 1/{1e3 / curvature:.0f} mm" if curvature > 2 * std else "shows no bulge"

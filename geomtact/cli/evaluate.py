@@ -87,6 +87,7 @@ def judge_localize(
     effort: study_options.EffortLevel = Effort.balanced,
     seed: study_options.Seed = 1,
     out: study_options.Out = None,
+    plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
     """Judge posteriors: their gain, coverage and pose errors for each part.
@@ -94,7 +95,7 @@ def judge_localize(
     Half of the touches are felt by a rigid threshold, half by an elastic gel. Prints the figures apart and together, and
     writes them and every outcome to --out.
     """
-    judge(parts, unit, sensor, touches, noise, effort, seed, out, cache_dir)
+    study_file.plot(judge(parts, unit, sensor, touches, noise, effort, seed, out, cache_dir), plot)
 
 
 def judge(

@@ -12,6 +12,7 @@ from geomtact.cli import study_file, study_options
 from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import print_table, tell
 from geomtact.cli.simulate import NoiseName
+from geomtact.errors import InputError
 
 if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
@@ -61,6 +62,8 @@ def judge_registration(
     from geomtact.versions import versions
 
     content = study_file.load(out, SCHEMA)
+    if any("outcomes" not in part for part in content["parts"].values()):
+        raise InputError(f"{out}: holds figures alone, no outcomes to go on with; give another file with --out")
     content.pop("figures", None)
     pressed, strength = Sensor.load(sensor), study_options.noise_named(noise)
     for mesh in [_mesh(part, unit, pressed).with_symmetry() for part in parts or [*THESIS_PARTS, *SHAPES]]:

@@ -161,7 +161,7 @@ def _write(out: Path, posterior: Posterior, ranked: Sequence[Action], content: M
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "next_touch.json", to_text(content))
     picture = draw_next_touch(posterior, ranked, seed)
-    write_whole(out / "next_touch.png", lambda path: path.write_bytes(picture))
+    write_whole(out / "next_touch.png", lambda temporary: temporary.write_bytes(picture))
 
 
 def _row(place: int, action: Action) -> list[str]:

@@ -22,10 +22,11 @@ def load(out: Path | None, schema: str) -> dict[str, Any]:
         return {"schema": schema, "parts": {}}
     try:
         content = json.loads(out.read_text("utf-8"))
-        if content["schema"] != schema:
-            raise ValueError(content["schema"])
+        held = content["schema"]
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{out}: is there, but is no study of geomtact; give another file with --out") from None
+    if held != schema:
+        raise InputError(f"{out}: expected a study of the schema {schema}, got {held}; give another file with --out")
     return content
 
 

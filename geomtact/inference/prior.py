@@ -50,10 +50,17 @@ class GaussianPrior:
 
     def __post_init__(self) -> None:
         T, C = check_pose(self.T, "GaussianPrior"), np.asarray(self.covariance, float)
-        if C.shape != (6, 6) or not np.allclose(C, C.T) or not (np.linalg.eigvalsh(C) > 0).all():
+        wrong = None
+        if C.shape != (6, 6):
+            wrong = f"the shape {C.shape}"
+        elif not np.allclose(C, C.T):
+            wrong = "one that is not symmetric"
+        elif not (np.linalg.eigvalsh(C) > 0).all():
+            wrong = f"one with an eigenvalue of {np.linalg.eigvalsh(C).min():.2g}"
+        if wrong:
             raise InputError(
                 "GaussianPrior: expected a symmetric positive definite covariance (6, 6), variances in radians and metres "
-                "squared"
+                f"squared, got {wrong}"
             )
         object.__setattr__(self, "T", T)
         object.__setattr__(self, "covariance", C)

@@ -126,6 +126,6 @@ def _text(path: str | Path) -> str:
     try:
         return Path(path).read_text("utf-8")
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError(f"{path}: no such file; give one that exists") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from None
+        raise InputError(f"{path}: cannot be read as text ({error}); give a text file") from None

@@ -54,7 +54,7 @@ def write_all(
     summaries = summaries_of(posterior, modes)
     picture = draw(posterior, modes, summaries, shown) if reports else None
     if picture is not None and "png" in reports:
-        write_whole(folder / "report.png", lambda path: path.write_bytes(picture.whole))
+        write_whole(folder / "report.png", lambda temporary: temporary.write_bytes(picture.whole))
     timing = {**(timing_ms or {}), "report": 1e3 * (time.perf_counter() - began)}
     content = result(posterior, modes, settings, timing, parts)
     if picture is not None and "html" in reports:

@@ -129,5 +129,8 @@ def load_resnet(path: Path) -> Resnet:
     try:
         network.load_state_dict({name: value.float() for name, value in load_file(path).items()})
     except RuntimeError as error:
-        raise InputError(f"{path}: the weights of another network ({str(error).splitlines()[0]})") from None
+        raise InputError(
+            f"{path}: the weights of another network ({str(error).splitlines()[0]}); give a file that "
+            "'geomtact train --architecture resnet50' wrote"
+        ) from None
     return Resnet(network.eval(), side, hashlib.sha256(path.read_bytes()).hexdigest()[:16])

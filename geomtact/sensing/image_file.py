@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import ImageError, PoseError
+from geomtact.files import write_whole
 from geomtact.se3 import check_transforms
 
 MAX_BYTES = 256 * 2**20
@@ -77,7 +77,9 @@ def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] 
         pixels = np.where(array, 255, 0).astype(np.uint8)
     elif array.dtype.kind == "f" and array.ndim == 2:
         if not np.isfinite(array).all() or array.min(initial=0) < 0 or array.max(initial=0) > 0.0655:
-            raise ImageError("heights to write must lie between 0 and 0.0655 m; give metres")
+            raise ImageError(
+                f"heights to write: expected 0 to 0.0655 m, got {array.min():g} to {array.max():g}; give metres"
+            )
         pixels = np.round(array * 1e6).astype(np.uint16)
     elif array.dtype == np.uint8 and array.ndim in (2, 3):
         pixels = array
@@ -88,13 +90,9 @@ def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] 
         text = value if isinstance(value, str) else json.dumps(np.asarray(value).tolist())
         info.add_text(_PREFIX + key.removeprefix(_PREFIX), text)
     path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        # an image is written whole or not at all
-        Image.fromarray(pixels).save(partial, format="PNG", pnginfo=info)
-        os.replace(partial, path)
+        write_whole(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", pnginfo=info))
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise ImageError(f"{path}: cannot be written ({error.strerror or error}); give another folder") from None
 
 
@@ -111,7 +109,9 @@ def _read_bytes(path: Path) -> bytes:
     except FileNotFoundError:
         raise ImageError(f"{path}: no such file; give the path of an image") from None
     except OSError as error:
-        raise ImageError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise ImageError(
+            f"{path}: cannot be read ({error.strerror or error}); check the file and its permissions"
+        ) from None
 
 
 def _read_npy(data: bytes, path: Path) -> NDArray[Any]:

@@ -94,19 +94,24 @@ class Sensor:
         pitch_mm = [round(1e3 * p, 9) for p in self.pixel_pitch]
         need(all(p > 0 for p in self.pixel_pitch), f"pixel_pitch_mm must be positive, got {pitch_mm}")
         need(min(self.pixel_pitch) > 1e-6, f"pixel_pitch_mm {pitch_mm} is under a micrometre; give millimetres a pixel")
-        need(self.max_penetration > 0, "max_penetration_mm must be positive")
-        need(self.camera_distance >= 0, "camera_distance_mm must be >= 0 (0 means orthographic)")
+        need(self.max_penetration > 0, f"max_penetration_mm must be positive, got {1e3 * self.max_penetration:g}")
+        need(
+            self.camera_distance >= 0,
+            f"camera_distance_mm must be >= 0 (0: parallel rays), got {1e3 * self.camera_distance:g}",
+        )
         need(
             self.camera_distance == 0 or self.camera_distance > 2 * self.max_penetration,
-            "camera_distance_mm must exceed twice max_penetration_mm",
+            f"camera_distance_mm must exceed twice max_penetration_mm, {1e3 * self.max_penetration:g}, "
+            f"got {1e3 * self.camera_distance:g}",
         )
         half_diagonal = float(np.hypot(*self.half_window))
         need(
             self.membrane_radius == 0 or self.membrane_radius > 1.02 * half_diagonal,
-            f"membrane_radius_mm must be 0 (flat) or exceed the window's half diagonal, {1e3 * half_diagonal:.2f} mm",
+            f"membrane_radius_mm must be 0 (flat) or exceed the window's half diagonal, {1e3 * half_diagonal:.2f} mm, "
+            f"got {1e3 * self.membrane_radius:g}",
         )
         need(self.housing_depth is None or self.housing_depth >= 0, "housing_depth_mm must be >= 0")
-        need(self.height_noise > 0, "height_noise_mm must be positive")
+        need(self.height_noise > 0, f"height_noise_mm must be positive, got {1e3 * self.height_noise:g}")
         need(
             self.contact_method in CONTACT_METHODS,
             f"contact_method must be one of {', '.join(CONTACT_METHODS)}, got {self.contact_method!r}",
@@ -159,7 +164,7 @@ class Sensor:
                 raise SensorError(f"{origin}: unknown key {key!r}{nearest_name(key, _KEYS)}")
         for key in _REQUIRED:
             if key not in data:
-                raise SensorError(f"{origin}: the key {key!r} is missing")
+                raise SensorError(f"{origin}: the key {key!r} is missing; add it, see 'geomtact sensors'")
         for key, value in data.items():
             wanted = _KEYS[key]
             number = _number(value)

@@ -11,7 +11,7 @@ from typing import Any
 from safetensors.torch import save_file
 from torch import nn
 
-from geomtact.files import write_whole
+from geomtact.files import write_text, write_whole
 from geomtact.scoring.encoder import ARCHITECTURE
 from geomtact.scoring.network import Encoder
 from geomtact.training.augment import AUGMENTATIONS
@@ -59,7 +59,7 @@ def write_network(
         "bytes": path.stat().st_size,
     }
     text = json.dumps(own | card | {"versions": versions("kornia", "manifold3d")}, indent=1)
-    path.with_suffix(".json").write_text(text + "\n", "utf-8")
+    write_text(path.with_suffix(".json"), text + "\n")
 
 
 def draw_curve(curve: Curve, path: Path) -> None:
@@ -74,4 +74,4 @@ def draw_curve(curve: Curve, path: Path) -> None:
     axes.plot(curve.step, curve.validation, color="#0072B2", label="scenes that it never saw")
     axes.legend(frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=120)
+    write_whole(path, lambda temporary: figure.savefig(temporary, dpi=120))

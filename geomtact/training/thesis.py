@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError
-from geomtact.files import write_whole
+from geomtact.files import write_text, write_whole
 from geomtact.geometry.distance import PoseDistance
 from geomtact.progress import Progress
 from geomtact.scoring.encoder import THESIS
@@ -137,7 +137,7 @@ def train_thesis(
         "device": device,
         "loss": [float(np.mean(part)) for part in np.array_split(losses, min(50, len(losses)))],
     }
-    out.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n", "utf-8")
+    write_text(out.with_suffix(".json"), json.dumps(card, indent=1) + "\n")
 
 
 def _small_motions(n: int, radius: float, rng: np.random.Generator) -> Array:

@@ -76,7 +76,9 @@ def train(
         The loss is not a number any more; the last good state stays in ``folder``.
     """
     if len(scenes) <= settings.validation:
-        raise InputError(f"training: expected more than {settings.validation} scenes, got {len(scenes)}")
+        raise InputError(
+            f"training: expected more than {settings.validation} scenes, got {len(scenes)}; give more with --scenes"
+        )
     learned, judged = scenes[: -settings.validation], scenes[-settings.validation :]
     torch.manual_seed(settings.seed)
     network = Encoder(settings.width, settings.dimension)
