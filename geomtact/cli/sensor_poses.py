@@ -11,7 +11,7 @@ import numpy as np
 
 from geomtact.contact_space.carry import RigStd
 from geomtact.errors import InputError, nearest_name
-from geomtact.inference.localizer import check_rig
+from geomtact.inference.rig import check_rig
 from geomtact.se3 import Array, check_transforms
 
 _KEYS = ("T_world_sensor", "sensor", "std_mm", "std_deg")

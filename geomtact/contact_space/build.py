@@ -23,6 +23,8 @@ from geomtact.sensing.cast import Caster
 from geomtact.sensing.moments import moments
 from geomtact.sensing.sensor import Sensor
 
+_THREADS = 2
+
 
 @dataclass(frozen=True)
 class _Turn:
@@ -43,7 +45,6 @@ def build(
     approach: Approach | None,
     resolution: Resolution,
     progress: Progress | None = None,
-    threads: int = 2,
 ) -> dict[str, NDArray]:
     """Simulate every pose of the contact pose space.
 
@@ -70,7 +71,7 @@ def build(
         return [_touches(there, turn, frame, window) for turn in turns]
 
     turns: list[_Turn] = []
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(_THREADS) as pool:
         try:
             for k, some in enumerate(pool.map(one, range(len(directions.vectors)))):
                 turns += some

@@ -49,7 +49,7 @@ class ContactSpace:
         may fit in there, and no pose of it there is found by coming from outside (thesis 6.1.1, its footnote)."""
         points, normals = self.mesh.sample_surface(_LOOKED_AT)
         reached = allowed(normals, self.cones)
-        gap = self.caster.ways(points[reached], normals[reached])
+        gap = self.caster.gaps(points[reached], normals[reached])
         wide = np.isfinite(gap) & (gap > 2 * self.sensor.half_window.max())
         return float(wide.mean()) if len(gap) else 0.0
 

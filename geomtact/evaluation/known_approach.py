@@ -23,7 +23,7 @@ from geomtact.inference.localizer import Localizer
 from geomtact.registration.observability import Spread
 from geomtact.registration.rim import make_problem
 from geomtact.se3 import Array
-from geomtact.sensing.moments import without_specks
+from geomtact.sensing.moments import cleaned
 from geomtact.sensing.noise import Noise
 from geomtact.sensing.sensor import Sensor
 
@@ -95,7 +95,7 @@ def _answers(localizer: Localizer, touch: Touch, effort: str) -> list[Array]:
     first = grid.leading_cells(1)
     best = index.poses(first)
     ours = localizer.refinery.refine(grid, grid.observation.contact, 1).refined[int(first[0])].T[None]
-    mask = without_specks(touch.mask, sensor.pixel_area(touch.mask.shape))
+    mask = cleaned(touch.mask, sensor)
     spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
     theirs = thesis_refinement(localizer.space, spread)(Seen(mask, make_problem(mask, sensor, None)), best[0]).T[None]
     return [best, ours, theirs, after[:1], before, after]

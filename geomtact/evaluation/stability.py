@@ -91,14 +91,14 @@ def larger(mesh: Mesh, percent: float) -> Mesh:
     return replace(mesh, vertices=mesh.centre + (1 + percent / 100) * (mesh.vertices - mesh.centre))
 
 
-def scanned(mesh: Mesh, rms: float, seed: int = 0) -> Mesh:
+def scanned(mesh: Mesh, rms: float) -> Mesh:
     """The mesh as a scanner might give it: divided finely, and its surface displaced by a smooth random field of ``rms`` [m]."""
     import trimesh
 
     if rms == 0:
         return mesh
     fine = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _BUMP / 2))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     # plane waves of random directions and lengths: smooth, and nowhere special
     waves = rng.normal(size=(64, 3)) / _BUMP
     phase = fine.vertices @ waves.T + rng.uniform(0, 2 * np.pi, 64)
@@ -106,13 +106,13 @@ def scanned(mesh: Mesh, rms: float, seed: int = 0) -> Mesh:
     return replace(mesh, vertices=fine.vertices + off[:, None] * fine.vertex_normals, faces=fine.faces)
 
 
-def knobbed(mesh: Mesh, radius: float, seed: int = 0) -> Mesh:
+def knobbed(mesh: Mesh, radius: float) -> Mesh:
     """The mesh with ``_KNOBS`` balls of ``radius`` [m] sunk by half into its surface, at random."""
     import trimesh
 
     if radius == 0:
         return mesh
-    points, _ = mesh.sample_surface(_KNOBS, seed=seed)
+    points, _ = mesh.sample_surface(_KNOBS, seed=0)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     vertices = [mesh.vertices, *(ball.vertices + point for point in points)]
     first = len(mesh.vertices) + len(ball.vertices) * np.arange(_KNOBS)

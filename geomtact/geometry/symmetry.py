@@ -41,7 +41,7 @@ class Symmetry:
     def sampled(self, n: int = 72) -> Array:
         """Elements (m, 4, 4) with continuous ones discretised: ``n`` turns of an axis, ``n * n`` rotations of a sphere.
 
-        For measuring distances modulo symmetry. The turns of an axis start at 0 and are equally spaced.
+        For priors and pictures; distances have closed forms. The turns of an axis start at 0 and are equally spaced.
         """
         if self.axis is not None:
             turns = Rotation.from_rotvec(2 * np.pi / n * np.arange(n)[:, None] * self.axis).as_matrix()

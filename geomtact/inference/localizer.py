@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from geomtact.contact_space.index import Index
 from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import default_cache_dir, open_index
-from geomtact.errors import InputError, UsageError, nearest_name
+from geomtact.errors import UsageError, nearest_name
 from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.inference.evidence import counted_once, digest
@@ -29,13 +28,14 @@ from geomtact.inference.prior import opened, prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.inference.refine_by_outline import few_are_left, refine_by_outline
 from geomtact.inference.refine_together import refine_together
+from geomtact.inference.rig import views_of
 from geomtact.inference.search import View
 from geomtact.planning.next_touch import Action, next_touch
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import Calibration, posterior_log_prob
 from geomtact.scoring.catalogue import DEFAULT_SCORER
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
-from geomtact.se3 import Array, check_pose, check_transforms
+from geomtact.se3 import Array, check_pose
 from geomtact.sensing.contact import Contact, Shown
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
@@ -62,8 +62,6 @@ class Effort:
 
 
 _HOLLOW = 0.01  # share of the surface in hollows that the sensor may fit into, from which it is warned of
-_HALL = 100.0  # m from the origin from which a translation is taken to be in millimetres
-_ROOM = 10.0  # m between two sensors from which translations are taken to be in millimetres
 EFFORTS = {
     "fast": Effort("blocks", 0),
     "balanced": Effort("cells", 5, thorough=False),
@@ -171,7 +169,7 @@ class Localizer:
         ImageError, PoseError, UsageError, InputError
         """
         how = _effort(effort)
-        images, frame, T_frame_sensor = _views(image, T_world_sensor)
+        images, frame, T_frame_sensor = views_of(image, T_world_sensor)
         backgrounds = background if isinstance(background, list | tuple) else [background] * len(images)
         if len(backgrounds) != len(images):
             raise UsageError(f"localize: expected one background, or {len(images)}, got {len(backgrounds)}")
@@ -338,51 +336,6 @@ def _effort(effort: str | Effort) -> Effort:
 
 def _worth(scored_by: str, calibration: Calibration) -> dict[str, Any]:
     return {"scored_by": scored_by, "temperature": calibration.temperature, "floor": calibration.floor}
-
-
-def _views(image: Any, T_world_sensor: Any) -> tuple[list[Any], str, Array]:
-    """The images, the posterior's frame, and the sensors' poses (n, 4, 4) in it."""
-    images = list(image) if isinstance(image, list | tuple) else [image]
-    n = len(images)
-    if not n:
-        raise UsageError("localize: expected an image, got an empty list")
-    if T_world_sensor is None:
-        if n > 1:
-            raise UsageError(f"localize: {n} images need T_world_sensor, the pose (4, 4) of each sensor in the world")
-        return images, "sensor", np.eye(4)[None]
-    T = check_transforms(T_world_sensor, "T_world_sensor")
-    if T.shape not in ([(4, 4), (1, 4, 4)] if n == 1 else [(n, 4, 4)]):
-        raise UsageError(f"T_world_sensor: expected one pose for each of {n} images, ({n}, 4, 4), got shape {T.shape}")
-    T = T.reshape(n, 4, 4)
-    check_rig(T)
-    return images, "world", T
-
-
-def check_rig(T_world_sensor: Array, name: str = "T_world_sensor") -> None:
-    """Whether sensors at ``T_world_sensor`` (n, 4, 4) can stand together; ``name`` is theirs in messages.
-
-    Raises
-    ------
-    InputError
-        Two are farther apart than a room is long, or at the same pose; or one is farther from the origin than a hall is long.
-    """
-    T = T_world_sensor
-    far = np.linalg.norm(T[:, :3, 3], axis=1)
-    if far.max() > _HALL:
-        raise InputError(
-            f"{name}: sensor {int(far.argmax()) + 1} is {far.max():.3g} m from the origin; give translations in metres"
-        )
-    for i, j in combinations(range(len(T)), 2):
-        apart = float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]))
-        if apart > _ROOM:
-            raise InputError(
-                f"{name}: sensors {i + 1} and {j + 1} are {apart:.3g} m apart; give translations in metres"
-            )
-        if np.abs(T[i] - T[j]).max() < 1e-6:
-            raise InputError(
-                f"{name}: sensors {i + 1} and {j + 1} are at the same pose; give each sensor its own, or follow "
-                "one sensor over time with track"
-            )
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from geomtact.scoring.likelihood import cast_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array
 from geomtact.sensing.contact import Contact
-from geomtact.sensing.moments import moments, without_specks
+from geomtact.sensing.moments import cleaned, moments
 
 _SURFACE_POINTS = 30_000  # of the object
 TRUST = 0.5  # of a likelihood at one pose, in weighing the cells around several
@@ -65,7 +65,7 @@ class Refinery:
         if not len(cells):
             return posterior
         index, sensor = posterior.index, self.space.sensor
-        shown = without_specks(contact.shown, sensor.pixel_area(contact.mask.shape))
+        shown = cleaned(contact.shown, sensor)
         problem, mask = make_problem(shown, sensor, contact.height), shown > 0.5
         start = index.poses(cells)
         candidates = [start, self._centred(posterior, mask, cells, start)]

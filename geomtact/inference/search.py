@@ -27,7 +27,7 @@ from geomtact.scoring.likelihood import cast_log_likelihood, height_log_likeliho
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact, Shown
-from geomtact.sensing.moments import without_specks
+from geomtact.sensing.moments import cleaned
 
 _SHAPE = (24, 32)  # of the casts that choose among many
 _DRAWS = 8  # poses drawn within each
@@ -61,7 +61,7 @@ class View:
         """The contact without specks, at the image's own resolution."""
         assert self.contact is not None
         shown = self.contact.shown
-        return without_specks(shown, self.refinery.space.sensor.pixel_area(shown.shape))
+        return cleaned(shown, self.refinery.space.sensor)
 
     @property
     def mask(self) -> NDArray[np.bool_]:

@@ -21,7 +21,6 @@ def grid_of_touches(
     side: ArrayLike | None = None,
     reachable: Callable[[Array], bool] | None = None,
     made: Iterable[ArrayLike] = (),
-    cost: float = 1.0,
     seed: int = 0,
 ) -> list[Touch]:
     """Touches from round about, aimed all over the region in which the object may be.
@@ -36,7 +35,6 @@ def grid_of_touches(
         sensor, along its +z
     reachable : whether the robot can bring the sensor to a pose (4, 4); asked of where it starts and of where it ends
     made : T_world_sensor (4, 4) of touches made before; what is nearly the same is left out, for it errs in the same way
-    cost : of each touch
     seed : of the poses that tell the region
     """
     check_contact(posterior)
@@ -59,7 +57,7 @@ def grid_of_touches(
                 first, last = (transform(R, R @ [x, y, z]) for z in (start, end))
                 again = any(_same_way(first, T, window.min() / 4) for T in before)
                 if not again and (reachable is None or (reachable(first) and reachable(last))):
-                    out.append(Touch(first, float(end - start), cost))
+                    out.append(Touch(first, float(end - start)))
     return out
 
 

@@ -22,7 +22,7 @@ from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.contact import Shown
-from geomtact.sensing.moments import without_specks
+from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
 
 WEIGHTS = Path(__file__).with_name("encoder.safetensors")  # trained once for all parts, with a card beside it
@@ -75,7 +75,7 @@ class EncoderScorer(VectorScorer):
     def seen(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""
         assert isinstance(self.descriptor, Tower)
-        image = _lying(without_specks(mask, index.sensor.pixel_area(mask.shape))[None].astype(np.float32))[0]
+        image = _lying(cleaned(mask, index.sensor)[None].astype(np.float32))[0]
         small = cv2.resize(image, SHAPE[::-1], interpolation=cv2.INTER_AREA)
         return vector(self.descriptor.weights, small, self.descriptor.cell)
 

@@ -118,12 +118,14 @@ def fitted_scorer(
 ) -> FittedScorer:
     """The scorer ``name`` calibrated for ``index``; read from ``folder`` where it was fitted before.
 
-    ``name`` is one of ``SCORERS``, or the path of an encoder's weights (.safetensors).
+    ``name`` is one of ``SCORERS``, or the path of an encoder's or ResNet-50's weights (.safetensors).
 
     Raises
     ------
     UsageError
         No scorer of that name.
+    InputError
+        The file of weights cannot be used.
     MeshError
         The object can hardly be touched, so nothing can be calibrated; or its touches are all alike.
     """

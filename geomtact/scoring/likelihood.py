@@ -18,7 +18,7 @@ from geomtact.contact_space.index import Index
 from geomtact.scoring.overlap import overlaps, to_grid
 from geomtact.se3 import Array
 from geomtact.sensing.contact import Shown
-from geomtact.sensing.moments import without_specks
+from geomtact.sensing.moments import cleaned
 
 THRESHOLDS = (0.0, 0.25, 0.5)  # of the penetration
 SOFTNESS = (0.1e-3, 0.4e-3)  # m
@@ -43,7 +43,7 @@ class PixelLikelihood:
 
     def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """Log likelihood (P, n) of ``mask`` (h, w) at every pose."""
-        seen = to_grid(without_specks(mask, index.sensor.pixel_area(mask.shape)), index.resolution.mask_shape)
+        seen = to_grid(cleaned(mask, index.sensor), index.resolution.mask_shape)
         depths = np.asarray(index.resolution.penetrations)
         P, bin_size = len(depths), depths[0] * 2
         # between two contours the surface lies in the middle; beyond the last ones it lies a bin away

@@ -18,7 +18,7 @@ from scipy.special import gammaln
 from geomtact.contact_space.index import Index
 from geomtact.se3 import Array
 from geomtact.sensing.contact import Shown
-from geomtact.sensing.moments import moments, without_specks
+from geomtact.sensing.moments import cleaned, moments
 
 _CHUNK = 1 << 15
 
@@ -91,4 +91,4 @@ class Moments:
 
 
 def _seen(index: Index, mask: Shown) -> NDArray[np.float32]:
-    return moments(without_specks(mask, index.sensor.pixel_area(mask.shape))[None], index.sensor)[0]
+    return moments(cleaned(mask, index.sensor)[None], index.sensor)[0]

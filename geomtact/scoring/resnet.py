@@ -84,7 +84,7 @@ def _conv(inside: int, outside: int, size: int, stride: int = 1) -> tuple[nn.Mod
     return nn.Conv2d(inside, outside, size, stride, size // 2, bias=False), nn.BatchNorm2d(outside)
 
 
-def make_network(numbers: int = NUMBERS) -> nn.Module:
+def make_network() -> nn.Module:
     """ResNet-50 (He et al. 2016) whose last activation is the identity, for images (n, 3, s, s)."""
     layers: list[nn.Module] = [*_conv(3, 64, 7, 2), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2, 1)]
     inside = 64
@@ -94,7 +94,7 @@ def make_network(numbers: int = NUMBERS) -> nn.Module:
             last = stage == len(_BLOCKS) - 1 and block == blocks - 1
             layers.append(_Bottleneck(inside, 64 << stage, stride, last))
             inside = 256 << stage
-    network = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(inside, numbers))
+    network = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(inside, NUMBERS))
     for module in network.modules():
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")

@@ -17,7 +17,7 @@ from geomtact.files import write_whole
 from geomtact.progress import Progress
 from geomtact.scoring.overlap import to_grid
 from geomtact.sensing.contact import Shown
-from geomtact.sensing.moments import without_specks
+from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
 
 _BATCH = 4096  # contacts described at a time
@@ -68,7 +68,7 @@ class VectorScorer:
 
     def seen(self, index: Index, mask: Shown) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""
-        small = to_grid(without_specks(mask, index.sensor.pixel_area(mask.shape)), index.resolution.mask_shape)
+        small = to_grid(cleaned(mask, index.sensor), index.resolution.mask_shape)
         return self.descriptor.describe(small[None], index.sensor)[0]
 
 

@@ -104,7 +104,7 @@ class Caster:
             out[part][self._camera_inside(sensor, T[part])] = np.inf
         return out
 
-    def ways(self, points: Array, directions: Array) -> Array:
+    def gaps(self, points: Array, directions: Array) -> Array:
         """How far (n,) [m] it is from ``points`` (n, 3) of the surface along unit ``directions`` (n, 3) to the surface again;
         +inf where it is not met."""
         rows = (points - self._centre + _OFF * directions, directions)

@@ -41,7 +41,7 @@ def read_image(path: str | Path) -> NDArray[Any]:
 def read_metadata(path: str | Path) -> dict[str, Any]:
     """What ``geomtact simulate`` wrote into a PNG, under the keys it has there; {} where there is nothing.
 
-    ``geomtact:object`` and ``geomtact:sensor`` are strings, ``geomtact:T_sensor_object`` an array (4, 4) [m].
+    ``geomtact:object``, ``geomtact:unit`` and ``geomtact:sensor`` are strings, ``geomtact:T_sensor_object`` an array (4, 4) [m].
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -67,7 +67,7 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
 def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] | None = None) -> None:
     """Write a PNG: a mask as 0/255, a height map [m] as 16-bit micrometres, an RGB image (uint8) as it is.
 
-    ``metadata``: ``object``, ``sensor``, ``T_sensor_object`` (4, 4), with or without the prefix ``geomtact:`` that they
+    ``metadata``: ``object``, ``unit``, ``sensor``, ``T_sensor_object`` (4, 4), with or without the prefix ``geomtact:`` that they
     carry in the file.
     """
     from PIL import Image, PngImagePlugin

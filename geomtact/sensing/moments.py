@@ -49,6 +49,11 @@ def _powers(sensor: Sensor, h: int, w: int) -> tuple[NDArray[np.float32], NDArra
     return np.ascontiguousarray(X.T), Y, float((x[1] - x[0]) * (y[1] - y[0]))
 
 
+def cleaned(mask: NDArray[Any], sensor: Sensor) -> NDArray[Any]:
+    """:func:`without_specks`, of a mask (h, w) that covers the window."""
+    return without_specks(mask, sensor.pixel_area(mask.shape))
+
+
 def without_specks(mask: NDArray[Any], pixel_area: float) -> NDArray[Any]:
     """``mask`` (h, w), of pixels of ``pixel_area`` [m^2], without patches that are dust beside a far larger contact; bool, or the
     probability of contact at each pixel."""

@@ -35,7 +35,7 @@ KEY_SHAPE, TOUCH_SHAPE = (24, 32), (48, 64)
 
 @dataclass(frozen=True)
 class Scene:
-    """Contacts of a part, masks packed into words and, for tall windows, turned by 90 degrees to lie.
+    """Contacts of a part, masks packed into words and, for tall windows, mirrored about the diagonal to lie.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ class _View:
         return depth[self.my : -self.my, self.mx : -self.mx] > 0, elastic
 
     def lying(self, masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Flat masks (..., h w), or masks (n, h, w), of a tall window turned by 90 degrees; others as they are."""
+        """Flat masks (..., h w), or masks (n, h, w), of a tall window mirrored about the diagonal; others as they are."""
         if masks.shape[-1] == np.prod(self.resolution.mask_shape):
             masks = masks.reshape(*masks.shape[:-1], *self.resolution.mask_shape)
         if self.sensor.tall:

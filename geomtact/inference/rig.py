@@ -1,0 +1,59 @@
+"""Where the sensors stand that show an object at the same time, and whether they can stand there together."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from geomtact.errors import InputError, UsageError
+from geomtact.se3 import Array, check_transforms
+
+_HALL = 100.0  # m from the origin from which a translation is taken to be in millimetres
+_ROOM = 10.0  # m between two sensors from which translations are taken to be in millimetres
+
+
+def views_of(image: Any, T_world_sensor: Any) -> tuple[list[Any], str, Array]:
+    """The images, the posterior's frame, and the sensors' poses (n, 4, 4) in it."""
+    images = list(image) if isinstance(image, list | tuple) else [image]
+    n = len(images)
+    if not n:
+        raise UsageError("localize: expected an image, got an empty list")
+    if T_world_sensor is None:
+        if n > 1:
+            raise UsageError(f"localize: {n} images need T_world_sensor, the pose (4, 4) of each sensor in the world")
+        return images, "sensor", np.eye(4)[None]
+    T = check_transforms(T_world_sensor, "T_world_sensor")
+    if T.shape not in ([(4, 4), (1, 4, 4)] if n == 1 else [(n, 4, 4)]):
+        raise UsageError(f"T_world_sensor: expected one pose for each of {n} images, ({n}, 4, 4), got shape {T.shape}")
+    T = T.reshape(n, 4, 4)
+    check_rig(T)
+    return images, "world", T
+
+
+def check_rig(T_world_sensor: Array, name: str = "T_world_sensor") -> None:
+    """Whether sensors at ``T_world_sensor`` (n, 4, 4) can stand together; ``name`` is theirs in messages.
+
+    Raises
+    ------
+    InputError
+        Two are farther apart than a room is long, or at the same pose; or one is farther from the origin than a hall is long.
+    """
+    T = T_world_sensor
+    far = np.linalg.norm(T[:, :3, 3], axis=1)
+    if far.max() > _HALL:
+        raise InputError(
+            f"{name}: sensor {int(far.argmax()) + 1} is {far.max():.3g} m from the origin; give translations in metres"
+        )
+    for i, j in combinations(range(len(T)), 2):
+        apart = float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]))
+        if apart > _ROOM:
+            raise InputError(
+                f"{name}: sensors {i + 1} and {j + 1} are {apart:.3g} m apart; give translations in metres"
+            )
+        if np.abs(T[i] - T[j]).max() < 1e-6:
+            raise InputError(
+                f"{name}: sensors {i + 1} and {j + 1} are at the same pose; give each sensor its own, or follow "
+                "one sensor over time with track"
+            )
