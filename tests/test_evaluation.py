@@ -16,6 +16,7 @@ from geomtact.errors import InputError
 from geomtact.evaluation import known_approach, proper, study
 from geomtact.evaluation.pose_error import add, add_s, coverage, mssd, random_add
 from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.report.studies import draw
 from geomtact.se3 import exp, log, random_rotations, transform
 from geomtact.sensing.noise import CLEAN, MODERATE
 
@@ -218,9 +219,11 @@ def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tm
     monkeypatch.setattr(study, "expected_random_add", lambda localizer: 5.0)
     common = ["evaluate", "localize", "ball", "--sensor", "gelsight-mini", "--effort", "fast"]
     common += ["--cache-dir", str(cache), "--touches", "6"]
-    done = CliRunner().invoke(app, [*common, "--out", str(out)])
+    picture = tmp_path / "study.png"
+    done = CliRunner().invoke(app, [*common, "--out", str(out), "--plot", str(picture)])
     assert done.exit_code == 0, done.output
     whole = json.loads(out.read_text())
+    assert picture.read_bytes() == draw(whole)
     part = whole["parts"]["ball"]
     assert whole["schema"] == "geomtact/study/3" and whole["versions"]["numpy"] == np.__version__
     assert part["settings"]["object_sha256"] == localizer.mesh.sha256 and part["settings"]["seed"] == 1
@@ -238,6 +241,12 @@ def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tm
     assert CliRunner().invoke(app, [*common, "--out", str(out)]).exit_code == 0
     assert asked == [2]
     assert json.loads(out.read_text())["parts"]["ball"] == part
+    stopped["schema"] = "geomtact/study/2"
+    (tmp_path / "older.json").write_text(json.dumps(stopped))
+    older = CliRunner().invoke(app, [*common, "--out", str(tmp_path / "older.json")])
+    assert (
+        older.exit_code == 3 and "expected a study of the schema geomtact/study/3, got geomtact/study/2" in older.output
+    )
     held = out.read_bytes()
     other = CliRunner().invoke(app, [*common, "--out", str(out), "--seed", "2"])
     assert other.exit_code == 3 and "other settings (seed)" in other.output

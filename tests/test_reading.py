@@ -349,6 +349,15 @@ def test_metadata_of_other_files_is_empty_and_a_broken_pose_is_named(tmp_path, b
         read_metadata(tmp_path / "wrong.png")
 
 
+def test_a_mask_that_hardly_is_a_touch_is_told_of():
+    dot = np.zeros(SHAPE, bool)
+    dot[100, 100] = True
+    for mask, said in ((dot, "as dust does"), (~MASK, "if that is where nothing touches, invert it")):
+        (warning,) = read_observation(mask, MINI).warnings
+        assert said in warning
+    assert read_observation(MASK, MINI).warnings == []
+
+
 def test_what_cannot_be_written_is_refused(tmp_path):
     with pytest.raises(ImageError, match=r"expected 0 to 0.0655 m, got 0 to \S+; give metres"):
         write_image(tmp_path / "h.png", HEIGHT * 1e3)

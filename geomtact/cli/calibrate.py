@@ -58,6 +58,7 @@ def calibrate(
             raise UsageError(f"{path}: expected a name that ends in {suffix}; give one")
         if path is not None and not path.parent.is_dir():
             raise UsageError(f"{path}: there is no folder {path.parent}; make it, or give another")
+    presses = [path for path in presses if path.absolute() != background.absolute()] or presses  # *.png names it, too
     folder = next((path for path in presses if path.is_dir()), None)
     if folder is not None:
         raise UsageError(f"{folder}: expected images, got a folder; give {folder}/*.png")

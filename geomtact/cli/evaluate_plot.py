@@ -17,7 +17,7 @@ def plot_study(
         str | None, typer.Option("--picture", help="Which one, where a study has several.", show_default=False)
     ] = None,
 ) -> None:
-    """Draw the picture of a study from its JSON alone, as the study itself would with --plot."""
+    """Draw the picture of a study from its JSON alone."""
     import json
 
     from geomtact.errors import InputError

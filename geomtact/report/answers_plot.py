@@ -26,7 +26,7 @@ def draw_answers(content: Mapping[str, Any]) -> bytes:
             levels = np.sort([outcome[field] for outcome in part["outcomes"]])
             axes.step([0, *levels, 1], np.linspace(0, 1, len(levels) + 2), where="post", color=colour, label=name)
         recall = part["figures"]["all"]["recall"]
-        shares = np.array([[r["share"], r["low"], r["high"]] for r in recall.values()]).T
+        shares = np.array(list(recall.values())).T  # with their intervals
         found.plot([int(k) for k in recall], shares[0], "o-", color=colour)
         found.fill_between([int(k) for k in recall], *shares[1:], color=colour, alpha=0.15, lw=0)
     n = min(len(part["outcomes"]) for part in content["parts"].values())
@@ -37,9 +37,11 @@ def draw_answers(content: Mapping[str, Any]) -> bytes:
         mass = np.array([0.0, 1.0])
         axes.fill_between(mass, mass - _BAND / np.sqrt(n), mass + _BAND / np.sqrt(n), color="0.9", lw=0)
         axes.plot(mass, mass, color="0.5", lw=1)
-        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="mass of the posterior", ylabel="share of true poses", title=title)
+        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="mass of the posterior", ylabel="share of true poses")
+        axes.set_title(title, fontsize=10)
         axes.set_aspect("equal")
-    found.set(xscale="log", xlabel="first modes", ylabel="share of touches", title="a right mode among the first ones")
+    found.set(xscale="log", xlabel="first modes", ylabel="share of touches")
+    found.set_title("a right mode among the first ones", fontsize=10)
     found.set_ylim(bottom=0)
     found.set_xticks([1, 2, 5, 10], ["1", "2", "5", "10"], minor=False)
     found.set_xticks([], minor=True)

@@ -145,11 +145,14 @@ def facts(posterior: Posterior) -> list[str]:
         if empty
         else []
     )
+    left = f"one part in {np.exp(min(known, 700)):,.0f} of all poses that touch is left"
+    if known >= 14:
+        left = "less than one part in a million of all poses that touch is left"
+    elif known < 0.7:
+        left = f"{100 * np.exp(-known):.0f} % of all poses that touch are left"
     return [
         *said,
-        f"{known:.1f} nats are known: one part in {np.exp(min(known, 700)):,.0f} of all poses that touch is left."
-        if known < 14
-        else f"{known:.1f} nats are known: less than one part in a million of all poses that touch is left.",
+        f"{known:.1f} nats are known: {left}.",
         f"{posterior.effective_poses:,.0f} of the grid's {len(posterior.index):,} poses carry the probability.",
     ]
 

@@ -21,6 +21,8 @@ from geomtact.sensing.sensor import Sensor
 __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observation", "write_image"]
 
 KINDS = ("auto", "mask", "height", "reading")
+_DUST = 0.1e-6  # m^2 of contact, under which a touch tells nothing (docs/stability.md)
+_MOST = 0.6  # share of a mask in contact, from which on it may be a negative
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,15 @@ def read_observation(
             )
     else:
         contact = _reading(array, name, sensor, background, warnings)
-    if contact.mask.all():
+    share, area = float(contact.mask.mean()), float(contact.mask.sum() * sensor.pixel_area(contact.mask.shape))
+    if share == 1:
         warnings.append(f"{name}: every pixel is in contact: the contact fills the image, so its outline is not seen")
+    elif kind == "mask" and share > _MOST:
+        warnings.append(
+            f"{name}: {100 * share:.0f} % of the mask is contact; if that is where nothing touches, invert it"
+        )
+    elif 0 < area < _DUST:
+        warnings.append(f"{name}: the contact covers {1e6 * area:.2g} mm2, as dust does: it tells next to nothing")
     return Observation(contact, kind, warnings, array)
 
 
