@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 from typer.testing import CliRunner
 
 from geomtact import InputError, UsageError, contact_mask
@@ -20,10 +21,12 @@ from geomtact.evaluation.readings import (
     overlap,
     summarise_contacts,
 )
+from geomtact.geometry.mesh import Mesh
 from geomtact.sensing.image_file import read_image
 from geomtact.sensing.mask_network import CHANNELS, WEIGHTS, MaskNetwork, contact_probability, seen
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
+from geomtact.training import presses
 from geomtact.training.presses import PRESSES, READINGS, make_presses, press_part
 from geomtact.training.state import read_weights
 from geomtact.training.train_mask import Settings, train_mask, validate, write_mask_network
@@ -52,6 +55,20 @@ def test_a_press_shows_colour_around_its_contact(parts):
         size = np.linalg.norm(part.seen[:, :, :3].astype(float), axis=2)
         more = [size[:, i][rim].mean() / size[:, i][~far].mean() for i in range(READINGS)]
         assert np.median(more) > 2 and min(more) > 1.5, more
+
+
+def test_a_gel_that_bulges_is_touched_by_a_plate_as_hertz_has_it(monkeypatch):
+    """A disk in the middle, of radius sqrt(R d)."""
+    plate = trimesh.creation.box((0.2, 0.2, 0.01))
+    monkeypatch.setattr(presses, "_part", lambda *_: Mesh(plate.vertices, plate.faces, "plate", "m"))
+    fixed = {"FLAT": 1.0, "TILT": 0.0, "CURVED": 1.0, "BULGES": (0.03, 0.03), "DEPTHS": (1e-3, 1e-3)}
+    for name, value in (fixed | {"THICKNESS": (10.0, 10.0), "PRESSES": 2}).items():
+        monkeypatch.setattr(presses, name, value)
+    for contact in press_part(1, 7).contact.astype(float):
+        pixel = presses.PITCH * presses.SHAPE[0] / len(contact)
+        assert contact.sum() * pixel**2 == pytest.approx(np.pi * 0.03 * 1e-3, rel=0.03)
+        middle = np.average(np.indices(contact.shape).reshape(2, -1), axis=1, weights=contact.ravel())
+        assert middle == pytest.approx((np.array(contact.shape) - 1) / 2, abs=0.3)
 
 
 def test_presses_are_made_once(tmp_path, monkeypatch):

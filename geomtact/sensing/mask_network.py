@@ -55,7 +55,8 @@ def contact_probability(change: ArrayLike, image: ArrayLike) -> Image:
     x = torch.from_numpy(seen(change, image))
     turned = [(), (-1, -2)]
     with torch.inference_mode():
-        log_odds = _network()(torch.stack([x.flip(axes) for axes in turned]))
+        views = torch.stack([x.flip(axes) for axes in turned]).contiguous(memory_format=torch.channels_last)
+        log_odds = _network()(views)
         mean = torch.stack([each.flip(axes) for each, axes in zip(log_odds, turned, strict=True)]).mean(0).numpy()
     full = cv2.resize(mean, np.shape(change)[1::-1], interpolation=cv2.INTER_CUBIC)
     return np.asarray(1 / (1 + np.exp(-full)), np.float32)
@@ -86,7 +87,7 @@ def side_shape(shape: tuple[int, ...]) -> tuple[int, int]:
 def _network() -> MaskNetwork:
     network = MaskNetwork()
     network.load_state_dict({name: value.float() for name, value in load_file(WEIGHTS).items()})
-    return network.eval()
+    return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]  # faster by half
 
 
 def _block(before: int, after: int) -> nn.Sequential:

@@ -27,11 +27,12 @@ SHAPE = (120, 160)  # of what the camera shows
 READINGS = 4  # of each press
 PITCH = 0.125e-3  # m
 PRESSES = 12  # of each part
-SIZES = (0.3, 4.0)  # longest side of a part, in long sides of the window
-BALLS, RADII = 0.25, (1.5e-3, 12e-3)  # share of balls among the parts, and their radius [m]
+SIZES = (0.5, 4.0)  # longest side of a part, in long sides of the window
+BALLS, RADII = 0.3, (1.5e-3, 12e-3)  # share of balls among the parts, and their radius [m]
 FLAT, TILT = 0.45, 0.05  # share of presses that lie on a face, and by how much that is tilted [rad]
-DEPTHS = (0.15e-3, 2.5e-3)  # m
-THICKNESS = (1.5e-3, 30e-3)  # of the gel [m]
+DEPTHS = (0.3e-3, 3.5e-3)  # m
+THICKNESS = (0.5e-3, 30e-3)  # of the gel [m]; a thin one hardly sinks beside the part
+CURVED, BULGES = 0.5, (25e-3, 120e-3)  # share of gels that bulge towards the part, and the radius of their membrane [m]
 _AROUND = 30  # px beyond what is shown, in which a part goes on
 _TRIES = 6
 _LEAST = 60  # px of contact
@@ -60,13 +61,15 @@ def make_presses(
 
 
 def press_part(i: int, seed: int) -> Presses:
-    """Presses of the part number ``i``: turned any way, anywhere in the window, log-uniform in depth and in the gel's
-    thickness; those that lamps do not show are left out."""
+    """Presses of the part number ``i``: turned any way, anywhere in the window, log-uniform in depth, in the gel's thickness
+    and in the radius of those that bulge; those that lamps do not show are left out."""
     rng = np.random.default_rng([seed, 31, i])
     h, w = (n + 2 * _AROUND for n in SHAPE)
     sensor = Sensor(f"{w} x {h}", (w, h), (PITCH, PITCH), 0.0, DEPTHS[1])
     part = _part(rng, w * PITCH)
     caster = Caster(part.vertices, part.faces, threads=1)
+    y, x = ((np.arange(n) - (n - 1) / 2) * PITCH for n in (h, w))
+    shown = np.s_[_AROUND:-_AROUND, _AROUND:-_AROUND]
     sights: list[list[Any]] = []
     contacts: list[NDArray[np.float32]] = []
     for _ in range(_TRIES * PRESSES):
@@ -74,16 +77,16 @@ def press_part(i: int, seed: int) -> Presses:
             break
         at = rng.uniform(-0.5, 0.5, 2) * PITCH * SHAPE[::-1]
         T = transform(_turned(part, rng), [*at, w * PITCH * SIZES[1]])
-        depth = caster.depths(sensor, T[None], (h, w))[0]
+        bulge = (x**2 + y[:, None] ** 2) / (2 * np.exp(rng.uniform(*np.log(BULGES)))) * (rng.random() < CURVED)
+        depth = caster.depths(sensor, T[None], (h, w))[0] - bulge
         deepest = float(depth.max())
         if not np.isfinite(deepest):
             continue
         depth = depth - deepest + np.exp(rng.uniform(*np.log(DEPTHS)))
         contact, height = elastic_contact(depth, (PITCH, PITCH), float(np.exp(rng.uniform(*np.log(THICKNESS)))))
-        shown = np.s_[_AROUND:-_AROUND, _AROUND:-_AROUND]
         if contact[shown].sum() < _LEAST:
             continue
-        readings = [random_sight(height[shown] / PITCH, rng) for _ in range(READINGS)]
+        readings = [random_sight(height[shown] / PITCH, rng, bulge[shown] / PITCH) for _ in range(READINGS)]
         if all(reading is not None for reading in readings):
             sights.append(readings)
             contacts.append(to_side(contact[shown].astype(np.float32)))

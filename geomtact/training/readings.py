@@ -22,48 +22,55 @@ Image = NDArray[np.float32]
 SKIN = 2.0  # px over which the gel's coating rounds it off, at most
 ELEVATION = (6.0, 45.0)  # deg of lamps above the gel
 AMBIENT = 1.5  # of what lamps make of the untouched gel, at most
-BRIGHT = 0.25  # share of readings of which one channel is so bright that it may be blown out
+BRIGHT = 0.35  # share of readings of which one channel is so bright that it may be blown out
+NOISE = (0.3 / 255, 6 / 255)
 _DRAWS = 4
 
 
-def random_reading(height: NDArray[np.floating], rng: np.random.Generator) -> tuple[Image, Image]:
-    """A reading (h, w, 3) of a gel pressed in by ``height`` (h, w) [px], and its background (h, w, 3)."""
+def random_reading(
+    height: NDArray[np.floating], rng: np.random.Generator, rest: NDArray[np.floating] | float = 0.0
+) -> tuple[Image, Image]:
+    """A reading (h, w, 3) of a gel pressed in by ``height`` (h, w) [px], and its background (h, w, 3). Untouched it lies at
+    ``rest`` (h, w) [px] towards the camera."""
     h, w = height.shape
-    lamps = random_lamps((h, w), rng)
+    flat = np.zeros((h, w), np.float32) + np.asarray(rest, np.float32)
+    lamps = random_lamps((h, w), rng, float(flat.max()))
     bent: Image = np.asarray(height, np.float32)
     bent = np.asarray(cv2.GaussianBlur(bent, (0, 0), float(rng.uniform(0.01, SKIN))), np.float32)
-    light = np.stack([lit(bent, lamps), lit(np.zeros_like(bent), lamps)])
+    light = np.stack([lit(flat + bent, lamps), lit(flat, lamps)])
     light[0] = _dusty(np.maximum(_scattered(light[0] - light[1], rng) + light[1], 0), rng)
     shown = _photographed(light * _paint(bent, rng)[..., None], rng)
-    # each as the camera sees it, the reading under light that has drifted, with noise of its own
+    # each with noise of its own, the reading under light that has drifted; what is brighter than a camera tells is cut off last
     drift = rng.choice([0.3, 1.0, 3.0])
     shown[0] = shown[0] * rng.normal(1, 0.01 * drift, 3) + rng.normal(0, 0.005 * drift, 3) + _uneven((h, w), rng)
-    noise = rng.uniform(0.3, 2.5) / 255
+    noise = np.exp(rng.uniform(*np.log(NOISE)))
     shown = np.clip(shown + noise * rng.normal(size=shown.shape), 0, 1)
     return shown[0].astype(np.float32), shown[1].astype(np.float32)
 
 
-def random_sight(height: NDArray[np.floating], rng: np.random.Generator) -> Image | None:
-    """What the network sees (``CHANNELS``, h', w') of a random reading of a gel pressed in by ``height`` (h, w) [px]; None where
-    no reading of it shows that, under a few draws of lamps."""
+def random_sight(
+    height: NDArray[np.floating], rng: np.random.Generator, rest: NDArray[np.floating] | float = 0.0
+) -> Image | None:
+    """What the network sees (``CHANNELS``, h', w') of a :func:`random_reading`; None where none shows anything, under a few draws
+    of lamps."""
     for _ in range(_DRAWS):
-        image, background = random_reading(height, rng)
+        image, background = random_reading(height, rng, rest)
         change, felt = colour_change(image, background)
         if felt.any():
             return seen(change, image)
     return None
 
 
-def random_lamps(shape: tuple[int, int], rng: np.random.Generator) -> Lamps:
+def random_lamps(shape: tuple[int, int], rng: np.random.Generator, rim: float = 0.0) -> Lamps:
     """Three of one colour each, or more of any, around an image of ``shape`` (h, w) or on three of its sides: near or far, low or
-    high."""
+    high above the ``rim`` of the gel [px]."""
     k = 3 if rng.random() < 0.6 else int(rng.integers(4, 7))
     around = 2 * np.pi / k * np.arange(k)
     if k == 3 and rng.random() < 0.5:  # on three sides of a square gel
         around = np.pi / 2 * np.arange(k)
     angle = rng.uniform(0, 2 * np.pi) + around + rng.normal(0, rng.choice([0.05, 0.3]), k)
     far = 0.5 * np.hypot(*shape) * np.exp(rng.uniform(0, 1.6) + rng.normal(0, 0.15, k))
-    up = far * np.tan(np.radians(rng.uniform(*ELEVATION)))
+    up = rim + far * np.tan(np.radians(rng.uniform(*ELEVATION)))
     colour = np.eye(3)[rng.permutation(3)] if k == 3 else rng.dirichlet([0.4] * 3, k)
     # each channel of the camera sees something of all colours
     mix = np.eye(3) + rng.uniform(0, 0.5, (3, 3)) * (rng.random() < 0.7)
@@ -74,13 +81,13 @@ def random_lamps(shape: tuple[int, int], rng: np.random.Generator) -> Lamps:
 
 
 def _photographed(light: Image, rng: np.random.Generator) -> Array:
-    """Readings 0..1 of ``light`` (2, h, w, 3): the second, without contact, of a random brightness in each channel, at times so
-    bright in one that much of the image is blown out."""
+    """Readings of ``light`` (2, h, w, 3), 1 what a camera tells at most: the second, without contact, of a random brightness in
+    each channel, at times so bright in one that much of the image is blown out."""
     exposure = np.clip(rng.uniform(0.15, 0.75) + rng.normal(0, 0.1, 3), 0.08, 0.95)
     if rng.random() < BRIGHT:
         exposure[rng.integers(3)] = rng.uniform(0.8, 1.2)
     shown = exposure * (light / np.median(light[1], (0, 1))) ** rng.uniform(0.45, 1)
-    return np.clip(_blurred(shown, float(rng.uniform(0.2, 1.5))), 0, 1).astype(float)
+    return np.maximum(_blurred(shown, float(rng.uniform(0.2, 1.5))), 0).astype(float)
 
 
 def _scattered(change: Image, rng: np.random.Generator) -> Image:

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from geomtact.errors import GeomtactError, InputError
 from geomtact.progress import Progress
 from geomtact.sensing.mask_network import MaskNetwork
-from geomtact.training import presses as made
+from geomtact.training import presses, readings
 from geomtact.training.card import write_network
 from geomtact.training.presses import Presses
 from geomtact.training.state import begin_with, not_a_number, resume, save_state
@@ -56,7 +56,9 @@ def train_mask(
         The loss is not a number any more; the last good state stays in ``folder``.
     """
     if len(parts) <= settings.validation:
-        raise InputError(f"training: expected more than {settings.validation} parts, got {len(parts)}")
+        raise InputError(
+            f"training: expected more than {settings.validation} parts, got {len(parts)}; give more with --scenes"
+        )
     (seen, contact), judged = (_tensors(p) for p in (parts[: -settings.validation], parts[-settings.validation :]))
     torch.manual_seed(settings.seed)
     network = MaskNetwork()
@@ -110,14 +112,19 @@ def write_mask_network(
     network: MaskNetwork,
     curve: dict[str, list[float]],
     settings: Settings,
-    presses: int,
+    n: int,
     start: str | None = None,
 ) -> None:
-    """Write ``path`` (safetensors, half precision) and beside it the card (.json); ``start`` is the SHA-256 of the weights that
-    training began with."""
-    ranges = ("SHAPE", "PITCH", "READINGS", "SIZES", "BALLS", "RADII", "FLAT", "TILT", "DEPTHS", "THICKNESS")
+    """Write ``path`` (safetensors, half precision) and beside it the card (.json): ``n`` presses were trained on, drawn from what
+    ``training.presses`` and ``training.readings`` say; ``start`` is the SHA-256 of the weights that training began with."""
+    drawn = {
+        name.lower(): value
+        for module in (presses, readings)
+        for name, value in vars(module).items()
+        if name.isupper() and not name.startswith("_")
+    }
     card = {
-        "data": {"presses": presses} | {name.lower(): getattr(made, name) for name in ranges},
+        "data": drawn | {"presses": n},
         "settings": asdict(settings),
         "start_sha256": start,
         "curve": curve,
