@@ -165,7 +165,7 @@ def upright(make_localizer):
 
 def test_of_a_known_side_outlines_tell_more_than_the_grid(upright):
     """Elastic and rigid gels in turn, moderate noise."""
-    touches = random_touches(upright, 10, 5)
+    touches = random_touches(upright, 20, 5)
     more, said = [], []
     for touch in touches:
         balanced, exact = (upright.localize(touch.mask, "mask", effort=e) for e in ("balanced", "exact"))

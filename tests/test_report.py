@@ -441,6 +441,7 @@ def test_several_sensors_are_shown_in_their_order(plug, rng):
         ("choices", None, "speed-accuracy"),
         ("choices", "modelled", "no-more-than-needed"),
         ("kitting", None, "kitting"),
+        ("localize", None, "calibration"),
         ("next_touch", None, "next_touch"),
         ("registration", None, "registration"),
         ("scores", None, "scores"),

@@ -22,7 +22,7 @@ __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observ
 
 KINDS = ("auto", "mask", "height", "reading")
 _DUST = 0.1e-6  # m^2 of contact, under which a touch tells nothing (docs/stability.md)
-_MOST = 0.6  # share of a mask in contact, from which on it may be a negative
+_NEGATIVE = (0.5, 0.95)  # share in contact of a mask that may be a negative, if all of its border is
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def read_observation(
     share, area = float(contact.mask.mean()), float(contact.mask.sum() * sensor.pixel_area(contact.mask.shape))
     if share == 1:
         warnings.append(f"{name}: every pixel is in contact: the contact fills the image, so its outline is not seen")
-    elif kind == "mask" and share > _MOST:
+    elif kind == "mask" and _NEGATIVE[0] < share < _NEGATIVE[1] and _framed(contact.mask):
         warnings.append(
             f"{name}: {100 * share:.0f} % of the mask is contact; if that is where nothing touches, invert it"
         )
@@ -137,6 +137,11 @@ def _grey(array: NDArray[Any]) -> NDArray[Any]:
 def _colourless(array: NDArray[Any]) -> bool:
     """Whether the channels of an image (H, W, C) are alike."""
     return bool((array == array[..., :1]).all())
+
+
+def _framed(mask: NDArray[np.bool_]) -> bool:
+    """Whether all pixels along the image's border are set."""
+    return bool(mask[[0, -1]].all() and mask[:, [0, -1]].all())
 
 
 def _decide(array: NDArray[Any], name: str, warnings: list[str]) -> str:
