@@ -12,6 +12,11 @@ def write_text(path: Path, text: str) -> None:
     write_whole(path, lambda temporary: temporary.write_text(text, "utf-8"))
 
 
+def write_bytes(path: Path, data: bytes) -> None:
+    """``data``, whole or not at all."""
+    write_whole(path, lambda temporary: temporary.write_bytes(data))
+
+
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` make a file under a temporary name beside ``path``, then rename it: a killed run leaves no half file."""
     temporary = path.with_name(f".{os.getpid()}-{path.name}")

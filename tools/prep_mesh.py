@@ -144,12 +144,12 @@ def _draw_ambiguity(result: dict[str, Any], out: Path, sensor: str) -> None:
     """Beside each part's mesh a picture of how much a touch tells there; an index is built for it, about a minute."""
     from meshprep.ambiguity import draw_ambiguity
 
-    from geomtact.files import write_whole
+    from geomtact.files import write_bytes
     from geomtact.geometry.mesh import load_mesh
 
     for part in result["parts"]:
         drawn = draw_ambiguity(load_mesh(out / f"{part}.ply", result["unit"]), sensor)
-        write_whole(out / f"{part}_ambiguity.png", lambda path, drawn=drawn: path.write_bytes(drawn))
+        write_bytes(out / f"{part}_ambiguity.png", drawn)
 
 
 def _bounded(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[str, Any]:

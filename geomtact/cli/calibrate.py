@@ -10,7 +10,7 @@ import typer
 from geomtact.cli.prepare import SensorName
 from geomtact.cli.shell import tell
 from geomtact.errors import UsageError
-from geomtact.files import write_text, write_whole
+from geomtact.files import write_bytes, write_text
 
 if TYPE_CHECKING:
     from geomtact.sensing.calibrate import Calibrated
@@ -97,8 +97,7 @@ def calibrate(
         _print_membrane(found, ball_mm, other_presses, other_ball_mm, background)
     _write(found.sensor, sensor, out)
     if plot is not None:
-        picture = draw_calibration(found, 1e-3 * ball_mm)
-        write_whole(plot, lambda temporary: temporary.write_bytes(picture))
+        write_bytes(plot, draw_calibration(found, 1e-3 * ball_mm))
         typer.echo(f"wrote {plot}")
 
 
@@ -141,12 +140,11 @@ def _of_taxim(
 
 def _print_membrane(found: Calibrated, ball_mm: float, folder: Path, other_mm: float, background: Path) -> None:
     """Print how the membrane bulges, by presses of another ball."""
-    from geomtact.cli.frames import IMAGES
+    from geomtact.cli.frames import listed
     from geomtact.sensing.calibrate import calibrated
     from geomtact.sensing.membrane import membrane_curvature
 
-    others = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
-    second = calibrated(others, 1e-3 * other_mm, background, sensor=found.sensor)
+    second = calibrated(sorted(listed(folder)), 1e-3 * other_mm, background, sensor=found.sensor)
     curvature, std = membrane_curvature(found, 1e-3 * ball_mm, second, 1e-3 * other_mm)
     said = f"bulges by 1/{1e3 / curvature:.0f} mm" if curvature > 2 * std else "shows no bulge"
     typer.echo(

@@ -148,14 +148,14 @@ def _print_contacts(figures: dict[str, dict[str, Any]]) -> None:
 
 
 def _draw(path: Path, sets: Any, method: Any, figures: dict[str, dict[str, Any]]) -> None:
-    from geomtact.files import write_whole
+    from geomtact.files import write_bytes
     from geomtact.report.readings_sheet import draw_sheet
 
     shown = {name: [(i.image, method(i.image, i.background), i.circle) for i in some] for name, some in sets.items()}
     factor = {name: sum(f["factors"]) / len(f["factors"]) for name, f in figures.items()}
     picture = draw_sheet(shown, factor)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, lambda temporary: temporary.write_bytes(picture))
+    write_bytes(path, picture)
     tell(f"sheet: {path}")
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from geomtact.errors import InputError, UsageError
 
-IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy")
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy")
 State = tuple[int, int]  # when a file was last written to [ns], and its size
 _POLL = 0.05  # s between looks into a folder that is being filled
 
@@ -50,7 +50,7 @@ def all_frames(source: str, follow: bool = False, sensor: str | None = None) -> 
     if path.is_dir():
         images = listed(path)
         if not images and not follow:
-            raise InputError(f"{path}: no image in this folder; expected {', '.join(IMAGES)}")
+            raise InputError(f"{path}: no image in this folder; expected {', '.join(_IMAGES)}")
         return _followed(path) if follow else (Frame(str(image)) for image in images)
     if path.is_char_device() or (source.isdigit() and not path.exists()):
         return camera_frames(source, sensor)
@@ -58,14 +58,14 @@ def all_frames(source: str, follow: bool = False, sensor: str | None = None) -> 
         raise InputError(
             f"{path}: no such folder, video or camera; give a folder of images, a video, a camera's number, or - for paths"
         )
-    if path.suffix.lower() in IMAGES:
+    if path.suffix.lower() in _IMAGES:
         raise UsageError(f"{path}: is one image; give its folder, or use 'geomtact localize'")
     return _filmed(path)
 
 
 def listed(folder: Path) -> list[Path]:
     """The images in a folder by name, numbers in it by value: 2 before 10."""
-    images = (path for path in folder.iterdir() if path.suffix.lower() in IMAGES and not path.name.startswith("."))
+    images = (path for path in folder.iterdir() if path.suffix.lower() in _IMAGES and not path.name.startswith("."))
     return sorted(
         images, key=lambda path: [(not s.isdigit(), int(s) if s.isdigit() else 0, s) for s in _parts(path.name)]
     )

@@ -154,14 +154,13 @@ def _content(
 
 
 def _write(out: Path, posterior: Posterior, ranked: Sequence[Action], content: Mapping[str, Any], seed: int) -> None:
-    from geomtact.files import write_text, write_whole
+    from geomtact.files import write_bytes, write_text
     from geomtact.report.next_touch_plot import draw_next_touch
     from geomtact.report.result import to_text
 
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "next_touch.json", to_text(content))
-    picture = draw_next_touch(posterior, ranked, seed)
-    write_whole(out / "next_touch.png", lambda temporary: temporary.write_bytes(picture))
+    write_bytes(out / "next_touch.png", draw_next_touch(posterior, ranked, seed))
 
 
 def _row(place: int, action: Action) -> list[str]:

@@ -118,13 +118,13 @@ def save(out: Path | None, content: dict[str, Any]) -> None:
 
 def plot(content: Mapping[str, Any], path: Path | None, which: str | None = None) -> None:
     """Write the picture of a study as PNG, if there is a file to write; ``which`` as of ``report.studies.draw``."""
-    from geomtact.files import write_whole
+    from geomtact.files import write_bytes
     from geomtact.report.studies import draw
 
     if path is not None:
         picture = draw(content, which)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, lambda temporary: temporary.write_bytes(picture))
+        write_bytes(path, picture)
 
 
 def length(mm: float | None) -> str:

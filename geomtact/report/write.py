@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from geomtact.files import write_text, write_whole
+from geomtact.files import write_bytes, write_text
 from geomtact.report.figure import draw
 from geomtact.report.page import page
 from geomtact.report.result import result, to_text
@@ -54,7 +54,7 @@ def write_all(
     summaries = summaries_of(posterior, modes)
     picture = draw(posterior, modes, summaries, shown) if reports else None
     if picture is not None and "png" in reports:
-        write_whole(folder / "report.png", lambda temporary: temporary.write_bytes(picture.whole))
+        write_bytes(folder / "report.png", picture.whole)
     timing = {**(timing_ms or {}), "report": 1e3 * (time.perf_counter() - began)}
     content = result(posterior, modes, settings, timing, parts)
     if picture is not None and "html" in reports:

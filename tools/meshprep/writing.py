@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from geomtact.errors import MeshError
-from geomtact.files import write_whole
+from geomtact.files import write_bytes
 from geomtact.geometry.mesh import UNITS, Mesh, load_mesh
 from geomtact.versions import versions
 from meshprep import Refused
@@ -67,7 +67,7 @@ def write(before: Surface, work: Work, name: str, unit: str, out: Path, options:
             symmetries = [mesh.symmetry for mesh in meshes if mesh.symmetry is not None]
             add(files, unit, options["licence"], words, symmetries, Path(options["add_to"]))
         for each, content in contents.items():
-            write_whole(out / each, lambda path, content=content: path.write_bytes(content))
+            write_bytes(out / each, content)
     return {key: value for key, value in told.items() if key not in ("schema", "options", "versions")}
 
 
