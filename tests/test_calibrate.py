@@ -217,7 +217,7 @@ def test_what_is_missing_or_wrong_is_said(found):
         contact_height(images[0], background[:-1], found.sensor)
     with pytest.raises(ImageError, match="expected 160 x 120 px for sensor made .width x height., got 80 x 60"):
         contact_height(images[0][::2, ::2], background[::2, ::2], found.sensor)
-    with pytest.raises(ImageError, match="press 2: expected the background's size, 160 x 120 px, got 160 x 119"):
+    with pytest.raises(ImageError, match="press 2: expected the size of the background, 160 x 120 px, got 160 x 119"):
         calibrate([images[0], images[1][:-1], images[2]], 8 * MM, background, PITCH)
     with pytest.raises(UsageError, match="expected a list of 3 images or more, got one path"):
         calibrate("press.png", 8 * MM, background, PITCH)

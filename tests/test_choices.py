@@ -31,9 +31,8 @@ def test_a_way_differs_from_the_default_in_one_thing():
             for f in fields(way)
             if f.name not in ("choice", "scenes") and getattr(way, f.name) != getattr(WAYS[DEFAULT], f.name)
         }
-        assert len(changed) == (0 if name == DEFAULT else {"this side alone": 2, "this side, exact": 3}.get(name, 1)), (
-            name
-        )
+        more = {DEFAULT: 0, "this side alone": 2, "this side, 1 mode": 3, "this side, exact": 3}
+        assert len(changed) == more.get(name, 1), name
     assert all(a in WAYS and b in WAYS for a, b in MODELLED.values())
     assert all(set(way.scenes) <= set(choices.SCENES) for way in WAYS.values())
 
@@ -133,3 +132,12 @@ def test_weights_of_ones_own_are_ways_more(tmp_path):
     told_more = {"encoder": told([1.0, 2.0], 1.0), "encoder small": told([0.5, 1.0], 1.0)}
     assert modelled(told_more)["encoder small, not encoder"]["adds"][0] == pytest.approx(-0.75)
     assert front(summarise({DEFAULT: told([1.0, 2.0], 1.0), **told_more}))[0] == DEFAULT
+
+
+def test_a_few_ways_are_judged_where_they_differ():
+    ways = choices.ways_of([], ["this side, 1 mode", "this side alone"])
+    assert list(ways) == [DEFAULT, "this side alone", "this side, 1 mode"]
+    assert choices.scenes_of(ways) == ["known side"]
+    assert choices.scenes_of(choices.ways_of([])) == list(choices.SCENES) == choices.scenes_of({DEFAULT: WAYS[DEFAULT]})
+    refused = CliRunner().invoke(app, ["evaluate", "choices", "hex_nut", "--way", "one mode"])
+    assert refused.exit_code == 2 and "no way to localize named 'one mode'" in refused.output

@@ -10,7 +10,7 @@ from geomtact.registration.observability import Spread
 from geomtact.registration.rim import make_problem
 from geomtact.scoring.outline import OutlineLikelihood
 from geomtact.scoring.overlap import to_grid
-from geomtact.sensing.noise import Noise, perturb
+from geomtact.sensing.noise import CLEAN, Noise, perturb
 from geomtact.sensing.sensor import Sensor
 
 MM = 1e-3
@@ -164,15 +164,15 @@ def upright(make_localizer):
 
 
 def test_of_a_known_side_outlines_tell_more_than_the_grid(upright):
-    """Elastic and rigid gels in turn, moderate noise."""
-    touches = random_touches(upright, 20, 5)
+    """Of every touch at least as much, rigid and elastic gels in turn; with noise, see docs/no-more-than-needed.md."""
+    touches = random_touches(upright, 8, 5, None, CLEAN)
     more, said = [], []
     for touch in touches:
         balanced, exact = (upright.localize(touch.mask, "mask", effort=e) for e in ("balanced", "exact"))
         more.append(exact.log_density(touch.T_sensor_object) - balanced.log_density(touch.T_sensor_object))
         said.append(exact.settings.get("by_outline", False))
         assert np.exp(exact.log_prob).sum() == pytest.approx(1, abs=1e-3)
-    assert np.mean(said) > 0.8 and np.mean(more) > 0.3
+    assert np.mean(said) > 0.8 and np.mean(more) > 0.5 and min(more) > -0.2
     again = upright.localize(touches[-1].mask, "mask", effort="exact")
     assert np.array_equal(again.log_prob, exact.log_prob) and np.array_equal(again.modes(3)[2].T, exact.modes(3)[2].T)
 

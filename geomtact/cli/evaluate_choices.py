@@ -37,6 +37,12 @@ def judge_choices(
             show_default=False,
         ),
     ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--way", help="Judge this way beside the default, not all; may be given again.", show_default=False
+        ),
+    ] = None,
     out: study_options.Out = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", help="PNG of information and error against the time of a touch.")
@@ -54,7 +60,11 @@ def judge_choices(
     from geomtact.report.result import plain
     from geomtact.sensing.sensor import Sensor
 
-    content, gel, ways = study_file.load(out, SCHEMA), Sensor.load(sensor), choices.ways_of(weights or [])
+    content, gel, ways = (
+        study_file.load(out, SCHEMA),
+        Sensor.load(sensor),
+        choices.ways_of(weights or [], only or []),
+    )
     for mesh in study_options.meshes(parts, unit, gel):
         settings = plain(
             {
@@ -70,7 +80,7 @@ def judge_choices(
         found = content["parts"].get(mesh.name)
         known = dict(found) if study_file.begun(found, settings) else {"ways": {}, "scenes": {}}
         part = known | {"settings": settings}
-        done = {kind: list(part["scenes"].get(kind, {}).get("answers", [])) for kind in choices.SCENES}
+        done = {kind: list(part["scenes"].get(kind, {}).get("answers", [])) for kind in choices.scenes_of(ways)}
         if any(len(some) < touches for some in done.values()):
             _judge(mesh, gel, ways, part, done, touches, seed, lambda part=part: _keep(out, content, part))
         _summarise(part)
@@ -114,7 +124,7 @@ def _judge(
                 "bytes_per_pose": bytes_read(localizers[name], "balanced"),
                 "prepare_s": spent[way.prepared],
             }
-        for kind in choices.SCENES:
+        for kind in done:
             scenes = choices.make(kind, localizers[choices.DEFAULT], n, seed)
             todo = choices.localized(localizers, ways, scenes[len(done[kind]) :], kind, seed)
             rows = ({name: asdict(answer) for name, answer in told.items()} for told in todo)

@@ -18,7 +18,7 @@ import numpy as np
 from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import CALIBRATION_NOISE, felt_height
-from geomtact.errors import NoPoseAgreesError
+from geomtact.errors import NoPoseAgreesError, UsageError, nearest_name
 from geomtact.evaluation import scores
 from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.fixture import upwards
@@ -96,6 +96,7 @@ WAYS = {
     "calibrated on rigid gels": Way("calibration", elastic=False),
     "within 30 degrees": Way("side", SCENES[2:], cone=np.radians(30)),
     "this side alone": Way("side", SCENES[2:], cone=0.0, max_poses=50_000),
+    "this side, 1 mode": Way("side", SCENES[2:], replace(_BALANCED, modes=1), cone=0.0, max_poses=50_000),
     "this side, exact": Way("side", SCENES[2:], EFFORTS["exact"], cone=0.0, max_poses=50_000),
 }
 
@@ -120,14 +121,24 @@ MODELLED = {
     "specks": ("calibrated without specks", DEFAULT),
     "missing patches": ("calibrated without gaps", DEFAULT),
     "elastic gels, in calibrating": ("calibrated on rigid gels", DEFAULT),
+    "5 modes refined, of a known side": ("this side, 1 mode", "this side alone"),
     "outlines (exact), of a known side": ("this side alone", "this side, exact"),
 }
 
 
-def ways_of(weights: Sequence[Path]) -> dict[str, Way]:
-    """``WAYS``, and one more for each file of weights that ``geomtact train`` wrote: an encoder of another size, on the default's
-    grid, or the thesis's network, on a grid as large as its own."""
-    out = dict(WAYS)
+def ways_of(weights: Sequence[Path], only: Sequence[str] = ()) -> dict[str, Way]:
+    """``WAYS``, or of these the default and ``only`` those named; and one more for each file of weights that ``geomtact train``
+    wrote: an encoder of another size, on the default's grid, or the thesis's network, on a grid as large as its own.
+
+    Raises
+    ------
+    UsageError
+        No way has that name.
+    """
+    for name in only:
+        if name not in WAYS:
+            raise UsageError(f"no way to localize named {name!r}{nearest_name(name, list(WAYS))}")
+    out = {name: way for name, way in WAYS.items() if not only or name in (DEFAULT, *only)}
     for path in weights:
         if about(path).get("architecture") == THESIS:
             out["the thesis's network"] = Way("score", scorer=str(path), max_poses=_THESIS_POSES)
@@ -152,6 +163,12 @@ class Scene:
     masks: list[Any]
     T_world_sensor: Array | None = None
     height: Any = None
+
+
+def scenes_of(ways: Mapping[str, Way]) -> list[str]:
+    """The kinds of scenes on which some way is judged beside the default."""
+    compared = [way for name, way in ways.items() if name != DEFAULT] or list(ways.values())
+    return [kind for kind in SCENES if any(kind in way.scenes for way in compared)]
 
 
 def prepare(

@@ -23,7 +23,7 @@ from geomtact.contact_space.index import spelled_out
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.se3 import Array, inverse
-from geomtact.sensing.moments import cleaned, moments
+from geomtact.sensing.moments import moments_of
 
 # chosen on trajectories that ``evaluate track`` does not judge (docs/tracking.md)
 NOW = 0.85  # power of a frame's likelihood in its own posterior
@@ -161,7 +161,7 @@ class Filter:
     def _weights(self, seen: Posterior) -> tuple[float, float]:
         """Powers that a frame's likelihood and what was known before have in what is remembered."""
         mask, before = seen.observation.contact.mask, self._moments
-        self._moments = moments(cleaned(mask, seen.sensor)[None], seen.sensor)[0]
+        self._moments = moments_of(mask, seen.sensor)
         if self.counts[1] is not None:
             return self.counts[1], 1.0
         if before is None:

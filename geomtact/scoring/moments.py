@@ -18,7 +18,7 @@ from scipy.special import gammaln
 from geomtact.contact_space.index import Index
 from geomtact.se3 import Array
 from geomtact.sensing.contact import Shown
-from geomtact.sensing.moments import cleaned, moments
+from geomtact.sensing.moments import moments_of
 
 _CHUNK = 1 << 15
 
@@ -47,7 +47,7 @@ class Moments:
 
         Maximum likelihood for a t distribution by iterated reweighting (Lange, Little and Taylor, 1989).
         """
-        seen = np.stack([_seen(index, m) for m in masks])
+        seen = np.stack([moments_of(m, index.sensor) for m in masks])
         difference = (seen - index.moments[:, ids].T).astype(float)
         bias, covariance = difference.mean(0), np.cov(difference.T)
         d = difference.shape[1]
@@ -72,7 +72,7 @@ class Moments:
         return self._of(index, mask, index.drawn_moments)
 
     def _of(self, index: Index, mask: Shown, stored: NDArray[np.float32]) -> NDArray[np.float32]:
-        seen = _seen(index, mask) - self.bias
+        seen = moments_of(mask, index.sensor) - self.bias
         W = self._whiten.astype(np.float32)
         target = (W @ seen).astype(np.float32)
         d, nu = len(seen), self.freedom
@@ -88,7 +88,3 @@ class Moments:
             off -= target[:, None]
             out[part] = np.log1p(np.einsum("in,in->n", off, off) / np.float32(nu))
         return np.float32(norm) - np.float32((nu + d) / 2) * out
-
-
-def _seen(index: Index, mask: Shown) -> NDArray[np.float32]:
-    return moments(cleaned(mask, index.sensor)[None], index.sensor)[0]

@@ -130,11 +130,11 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
     raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
 
 
-def same_size(background: Array, image: Array) -> Array:
-    """The background (H, W, 3); one of another size than the image is refused."""
-    if background.shape != image.shape:
+def same_size(image: Array, other: Array, name: str, of: str) -> Array:
+    """``image`` (H, W, 3), which is refused under its ``name`` if it is not of the size of the ``other``, which is ``of``."""
+    if image.shape != other.shape:
         raise ImageError(
-            f"background: expected the size of the image, {image.shape[1]} x {image.shape[0]} px, "
-            f"got {background.shape[1]} x {background.shape[0]} px; take it with the same sensor"
+            f"{name}: expected the size of the {of}, {other.shape[1]} x {other.shape[0]} px, got {image.shape[1]} x "
+            f"{image.shape[0]} px; take both with the same sensor"
         )
-    return background
+    return image

@@ -45,7 +45,7 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
         )
     image = as_unit_rgb(image, "image")
     check_size(image, sensor, "image")
-    change, felt = colour_change(image, same_size(as_unit_rgb(background, "background"), image))
+    change, felt = colour_change(image, same_size(as_unit_rgb(background, "background"), image, "background", "image"))
     return (np.maximum(relief(change, felt, sensor.colour, sensor.pixel_pitch), 0) * felt).astype(np.float32)
 
 

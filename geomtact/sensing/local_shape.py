@@ -74,7 +74,9 @@ def find_contact(
         method = method or sensor.contact_method
         pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
         check_size(image, sensor, "image")
-    reference = None if background is None else same_size(as_unit_rgb(background, "background"), image)
+    reference = (
+        None if background is None else same_size(as_unit_rgb(background, "background"), image, "background", "image")
+    )
     return contact_of(image, reference, method, pitch)
 
 

@@ -49,6 +49,11 @@ def _powers(sensor: Sensor, h: int, w: int) -> tuple[NDArray[np.float32], NDArra
     return np.ascontiguousarray(X.T), Y, float((x[1] - x[0]) * (y[1] - y[0]))
 
 
+def moments_of(mask: NDArray[Any], sensor: Sensor) -> NDArray[np.float32]:
+    """:func:`moments` (6,) of one mask (h, w), without dust."""
+    return moments(cleaned(mask, sensor)[None], sensor)[0]
+
+
 def cleaned(mask: NDArray[Any], sensor: Sensor) -> NDArray[Any]:
     """:func:`without_specks`, of a mask (h, w) that covers the window."""
     return without_specks(mask, sensor.pixel_area(mask.shape))

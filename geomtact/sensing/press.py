@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.errors import ImageError
 from geomtact.se3 import Array
-from geomtact.sensing.change import as_unit_rgb, colour_change
+from geomtact.sensing.change import as_unit_rgb, colour_change, same_size
 from geomtact.sensing.local_shape import contact_of
 
 _ROUND = 0.05  # of the radius that half of an outline may stray from its circle
@@ -49,11 +48,7 @@ def find_presses(
     stretch = 1.0 if pitch is None else pitch[1] / pitch[0]
     for number, source in enumerate(images, 1):
         name, image = named_image(source, f"press {number}")
-        if image.shape != reference.shape:
-            raise ImageError(
-                f"{name}: expected the background's size, {reference.shape[1]} x {reference.shape[0]} px, got "
-                f"{image.shape[1]} x {image.shape[0]} px; give images of one sensor"
-            )
+        same_size(image, reference, name, "background")
         if any(np.array_equal(image, other) for other in seen):
             left_out[name] = "it is the same image as one before"
             continue
