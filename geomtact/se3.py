@@ -25,9 +25,9 @@ def check_transforms(T: ArrayLike, name: str = "T") -> Array:
     """
     out = np.asarray(T, dtype=np.float64)
     if out.ndim < 2 or out.shape[-2:] != (4, 4):
-        raise PoseError(f"{name}: expected rigid transforms of shape (..., 4, 4), got {out.shape}")
+        raise PoseError(f"{name}: expected rigid transforms of shape (..., 4, 4), got {out.shape}; give 4x4 matrices")
     if not np.isfinite(out).all():
-        raise PoseError(f"{name}: expected finite numbers, got NaN or infinity")
+        raise PoseError(f"{name}: expected finite numbers, got NaN or infinity; look where they come from")
     R, last = out[..., :3, :3], out[..., 3, :]
     error = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max((-1, -2))
     mirrors, moved = np.linalg.det(R) < 0, np.abs(last - [0, 0, 0, 1]).max(-1)

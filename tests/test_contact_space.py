@@ -19,7 +19,7 @@ from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache
 from geomtact.errors import CacheError, UsageError
 from geomtact.geometry.approach import allowed, approach_of
 from geomtact.geometry.mesh import Mesh, load_mesh
-from geomtact.se3 import exp, random_rotations, transform
+from geomtact.se3 import inverse, log, random_rotations, transform
 from geomtact.sensing.sensor import Sensor
 
 MM = 1e-3
@@ -131,28 +131,18 @@ def test_poses_around_a_place_are_found_as_by_brute_force(localizer, rng):
 
 
 def test_the_covariance_of_a_cell_is_that_of_draws_from_it(plug, rng):
-    """Shifts along the sensor's axes, turns about the object's centre; and the twist is in the object's own frame."""
+    """What touches within a cell lies about its pose as far as said, in all directions: squared by it 6 in the mean, were it
+    as wide everywhere."""
     index = plug.index
-    i = int(np.argmax(weights(index)))
-    T = index.poses([i])[0]
-    C = index.cell_covariance(T)
-    assert np.abs(C - C.T).max() < 1e-12 and (np.linalg.eigvalsh(C) > 0).all()
-    # the centre of the object is moved by the lattice cell alone
-    J = np.concatenate([-_hat(index.mesh.centre), np.eye(3)], 1)
-    shift = T[:3, :3] @ (J @ C @ J.T) @ T[:3, :3].T
-    depth = index.sensor.max_penetration / len(index.resolution.penetrations)
-    expected = np.diag([index.resolution.step**2] * 2 + [depth**2]) / 12
-    assert np.abs(shift - expected).max() < 1e-12
-    # and to first order moves by twists drawn with this covariance
-    xi = rng.multivariate_normal(np.zeros(6), C * 1e-4, 4000)
-    moved = (T @ exp(xi)) @ np.append(index.mesh.centre, 1)
-    centre = moved[:, :3] - (T @ np.append(index.mesh.centre, 1))[:3]
-    assert np.cov(centre.T) == pytest.approx(shift * 1e-4, abs=0.1 * shift.max() * 1e-4)
-
-
-def _hat(w):
-    x, y, z = w
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    found = []
+    for i in rng.choice(len(index), 12, p=weights(index)):
+        T = index.poses([i])[0]
+        C = index.cell_covariance(T)
+        assert np.abs(C - C.T).max() < 1e-12 and (np.linalg.eigvalsh(C) > 0).all()
+        drawn, _, ok = draw_within(index, plug.space, np.full(60, i), rng)
+        xi = log(inverse(T) @ drawn[ok])
+        found.append(np.einsum("ni,ni->n", xi, np.linalg.solve(C, xi.T).T).mean())
+    assert 3 < np.median(found) < 15 and max(found) < 60
 
 
 # --- the index against poses drawn without it

@@ -2,7 +2,6 @@
 
 import io
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,7 +44,7 @@ def stay(seen, start):
 
 
 def touches_of(space, n, elastic=None, noise=CLEAN):
-    return random_touches(SimpleNamespace(space=space), n, 3, elastic, noise)
+    return random_touches(space, n, 3, elastic, noise)
 
 
 def pressed_in_the_middle(space, depth=0.8e-3):

@@ -119,9 +119,9 @@ def test_touches_repeat_and_only_elastic_ones_are_felt_anew(localizer):
     space = localizer.space
     blob = np.zeros(localizer.sensor.image_size_px[::-1], bool)
     blob[100:130, 150:190] = True
-    own = study.make_touches(localizer, 6, 3, CLEAN)
-    again = study.make_touches(localizer, 6, 3, CLEAN)
-    felt = study.make_touches(localizer, 6, 3, CLEAN, lambda s, T, elastic: blob)
+    own = study.make_touches(localizer.space, 6, 3, CLEAN)
+    again = study.make_touches(localizer.space, 6, 3, CLEAN)
+    felt = study.make_touches(localizer.space, 6, 3, CLEAN, lambda s, T, elastic: blob)
     assert [t.elastic for t in own] == [False, True] * 3
     for a, b, c in zip(own, again, felt, strict=True):
         np.testing.assert_array_equal(a.T_sensor_object, c.T_sensor_object)
@@ -189,7 +189,7 @@ def test_modes_that_hold_what_they_claim_are_reliable(rng):
 
 
 def test_a_study_says_what_the_posterior_says(localizer):
-    touches = study.make_touches(localizer, 8, 1, MODERATE)
+    touches = study.make_touches(localizer.space, 8, 1, MODERATE)
     outcomes = list(proper.judge(localizer, touches, "fast", 1))
     for touch, outcome in zip(touches, outcomes, strict=True):
         posterior = localizer.localize(touch.mask, kind="mask", effort="fast", seed=1)
@@ -289,7 +289,7 @@ def test_touches_are_described(tmp_path):
 
 
 def test_outcomes_are_plain_numbers(localizer):
-    touches = study.make_touches(localizer, 1, 0, MODERATE)
+    touches = study.make_touches(localizer.space, 1, 0, MODERATE)
     (outcome,) = proper.judge(localizer, touches, "fast", 0)
     assert json.loads(json.dumps(asdict(outcome))) == asdict(outcome)
 

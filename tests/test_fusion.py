@@ -124,7 +124,7 @@ def test_sensors_that_vary_alike_count_as_one(rng):
 
 def test_each_more_sensor_tells_more_of_the_true_pose(plug):
     gains = []
-    touches = random_touches(plug, 18, 3)
+    touches = random_touches(plug.space, 18, 3)
     for i in range(6):
         rng = np.random.default_rng(i)
         some = touches[3 * i : 3 * i + 3]
@@ -142,7 +142,7 @@ def test_each_more_sensor_tells_more_of_the_true_pose(plug):
 
 
 def test_what_is_found_lies_in_the_cell_that_holds_its_mass(plug):
-    touches = random_touches(plug, 6, 11)
+    touches = random_touches(plug.space, 6, 11)
     T_world_sensor = [se3.inverse(touch.T_sensor_object) for touch in touches]
     for k in (0, 3):
         some = slice(k, k + 3)
@@ -155,7 +155,7 @@ def test_what_is_found_lies_in_the_cell_that_holds_its_mass(plug):
 
 
 def test_the_order_of_the_others_changes_nothing_and_the_world_is_anywhere(plug):
-    touches = random_touches(plug, 3, 5)
+    touches = random_touches(plug.space, 3, 5)
     _, sensors = world(touches, np.random.default_rng(0))
     alone = [single(plug, touch, T) for touch, T in zip(touches, sensors, strict=True)]
     straight, swapped = fuse(alone), fuse([alone[0], alone[2], alone[1]])
@@ -167,7 +167,7 @@ def test_the_order_of_the_others_changes_nothing_and_the_world_is_anywhere(plug)
 
 
 def test_a_sensor_that_feels_nothing_speaks_against_poses_that_would_touch_it(plug, rng):
-    touch = random_touches(plug, 1, 7)[0]
+    touch = random_touches(plug.space, 1, 7)[0]
     T, sensors = world([touch], rng)
     # a sensor at the object's other side, and one far away
     back = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -195,7 +195,7 @@ def test_a_sensor_that_feels_nothing_speaks_against_poses_that_would_touch_it(pl
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (3, 4, 0, 1, 2), (0, 3, 1, 4, 2)])
 def test_refinement_learns_nothing_from_sensors_out_of_reach_wherever_they_stand(plug, order):
-    touches = random_touches(plug, 3, 11)
+    touches = random_touches(plug.space, 3, 11)
     _, sensors = world(touches, np.random.default_rng(1))
     far = [se3.transform(np.eye(3), [0, 0, z]) @ sensors[0] for z in (2.0, 3.0)]
     masks, T = [t.mask for t in touches], [*sensors, *far]
@@ -210,7 +210,7 @@ def test_refinement_learns_nothing_from_sensors_out_of_reach_wherever_they_stand
 
 @pytest.mark.parametrize("apart", [0.05, 0.3])
 def test_a_sensor_that_looks_away_says_nothing_of_what_lies_behind_it(plug, rng, apart):
-    touch = random_touches(plug, 1, 7)[0]
+    touch = random_touches(plug.space, 1, 7)[0]
     _, sensors = world([touch], rng)
     away = sensors[0] @ se3.transform(np.eye(3), [0, 0, -apart]) @ np.diag([1.0, -1.0, -1.0, 1.0])
     empty = np.zeros_like(touch.mask)
@@ -220,7 +220,7 @@ def test_a_sensor_that_looks_away_says_nothing_of_what_lies_behind_it(plug, rng,
 
 
 def test_no_contact_anywhere_leaves_what_touches_nothing(plug, rng):
-    touches = random_touches(plug, 2, 8)
+    touches = random_touches(plug.space, 2, 8)
     T, sensors = world(touches, rng)
     empty = np.zeros_like(touches[0].mask)
     posterior = plug.localize([empty, empty], "mask", None, sensors)
@@ -229,8 +229,24 @@ def test_no_contact_anywhere_leaves_what_touches_nothing(plug, rng):
     assert posterior.log_density(se3.transform(np.eye(3), [0, 0, 5.0]) @ T) == 0
 
 
+@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
+def test_sensors_that_felt_nothing_never_rule_the_truth_out_for_a_later_one(plug, order):
+    """Two of them stay half a millimetre before the part, in either order; a touch comes later."""
+    empty = np.zeros(plug.sensor.image_size_px[::-1], bool)
+    for seed in range(4):
+        touches = random_touches(plug.space, 3, 50 + seed)
+        T, sensors = world(touches, np.random.default_rng(seed))
+        for i in (0, 1):
+            sensors[i] = sensors[i] @ se3.transform(np.eye(3), [0, 0, -touches[i].penetration - 0.5e-3])
+        before = plug.localize([empty, empty], "mask", None, sensors[order])
+        assert not before.contact and np.isfinite(before.log_density(T))
+        posterior = plug.localize(touches[2].mask, "mask", None, sensors[2], prior=before, effort="fast")
+        alone = plug.localize(touches[2].mask, "mask", None, sensors[2], effort="fast")
+        assert posterior.log_density(T) > alone.log_density(T) - 3
+
+
 def test_sensors_that_exclude_each_other_are_named(plug, rng):
-    touches = random_touches(plug, 3, 9)
+    touches = random_touches(plug.space, 3, 9)
     T, sensors = world(touches, rng)
     wrong = sensors.copy()
     wrong[2, :3, 3] += [0.0, 0.0, 0.5]
@@ -242,7 +258,7 @@ def test_sensors_that_exclude_each_other_are_named(plug, rng):
 
 def test_a_sensor_that_is_hardly_possible_is_told(plug, rng):
     """Support far below chance is said in words; agreement is not."""
-    touches = random_touches(plug, 3, 10)
+    touches = random_touches(plug.space, 3, 10)
     _, sensors = world(touches, rng)
     fused = fuse([single(plug, touch, T) for touch, T in zip(touches, sensors, strict=True)])
     assert disagreement(fused) is None
@@ -251,7 +267,7 @@ def test_a_sensor_that_is_hardly_possible_is_told(plug, rng):
 
 
 def test_a_prior_counts_once(plug, rng):
-    touches = random_touches(plug, 2, 11)
+    touches = random_touches(plug.space, 2, 11)
     T, sensors = world(touches, rng)
     images = [t.mask for t in touches]
     near = plug.localize(images, "mask", None, sensors, prior=(T[None], np.zeros(1)), effort="fast")
@@ -273,7 +289,7 @@ def test_a_posterior_told_elsewhere_is_a_prior(plug, rng):
     """One after the other, two sensors do not rule out the truth, and tell more than each alone."""
     gains = []
     for seed in range(50, 58):
-        touches = random_touches(plug, 2, seed)
+        touches = random_touches(plug.space, 2, seed)
         T, sensors = world(touches, rng)
         before, alone = (single(plug, touch, at) for touch, at in zip(touches, sensors, strict=True))
         after = plug.localize(touches[1].mask, "mask", None, sensors[1], prior=before, effort="fast")
@@ -285,7 +301,7 @@ def test_a_posterior_told_elsewhere_is_a_prior(plug, rng):
 
 
 def test_an_image_that_counts_twice_is_told(plug, rng):
-    touches = random_touches(plug, 2, 12)
+    touches = random_touches(plug.space, 2, 12)
     _, sensors = world(touches, rng)
     images = [touch.mask for touch in touches]
     assert not any("same" in warning for warning in plug.localize(images, "mask", None, sensors).warnings)
@@ -301,7 +317,7 @@ def test_an_image_that_counts_twice_is_told(plug, rng):
 
 def test_the_evidence_of_a_touch_told_twice_is_hardly_more(plug):
     """Two sensors at one place show the same, so that together they say about what each says."""
-    touch = random_touches(plug, 1, 13)[0]
+    touch = random_touches(plug.space, 1, 13)[0]
     sensors = np.stack([np.eye(4), se3.transform(np.eye(3), [0, 0, 2e-6])])
     once = plug.localize(touch.mask, "mask", effort="fast").log_evidence
     twice = plug.localize([touch.mask] * 2, "mask", None, sensors, effort="fast").log_evidence
@@ -309,7 +325,7 @@ def test_the_evidence_of_a_touch_told_twice_is_hardly_more(plug):
 
 
 def test_saved_and_loaded_it_says_the_same(plug, rng, tmp_path, cache_dir):
-    touches = random_touches(plug, 2, 12)
+    touches = random_touches(plug.space, 2, 12)
     T, sensors = world(touches, rng)
     posterior = plug.localize([t.mask for t in touches], "mask", None, sensors)
     posterior.save(tmp_path / "p.npz")
@@ -342,7 +358,7 @@ def test_sensors_may_differ(make_localizer, plug, cache_dir, rng):
     both = type(plug)(plug.index, plug.scorer, plug.max_poses, plug.cache_dir, (other,))
     gains = []
     for i in range(12):
-        touches = [random_touches(plug, 1, 20 + i)[0], random_touches(other, 1, 40 + i)[0]]
+        touches = [random_touches(plug.space, 1, 20 + i)[0], random_touches(other.space, 1, 40 + i)[0]]
         T, sensors = world(touches, rng)
         together = both.localize([t.mask for t in touches], "mask", None, sensors, effort="fast")
         assert together.sensor.name == "gelslim"
@@ -353,7 +369,7 @@ def test_sensors_may_differ(make_localizer, plug, cache_dir, rng):
 
 
 def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
-    touches = random_touches(plug, 2, 14)
+    touches = random_touches(plug.space, 2, 14)
     T, sensors = world(touches, rng)
     paths = []
     for i, touch in enumerate(touches):

@@ -165,7 +165,7 @@ def upright(make_localizer):
 
 def test_of_a_known_side_outlines_tell_more_than_the_grid(upright):
     """Of every touch at least as much, rigid and elastic gels in turn; with noise, see docs/no-more-than-needed.md."""
-    touches = random_touches(upright, 8, 5, None, CLEAN)
+    touches = random_touches(upright.space, 8, 5, None, CLEAN)
     more, said = [], []
     for touch in touches:
         balanced, exact = (upright.localize(touch.mask, "mask", effort=e) for e in ("balanced", "exact"))
@@ -179,7 +179,7 @@ def test_of_a_known_side_outlines_tell_more_than_the_grid(upright):
 
 def test_a_prior_counts_once(upright):
     """What a prior makes twice as probable is so after it, too; what it rules out stays so."""
-    touch = random_touches(upright, 1, 6)[0]
+    touch = random_touches(upright.space, 1, 6)[0]
     T = touch.T_sensor_object
     left = upright.index.poses()[:, 0, 3] < 0
 
@@ -199,7 +199,7 @@ def test_a_prior_counts_once(upright):
 
 def test_a_pose_that_was_ruled_out_stays_so(upright):
     """Of a prior that names some poses: nothing that the search finds in other cells gets in."""
-    touch = random_touches(upright, 1, 6)[0]
+    touch = random_touches(upright.space, 1, 6)[0]
     plain = upright.localize(touch.mask, "mask", effort="exact")
     chosen = plain.likeliest_cells(60)
     known = upright.localize(

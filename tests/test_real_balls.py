@@ -199,7 +199,7 @@ def test_readings_of_another_simulator_tell_where_the_marker_is(marker):
 @pytest.mark.xfail(strict=True, reason="the network is too bold on another simulator's readings: see docs/method.md")
 def test_the_markers_featureless_side_is_told_less_than_a_distinctive_touch(marker):
     localizer, read = marker
-    touches = random_touches(localizer, 40, seed=0)
+    touches = random_touches(localizer.space, 40, seed=0)
     distinctive = min(localizer.localize(t.mask, kind="mask").entropy_nats for t in touches)
     featureless = [posterior.entropy_nats for posterior, _ in read[:3]]
     print(f"\nentropy [nats]: readings {np.round(featureless, 2)}, distinctive {distinctive:.2f}")

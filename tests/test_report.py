@@ -414,7 +414,7 @@ def test_several_sensors_are_shown_in_their_order(plug, rng):
     """A row for each, also for one that felt nothing, with what it would show at each mode."""
     from geomtact.report.figure import draw
 
-    touches = random_touches(plug, 2, 5)
+    touches = random_touches(plug.space, 2, 5)
     T = se3.transform(se3.random_rotations(1, rng)[0], [0.1, 0, 0])
     sensors = [T @ se3.inverse(touch.T_sensor_object) for touch in touches]
     far = se3.transform(np.eye(3), [0, 0, 0.5]) @ sensors[0]

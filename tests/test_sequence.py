@@ -51,7 +51,7 @@ def dense(index, mixture):
 @pytest.fixture(scope="module")
 def creeping(flat_nut):
     """Four trajectories of a nut on its face, half of them elastic, and the single frames' posteriors."""
-    found = [random_trajectory(flat_nut, 6, seed, elastic=seed % 2 == 1) for seed in range(4)]
+    found = [random_trajectory(flat_nut.space, 6, seed, elastic=seed % 2 == 1) for seed in range(4)]
     return [(t, [alone(flat_nut, mask) for mask in t.masks]) for t in found]
 
 
@@ -198,7 +198,7 @@ def test_the_filter_beats_single_frames(flat_nut, creeping):
 
 def test_frames_alike_are_not_taken_for_independent(pin):
     """On a grid of centimetres the frames of a slow object err alike: the thesis's filter becomes sure of a wrong pose."""
-    t = random_trajectory(pin, 8, 1)
+    t = random_trajectory(pin.space, 8, 1)
     single = np.mean(gains([alone(pin, mask) for mask in t.masks], t))
     ours = np.mean(gains(track(pin, t.masks), t))
     thesis = np.mean(gains(track(pin, t.masks, most=50, counts=(1, 1), fresh=0), t))
@@ -210,7 +210,7 @@ def test_a_sensor_whose_motion_is_known_tells_more(flat_nut):
     """The object rests in the world, the sensor creeps over it."""
     gain = []
     for seed in (1, 2):
-        t = random_trajectory(flat_nut, 8, seed, speed=2e-3)
+        t = random_trajectory(flat_nut.space, 8, seed, speed=2e-3)
         known = track(flat_nut, t.masks, t.T_world_sensor, GaussianTwist(0.01, 0.3e-3))
         blind = track(flat_nut, t.masks)
         for a, b, T in zip(known, blind, t.T_sensor_object, strict=True):
@@ -223,7 +223,7 @@ def test_a_sensor_whose_motion_is_known_tells_more(flat_nut):
 def test_it_says_so_when_the_object_slips_and_finds_back(flat_nut):
     told = 0
     for seed in range(3):
-        t = random_trajectory(flat_nut, 8, seed, slips=(5,))
+        t = random_trajectory(flat_nut.space, 8, seed, slips=(5,))
         posteriors = list(track(flat_nut, t.masks))
         slipped = [p.settings["frame"] for p in posteriors if any(w.startswith("slip?") for w in p.warnings)]
         assert set(slipped) <= {6}
@@ -367,8 +367,8 @@ def test_wrong_options_are_told_at_once(flat_nut, wrong, told):
 
 
 def test_trajectories_creep_and_stay_in_contact(flat_nut):
-    t = random_trajectory(flat_nut, 8, 5, slips=(4,))
-    again = random_trajectory(flat_nut, 8, 5, slips=(4,))
+    t = random_trajectory(flat_nut.space, 8, 5, slips=(4,))
+    again = random_trajectory(flat_nut.space, 8, 5, slips=(4,))
     np.testing.assert_array_equal(t.T_sensor_object, again.T_sensor_object)
     assert all(mask.any() for mask in t.masks)
     assert np.isfinite(flat_nut.space.penetration(t.T_sensor_object)).all()

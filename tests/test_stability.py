@@ -69,11 +69,11 @@ def test_a_sequence_is_judged_at_its_last_frame(flat_nut, monkeypatch):
     monkeypatch.setattr(stability, "_FRAMES", 4)
     told = list(stability.swept(flat_nut, SWEEPS["slips"], 1, 2, 3, "fast"))
     for number, answer in enumerate(told):
-        made = random_trajectory(flat_nut, 4, 3000 + number, 2 * MM, slips=(2,), elastic=number % 2 == 1)
-        last = list(flat_nut.track(made.masks, effort="fast", kind="mask", seed=3))[-1]
-        assert replace(answer, warned=False) == replace(
-            judged(flat_nut.mesh, made.T_sensor_object[-1], last), warned=False
-        )
+        made = random_trajectory(flat_nut.space, 4, 3000 + number, 2 * MM, slips=(2,), elastic=number % 2 == 1)
+        frames = list(flat_nut.track(made.masks, effort="fast", kind="mask", seed=3))
+        slipped = any("slip?" in warning for frame in frames for warning in frame.warnings)
+        assert answer == replace(judged(flat_nut.mesh, made.T_sensor_object[-1], frames[-1]), warned=slipped)
+    assert any(answer.warned for answer in told)
 
 
 @pytest.mark.parametrize("degrees", [0, 10, 90])
@@ -114,9 +114,12 @@ def test_a_coarser_part_keeps_so_many_faces():
 
 def test_pixels_that_are_larger_than_said_show_a_smaller_contact(here, plug):
     world = replace(SWEEPS["pitch"].world(here, 10), noise=CLEAN, threshold=0.0)
-    for T, mask in stability.touches(world, 4, 3):
+    whole = 0
+    for T, mask in stability.touches(world, 16, 3):
         if cut_off(mask) == 0:
+            whole += 1
             assert plug.simulate(T).mask.sum() == pytest.approx(1.21 * mask.sum(), rel=0.03)
+    assert whole >= 2
 
 
 @pytest.mark.parametrize(("name", "level"), [("area", 4), ("area", 1), ("border", 10), ("border", 0)])

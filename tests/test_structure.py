@@ -91,6 +91,8 @@ def test_committed_results_are_of_studies_as_they_are_now():
     files = sorted((ROOT / "docs" / "results").glob("*.json"))
     schemas = {path.name: json.loads(path.read_text("utf-8")).get("schema") for path in files}
     assert len(schemas) > 10
+    told_apart = {name for name, schema in schemas.items() if schema is None}
+    assert told_apart <= {"benchmark.json", "peers.json", "thesis_figures.json"}  # which nothing resumes
     assert {name: schema for name, schema in schemas.items() if schema is not None and schema not in known} == {}
 
 
@@ -139,3 +141,13 @@ def test_setup_cfg_ships_every_package_and_pins_every_requirement():
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
     assert names <= set(pins)
     assert pins["torch"] == "2.13.0"
+
+
+def test_every_study_and_every_module_of_evaluation_stands_in_its_table():
+    import geomtact.evaluation
+    from geomtact.cli.evaluate import evaluate
+
+    table = geomtact.evaluation.__doc__
+    studies = {command.name for command in evaluate.registered_commands} - {"samples", "plot"}
+    modules = {path.stem for path in (ROOT / "geomtact" / "evaluation").glob("*.py")} - {"__init__"}
+    assert set(re.findall(r"``([a-z_-]+)``", table)) == studies | modules

@@ -154,8 +154,8 @@ def test_figures_are_told_of_distinctive_and_ambiguous_touches_apart():
 
 
 def test_touches_come_one_by_one_as_they_do_at_once(flat_nut):
-    at_once = random_touches(flat_nut, 6, 3, False, MODERATE)
-    for one, other in zip(islice(each_touch(flat_nut, 6, 3, False, MODERATE), 4), at_once, strict=False):
+    at_once = random_touches(flat_nut.space, 6, 3, False, MODERATE)
+    for one, other in zip(islice(each_touch(flat_nut.space, 6, 3, False, MODERATE), 4), at_once, strict=False):
         assert np.array_equal(one.T_sensor_object, other.T_sensor_object)
         assert np.array_equal(one.mask, other.mask)
 

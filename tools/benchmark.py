@@ -131,7 +131,7 @@ def _localize(part: str, sensor: str, cache: str, repeats: str) -> dict[str, Any
     from geomtact.inference.localizer import EFFORTS, Localizer
 
     localizer = Localizer.prepare(part, sensor=sensor, cache_dir=cache)
-    touches = random_touches(localizer, int(repeats), seed=0)
+    touches = random_touches(localizer.space, int(repeats), seed=0)
     query = thesis_query(localizer.sensor)
     for touch in touches[:2]:
         for effort in EFFORTS:
@@ -188,7 +188,7 @@ def starts(part: str, sensor: str, cache: Path, repeats: int) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as folder:
         image = Path(folder) / "touch.png"
-        touch = random_touches(Localizer.prepare(part, sensor=sensor, cache_dir=cache), 1, seed=0)[0]
+        touch = random_touches(Localizer.prepare(part, sensor=sensor, cache_dir=cache).space, 1, seed=0)[0]
         Image.fromarray(255 * touch.mask.astype(np.uint8)).save(image)
         python, run = sys.executable, [sys.executable, "-m", "geomtact"]
         localize = [*run, "localize", str(image), "--object", part, "--sensor", sensor, "--cache-dir", str(cache)]

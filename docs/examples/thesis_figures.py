@@ -41,7 +41,7 @@ def pixel_distance():
     side = draw_sides(mesh, SENSOR, 1, 2)[0]
     localizer = Localizer.prepare(mesh, sensor=SENSOR, approach=side, scorer="encoder", max_poses=50_000)
     index, distance = localizer.index, PoseDistance(mesh)
-    for number, touch in enumerate(each_touch(localizer, 60, 2, True, MODERATE), 1):
+    for number, touch in enumerate(each_touch(localizer.space, 60, 2, True, MODERATE), 1):
         seen = to_grid(touch.mask, index.resolution.mask_shape)
         differ = 1 - PixelL1().score(index, seen).reshape(-1)
         apart = -localizer.scorer.scorer.score(index, touch.mask).reshape(-1)

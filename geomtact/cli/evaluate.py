@@ -52,7 +52,6 @@ def judge_samples(
 
     Prints a table, half of the touches felt by a rigid threshold and half by an elastic gel, and writes nothing.
     """
-    from types import SimpleNamespace
 
     import numpy as np
 
@@ -64,7 +63,7 @@ def judge_samples(
     pixel_mm2 = 1e6 * float(np.prod(pressed.pixel_pitch))
     rows = []
     for mesh in study_options.meshes(parts, unit, pressed):
-        made = make_touches(SimpleNamespace(space=ContactSpace(mesh, pressed)), touches, seed, strength)
+        made = make_touches(ContactSpace(mesh, pressed), touches, seed, strength)
         for name, elastic in (("geometric", False), ("elastic", True)):
             some = [t for t in made if t.elastic == elastic]
             if not some:
@@ -135,7 +134,7 @@ def judge(
             study_file.keep(out, content, name, settings=settings, **figures, outcomes=flat)
 
         if len(outcomes) < touches:
-            made = study.make_touches(localizer, touches, seed, strength, felt)
+            made = study.make_touches(localizer.space, touches, seed, strength, felt)
             more = proper.judge(localizer, made, effort, seed, len(outcomes))
             study_file.collect(outcomes, more, touches, f"localizing {name}", keep)
         random_mm = study.expected_random_add(localizer)

@@ -112,5 +112,5 @@ def _print(figures: Sequence[Mapping[str, Any]]) -> None:
         ]
         for f in figures
     ]
-    typer.echo("Shares of scenes, with 95 % intervals; P(right) is the median; sure is more than 95 %")
+    typer.echo("Shares of scenes, with 95 % intervals; log P(right) is a mean; sure is more than 95 %")
     print_table(headings, rows, headings)

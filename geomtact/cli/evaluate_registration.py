@@ -44,7 +44,6 @@ def judge_registration(
 
     Prints success, errors and times of each method, and writes them and every trial to --out.
     """
-    from types import SimpleNamespace
 
     from geomtact.contact_space.build import choose_resolution
     from geomtact.contact_space.resolution import MAX_POSES
@@ -98,7 +97,7 @@ def judge_registration(
             study_file.keep(out, content, name, settings=settings, outcomes=outcomes)
 
         if len(done) < touches:
-            pressed_at = random_touches(SimpleNamespace(space=space), touches, seed, FELT[felt], strength)
+            pressed_at = random_touches(space, touches, seed, FELT[felt], strength)
             more = registration.trials(space, pressed_at, methods, grid, strength, seed, first=len(done))
             outcomes = ([asdict(trial) for trial in some] for some in more)
             done = study_file.collect(done, outcomes, touches, f"registering {mesh.name}", keep)

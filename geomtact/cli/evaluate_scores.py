@@ -200,7 +200,7 @@ def _judge(
     if len(outcomes) < options.touches and not touches:
         elastic, strength = FELT[options.felt], study_options.noise_named(options.noise)
         touches += study.make_touches(
-            localizer, options.touches, options.seed, strength, elastic=elastic, only=options.only
+            localizer.space, options.touches, options.seed, strength, elastic=elastic, only=options.only
         )
     todo = scores.judged(localizer, touches[len(outcomes) :], effort, options.seed)
     keep(study_file.collect(outcomes, todo, options.touches, f"judging {mesh.name}, {name}", keep))

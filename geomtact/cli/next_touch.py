@@ -88,7 +88,9 @@ def read_actions(path: Path) -> list[Touch | Probe]:
             f"{path}: cannot be read ({(error.strerror or str(error)).lower()}); give a JSON file"
         ) from None
     except (ValueError, KeyError, TypeError):
-        raise InputError(f'{path}: expected JSON {{"actions": [...]}} with touches and probes') from None
+        raise InputError(
+            f'{path}: expected JSON {{"actions": [...]}} with touches and probes; see docs/formats.md'
+        ) from None
     if not entries:
         raise InputError(f"{path}: no actions to choose from; add some, or leave --actions out for touches all round")
     found = []
@@ -106,7 +108,7 @@ def _action(entry: Any) -> Touch | Probe:
     from geomtact.planning.actions import Probe, Touch
 
     if not isinstance(entry, Mapping) or ("T_world_sensor" in entry) == ("probe" in entry):
-        raise InputError('expected either "T_world_sensor" (4x4) or "probe"')
+        raise InputError('expected either "T_world_sensor" (4x4) or "probe"; give one of them')
     for key in entry:
         if key not in _KEYS:
             raise InputError(f"unknown key {key!r}{nearest_name(key, _KEYS)}")

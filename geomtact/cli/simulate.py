@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,13 +23,6 @@ class NoiseName(StrEnum):
     none = "none"
     moderate = "moderate"
     heavy = "heavy"
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """What touches need of a localizer: no index is built for them."""
-
-    space: ContactSpace
 
 
 def simulate(
@@ -71,16 +63,16 @@ def simulate(
     sensor_named = require(values, "sensor", bundled_sensors(), "a TOML file")
     pressed = Sensor.load(sensor_named)
     mesh = load_mesh(named, values["unit"], sensor=pressed)
-    scene = _Scene(ContactSpace(mesh, pressed))
+    space = ContactSpace(mesh, pressed)
     elastic = elastic or reading
     strength = {NoiseName.none: noises.CLEAN, NoiseName.moderate: noises.MODERATE, NoiseName.heavy: noises.HEAVY}[noise]
 
     if pose is not None:
-        touches = [_touch_at(scene, read_pose(pose), seed, elastic, strength)]
+        touches = [_touch_at(space, read_pose(pose), seed, elastic, strength)]
     else:
         from geomtact.evaluation.touches import random_touches
 
-        touches = random_touches(scene, n, seed, elastic=elastic, noise=strength)
+        touches = random_touches(space, n, seed, elastic=elastic, noise=strength)
     # files are named in full, so that the image is understood from any folder
     metadata = {key: str(Path(v).resolve()) if Path(v).is_file() else v for key, v in values.items() if v is not None}
     out.mkdir(parents=True, exist_ok=True)
@@ -93,7 +85,7 @@ def simulate(
 
         heights = [
             np.zeros(pressed.image_size_px[::-1]),
-            *(felt_height(scene.space, t.T_sensor_object) for t in touches),
+            *(felt_height(space, t.T_sensor_object) for t in touches),
         ]
         rng = np.random.default_rng([seed, 2])
         background, *shown = (example_reading(h, pressed.pixel_pitch, SPOILT[noise.value], rng) for h in heights)
@@ -137,14 +129,14 @@ def read_pose(path: Path) -> Array:
         raise InputError(f'{path}: expected JSON {{"T_sensor_object": 4x4 numbers}}, in metres') from None
 
 
-def _touch_at(scene: _Scene, T: Array, seed: int, elastic: bool, noise: Noise) -> Touch:
+def _touch_at(space: ContactSpace, T: Array, seed: int, elastic: bool, noise: Noise) -> Touch:
     import numpy as np
 
     from geomtact.contact_space.touch import felt_mask, spoilt
     from geomtact.evaluation.touches import Touch
 
-    mask = spoilt(felt_mask(scene.space, T, elastic), scene.space, noise, np.random.default_rng(seed))
-    return Touch(T, float(scene.space.caster.penetration(scene.space.sensor, T)[0]), mask, elastic)
+    mask = spoilt(felt_mask(space, T, elastic), space, noise, np.random.default_rng(seed))
+    return Touch(T, float(space.caster.penetration(space.sensor, T)[0]), mask, elastic)
 
 
 def _write(stem: Path, mask: Any, truth: dict, metadata: dict) -> None:

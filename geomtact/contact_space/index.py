@@ -19,11 +19,15 @@ from geomtact.geometry.approach import Approach
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Directions
-from geomtact.se3 import Array, hat, transform
+from geomtact.se3 import Array, exp, hat, transform
 from geomtact.sensing.sensor import Sensor
 
 _TURNED = 8  # rotations of a cell that stand for all of it
 _DRAWN = 30_000  # poses that stand for all
+_NO_TILT = 1e-8  # rad that an exact approach leaves
+# poses about one, in widths of a cell in tilts, turn, x and y, whose heights tell how those of its cell differ
+_AROUND = np.random.default_rng(0).uniform(-0.75, 0.75, (32, 5))
+_AROUND = np.concatenate([_AROUND, -_AROUND])
 
 
 @dataclass(frozen=True)
@@ -146,18 +150,37 @@ class Index:
         return x, y
 
     def cell_covariance(self, T: ArrayLike) -> Array:
-        """Spread (6, 6) of the poses in the cell around ``T`` (4, 4): covariance of xi in T exp(xi^), radians and metres."""
+        """Spread (6, 6) of the poses in the cell around ``T`` (4, 4): covariance of xi in T exp(xi^), radians and metres.
+
+        A cell is as wide in tilt, turn, x and y as the grid is fine; but where its poses touch, at one penetration, they lie as
+        high as the object's surface lets them: by what the cells round about say, a plane and what is left of it.
+        """
         R = np.asarray(T, float)[:3, :3]
-        about_z = np.outer(R[2], R[2])
-        turn = self.angle_step
+        up = R[2]
         # an approach leaves no more tilt than its cones are wide
         cones = self.directions.cones
-        tilt = turn if cones is None else min(turn, 2 * max(half for _, half in cones))
-        depth = self.sensor.max_penetration / len(self.resolution.penetrations)
-        step = self.resolution.step
-        about_centre = np.zeros((6, 6))
-        about_centre[:3, :3] = (turn**2 * about_z + tilt**2 * (np.eye(3) - about_z)) / 12
-        about_centre[3:, 3:] = R.T @ np.diag([step**2, step**2, depth**2]) @ R / 12
+        turn, step = self.angle_step, self.resolution.step
+        tilt = turn if cones is None else min(turn, max(_NO_TILT, 2 * max(half for _, half in cones)))
+        sideways = np.linalg.svd(up[None])[2][1:]
+        turned = np.stack([tilt * sideways[0], tilt * sideways[1], turn * up, np.zeros(3), np.zeros(3)])
+        moved = np.zeros((5, 3))
+        moved[3, 0] = moved[4, 1] = step
+
+        centre = R @ self.mesh.centre + np.asarray(T, float)[:3, 3]
+        around = R @ exp(np.pad(_AROUND @ turned, ((0, 0), (0, 3))))[:, :3, :3]
+        poses = transform(around, centre + _AROUND @ moved - around @ self.mesh.centre)
+        level = len(self.height) // 2
+        place = self.lookup(poses, np.full(len(poses), 0.5 * self.sensor.max_penetration)) % self.places
+        height = self.height[level, place].astype(float)
+        height -= height.mean()
+        lean = np.linalg.lstsq(_AROUND, height, rcond=None)[0]
+        moved[:, 2] = lean
+        depth = self.sensor.max_penetration / len(self.height)
+        left = np.square(height - _AROUND @ lean).mean() + depth**2 / 12
+
+        way = np.concatenate([turned, moved @ R], 1)
+        about_centre = way.T @ way / 12
+        about_centre[3:, 3:] += left * np.outer(up, up)
         # a rotation about the object's centre is one about its origin and a shift
         J = np.eye(6)
         J[3:, :3] = hat(self.mesh.centre)

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -196,13 +195,11 @@ def make(kind: str, localizer: Localizer, n: int, seed: int) -> list[Scene]:
     if kind == "three sensors":
         scenes = make_scenes(localizer, n, seed, MODERATE, None, _SENSORS)
         return [Scene(s.T_world_object, [t.mask for t in s.touches], s.T_world_sensor) for s in scenes]
-    where: Any = localizer
+    space = localizer.space
     if kind == "known side":
-        where = SimpleNamespace(space=ContactSpace(localizer.mesh, localizer.sensor, [(upwards(localizer.mesh), 0.0)]))
-    touches = random_touches(where, n, seed, None, MODERATE)
-    return [
-        Scene(t.T_sensor_object, [t.mask], height=_height(where.space, t, [seed, i])) for i, t in enumerate(touches)
-    ]
+        space = ContactSpace(localizer.mesh, localizer.sensor, [(upwards(localizer.mesh), 0.0)])
+    touches = random_touches(space, n, seed, None, MODERATE)
+    return [Scene(t.T_sensor_object, [t.mask], height=_height(space, t, [seed, i])) for i, t in enumerate(touches)]
 
 
 def _height(space: ContactSpace, touch: Touch, seed: list[int]) -> Array:

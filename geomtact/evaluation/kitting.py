@@ -116,7 +116,9 @@ def first_grasp(mesh: Mesh, rng: np.random.Generator) -> Array:
     away = np.einsum("ijk,ik->ij", along, normals)
     holds = (np.minimum(away, away.T) >= np.cos(_SLIP)) & (width <= _MOST_OPEN)
     if not holds.any():
-        raise InputError(f"{mesh.name}: no place to grasp between fingers that open {1e3 * _MOST_OPEN:.0f} mm")
+        raise InputError(
+            f"{mesh.name}: no place to grasp between fingers that open {1e3 * _MOST_OPEN:.0f} mm; take another part"
+        )
     i, j = rng.choice(np.argwhere(holds))
     turn = exp([0, 0, rng.uniform(0, 2 * np.pi), 0, 0, 0])
     return transform(facing(along[i, j]).T, 0.5 * (points[i] + points[j])) @ turn
@@ -209,7 +211,7 @@ def kit(
     """
     felt = touch_with_jaw(localizer.space, T_world_part, np.eye(4), elastic, noise, rng)
     if not felt.masks or not felt.masks[0].any():
-        raise InputError("kit: no finger felt the part")
+        raise InputError("kit: expected a grasp with contact, no finger felt the part; take another seed")
     for touch in range(1, touches + 1):
         posterior = localizer.localize(felt.masks, "mask", T_world_sensor=felt.T_world_sensor)
         belief = believe(localizer.space, posterior, felt, rng)

@@ -1,7 +1,7 @@
 """The thesis's Table 1: one touch from a side that is known, anywhere on the part, turned in any way about the normal (7.1).
 
-A robot that lowers a part onto the sensor knows which way it came. The errors of the most probable pose and of the best of
-ten are given before and after refinement: by this project, and by the thesis's own way of refining.
+A robot that lowers a part onto the sensor knows which way it came. The errors of the grid's pose at the heart of the most
+probable mode, and of the best of ten, are given before and after refinement: by this project, and by the thesis's own way.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Outcome:
     Attributes
     ----------
     side : number of the side that is touched
-    error_mm : of each of ``ROWS``: the most probable mode of the grid, the same pose refined, refined as in the thesis, the
+    error_mm : of each of ``ROWS``: the heart of the grid's most probable mode, that pose refined, refined as in the thesis, the
         first mode of what ``localize`` says, and the best of ten modes of the grid and of that
     random_mm : expected ADD of a random guess, touching from that side
     """
@@ -71,7 +71,7 @@ def touches_of_side(
     localizer: Localizer, side: int, n: int, seed: int, noise: Noise, elastic: bool | None
 ) -> Iterator[Touch]:
     """The ``n`` touches of a side, one by one: the same ones whoever asks."""
-    return each_touch(localizer, n, seed * 1000 + side, elastic, noise)
+    return each_touch(localizer.space, n, seed * 1000 + side, elastic, noise)
 
 
 def judge_side(
@@ -97,7 +97,7 @@ def _answers(localizer: Localizer, touch: Touch, effort: str) -> list[Array]:
     ours = localizer.refinery.refine(grid, grid.observation.contact, 1).refined[int(first[0])].T[None]
     mask = cleaned(touch.mask, sensor)
     spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
-    theirs = thesis_refinement(localizer.space, spread)(Seen(mask, make_problem(mask, sensor, None)), best[0]).T[None]
+    theirs = thesis_refinement(localizer.space, spread)(Seen(mask, make_problem(mask, sensor)), best[0]).T[None]
     return [best, ours, theirs, after[:1], before, after]
 
 

@@ -52,7 +52,7 @@ class Run:
 
 def touch_until_sure(localizer: Localizer, n: int, seed: int, noise: Noise, first: int = 0) -> Iterator[list[Run]]:
     """For ``n`` scenes from ``first`` on, a run by each policy, from the same first touch; gels are rigid and elastic in turn."""
-    touches = random_touches(localizer, n, seed, None, noise)
+    touches = random_touches(localizer.space, n, seed, None, noise)
     for number, touch in enumerate(touches[first:], first):
         yield [_run(localizer, number, touch, policy, seed, noise) for policy in POLICIES]
 

@@ -125,9 +125,14 @@ def imprints_by_eye(folder: Path, circles: Path) -> list[Imprint]:
     Raises
     ------
     InputError
-        A reading is missing.
+        A reading is missing, or the file has not the columns of the one in ``tests``.
     """
-    rows = [row for row in circles_of(circles) if row["inside"] == "1"]
+    missing = {"file", "cx_px", "cy_px", "r_px", "inside"} - set(next(iter(rows := circles_of(circles)), {}))
+    if missing:
+        raise InputError(
+            f"{circles}: expected a table of circles with the columns {', '.join(sorted(missing))}; add them"
+        )
+    rows = [row for row in rows if row["inside"] == "1"]
     presses = _presses(folder)
     return _drawn(rows, ("file", "cx_px", "cy_px", "r_px"), presses, presses / "background.png")
 
@@ -350,12 +355,21 @@ def localize_groove(folder: Path, cache_dir: Any = None, modes: int = 5) -> tupl
 
 
 def read_scan(path: Path) -> tuple[Any, tuple[float, float]]:
-    """Heights (H, W) [m] and the pitch along x and y [m] of a TrueMap file, version 2."""
+    """Heights (H, W) [m] and the pitch along x and y [m] of a TrueMap file, version 2.
+
+    Raises
+    ------
+    InputError
+        It is none.
+    """
     data = path.read_bytes()
-    start = data.index(b"\0", 32) + 1
-    columns, rows = (int(n) for n in np.frombuffer(data, "<u4", 2, start))
-    length = np.frombuffer(data, "<f4", 2, start + 8) * MM
-    height = np.frombuffer(data, "<f4", rows * columns, start + 24).reshape(rows, columns) * MM
+    try:
+        start = data.index(b"\0", 32) + 1
+        columns, rows = (int(n) for n in np.frombuffer(data, "<u4", 2, start))
+        length = np.frombuffer(data, "<f4", 2, start + 8) * MM
+        height = np.frombuffer(data, "<f4", rows * columns, start + 24).reshape(rows, columns) * MM
+    except ValueError as error:
+        raise InputError(f"{path}: expected a TrueMap file as its makers wrote it ({error})") from None
     return height.astype(float), (float(length[0]) / columns, float(length[1]) / rows)
 
 

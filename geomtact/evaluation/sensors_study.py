@@ -68,7 +68,7 @@ def make_scenes(
     ``elastic`` as in ``touches.random_touches``.
     """
     rng = np.random.default_rng([seed, 13])
-    touches = random_touches(localizer, n * sensors, seed, elastic, noise)
+    touches = random_touches(localizer.space, n * sensors, seed, elastic, noise)
     out = []
     for i in range(n):
         some = touches[i * sensors : (i + 1) * sensors]
@@ -109,7 +109,7 @@ def fuse_scenes(
                     add_s_mm=float(1e3 * add_s(T, poses[:1], points)[0]),
                     add10_mm=float(mean.min()),
                     probability=modes[0].probability,
-                    warned=any("disagree" in warning for warning in posterior.warnings),
+                    warned=posterior.settings.get("disagrees", False),
                     ms=ms,
                 )
             )

@@ -24,6 +24,7 @@ from geomtact.evaluation.study import CERTAIN
 from geomtact.evaluation.touches import closed_on, counts, penetrations
 from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.geometry.mesh import Mesh, coarser
+from geomtact.inference.filter import has_slipped
 from geomtact.inference.localizer import Localizer
 from geomtact.se3 import Array, exp, inverse
 from geomtact.sensing.noise import MODERATE, Noise
@@ -364,9 +365,11 @@ def _sequences(localizer: Localizer, slips: int, n: int, seed: int, effort: str)
     """What is told at the last frame of sequences in which the part slips so often, at even distances; warned, if of any slip."""
     at = tuple(_FRAMES * (i + 1) // (slips + 1) for i in range(slips))
     for number in range(n):
-        made = random_trajectory(localizer, _FRAMES, seed * 1000 + number, _STEP, slips=at, elastic=number % 2 == 1)
+        made = random_trajectory(
+            localizer.space, _FRAMES, seed * 1000 + number, _STEP, slips=at, elastic=number % 2 == 1
+        )
         told = list(localizer.track(made.masks, effort=effort, kind="mask", seed=seed))
-        slipped = any(warning.startswith("slip?") for posterior in told for warning in posterior.warnings)
+        slipped = any(has_slipped(posterior.settings["surprise_nats"]) for posterior in told)
         yield replace(judged(localizer.mesh, made.T_sensor_object[-1], told[-1]), warned=slipped)
 
 

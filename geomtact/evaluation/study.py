@@ -60,7 +60,7 @@ class Outcome:
 
 
 def make_touches(
-    scene: Any,
+    space: ContactSpace,
     n: int,
     seed: int,
     noise: Noise,
@@ -68,20 +68,17 @@ def make_touches(
     elastic: bool | None = None,
     only: str | None = None,
 ) -> list[Touch]:
-    """``n`` touches of ``scene`` (anything with a ``space``), geometric and elastic in turn unless ``elastic`` says which.
-
-    ``only`` names a class of contact, as in ``touches.random_touches``.
+    """``n`` touches of the object of ``space`` on its sensor, geometric and elastic in turn unless ``elastic`` says which.
 
     ``felt`` (space, T, elastic) -> (H, W) bool replaces the elastic touches' masks: with another solver than the one
-    that the posterior was calibrated with.
+    that the posterior was calibrated with. ``only`` names a class of contact, as in ``touches.random_touches``.
     """
-    touches = random_touches(scene, n, seed, elastic, noise, only)
+    touches = random_touches(space, n, seed, elastic, noise, only)
     if felt is None:
         return touches
     from geomtact.contact_space.touch import spoilt
 
     rng = np.random.default_rng([seed, n])
-    space = scene.space
     return [
         replace(t, mask=spoilt(felt(space, t.T_sensor_object, True), space, noise, rng)) if t.elastic else t
         for t in touches

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,26 +58,26 @@ def counts(space: ContactSpace, mask: NDArray[np.bool_]) -> bool:
 
 
 def random_touches(
-    localizer: Any,
+    space: ContactSpace,
     n: int,
     seed: int,
     elastic: bool | None = None,
     noise: Noise = MODERATE,
     only: str | None = None,
 ) -> list[Touch]:
-    """``n`` touches of ``localizer.mesh`` on ``localizer.sensor``, all at once: see :func:`each_touch`."""
-    return list(each_touch(localizer, n, seed, elastic, noise, only))
+    """``n`` touches of an object on a sensor, all at once: see :func:`each_touch`."""
+    return list(each_touch(space, n, seed, elastic, noise, only))
 
 
 def each_touch(
-    localizer: Any,
+    space: ContactSpace,
     n: int,
     seed: int,
     elastic: bool | None = None,
     noise: Noise = MODERATE,
     only: str | None = None,
 ) -> Iterator[Touch]:
-    """``n`` touches of ``localizer.mesh`` on ``localizer.sensor``, one by one.
+    """``n`` touches of the object of ``space`` on its sensor, one by one.
 
     Poses are uniform over the contact pose space with a penetration of 0.3 to 1.5 mm and at least 1 mm^2 of contact.
     They come from casts at the exact pose, not from the index.
@@ -94,7 +93,6 @@ def each_touch(
         Hardly any touch of the object is of that class, or large enough to count.
     """
     rng = np.random.default_rng(seed)
-    space: ContactSpace = localizer.space
     made = tried = 0
     while made < n:
         some = 64 if only else min(64, 2 * (n - made) + 8)

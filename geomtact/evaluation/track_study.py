@@ -61,10 +61,10 @@ def make_trajectory(localizer: Localizer, number: int, seed: int, frames: int, n
     own = int(np.random.default_rng([seed, number]).integers(1 << 31))
     if number % 4 < 2:
         try:
-            return random_trajectory(localizer, frames, own, featureless=min(STRETCH, frames), **options)
+            return random_trajectory(localizer.space, frames, own, featureless=min(STRETCH, frames), **options)
         except MeshError:
             pass
-    return random_trajectory(localizer, frames, own, **options)
+    return random_trajectory(localizer.space, frames, own, **options)
 
 
 def follow(

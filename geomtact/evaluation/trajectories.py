@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +38,7 @@ class Trajectory:
 
 
 def random_trajectory(
-    localizer: Any,
+    space: ContactSpace,
     n: int,
     seed: int,
     speed: float = 1e-3,
@@ -48,7 +47,7 @@ def random_trajectory(
     elastic: bool = False,
     noise: Noise = MODERATE,
 ) -> Trajectory:
-    """``n`` frames of ``localizer.mesh`` creeping over ``localizer.sensor`` in a slowly turning direction.
+    """``n`` frames of the object of ``space`` creeping over its sensor in a slowly turning direction.
 
     Parameters
     ----------
@@ -63,7 +62,6 @@ def random_trajectory(
         The object has no such contacts.
     """
     rng = np.random.default_rng(seed)
-    space: ContactSpace = localizer.space
     poses: list[Array] = []
     ends = [*slips, n]
     for first, end in zip([0, *slips], ends, strict=True):

@@ -180,7 +180,7 @@ def _localized(localizer: Localizer, triplet: Triplet, shown: str, n: int, effor
         claimed=-float(posterior.entropy_nats),
         level=float(posterior.credible_level(triplet.T_world_object)),
         probability=modes[0].probability if modes else 0.0,
-        warned=any("disagree" in warning for warning in posterior.warnings),
+        warned=posterior.settings.get("disagrees", False),
         ms=ms,
     )
 

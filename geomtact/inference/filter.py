@@ -41,6 +41,11 @@ Counts = tuple[float, float | None]
 Known = tuple[NDArray[np.int64], NDArray[np.floating]]  # cells, ascending, and the log probability of each
 
 
+def has_slipped(surprise: float | None) -> bool:
+    """Whether a ``surprise`` [nats], None where there was nothing to compare with, is so low that the object may have slipped."""
+    return surprise is not None and surprise < _SLIP
+
+
 @dataclass
 class Filter:
     """What is known between two frames.
@@ -96,7 +101,7 @@ class Filter:
                 warnings.append(f"contact was lost for {lost}: of what was known before, half is given up")
             self.predict(seen.T_frame_sensor)
             known, surprise = self.update(seen)
-            if surprise < _SLIP:
+            if has_slipped(surprise):
                 chance = f"{np.exp(min(-surprise, 99)):.3g} times less likely than chance does"
                 given_up = ": half of it is given up" if self.fresh > 0 else ""
                 warnings.append(f"slip? what was known before makes this frame {chance}{given_up}")
@@ -139,7 +144,7 @@ class Filter:
             likely = np.exp(gain[self._row(self.believed.cells)])
             with np.errstate(divide="ignore"):
                 surprise = float(np.log(self.believed.mass @ likely + self.believed.uniform))
-            if surprise < _SLIP and self.fresh > 0:
+            if has_slipped(surprise) and self.fresh > 0:
                 expected = expected.mixed(_ANEW)
         before = self._log_density(expected)
         log_density = np.float32(now) * gain

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from geomtact.contact_space.carry import Carry, RigStd
 from geomtact.errors import NoPoseAgreesError
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import prior_log_density, prior_log_mass
+from geomtact.inference.prior import NothingFelt, prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.inference.refine_together import refine_together
 from geomtact.inference.search import View
@@ -158,7 +158,9 @@ def fused_posterior(
         runs=None,
         log_evidence=float(fused.weight @ [t.log_evidence for t in touches]) + fused.log_evidence,
         observations=first.observations + [o for touch in touches if touch is not first for o in touch.observations],
-        settings=first.settings | _said(touches) | {"odd": any(t.settings.get("odd", False) for t in touches)},
+        settings=first.settings
+        | _said(touches)
+        | {"odd": any(t.settings.get("odd", False) for t in touches), "disagrees": against is not None},
         timing_ms=timing,
         warnings=_warnings(touches) + ([against] if against else []),
     )
@@ -194,15 +196,9 @@ def _badly_agreed(settings: Mapping[str, Any]) -> list[str]:
 def _nothing_felt(touches: Sequence[Posterior], prior: Any) -> Posterior:
     """The posterior when no sensor feels anything: what was known before, where none is touched."""
     first, others = touches[0], touches[1:]
-    before = prior_log_density(prior, first.mesh, first.frame)
-
-    def elsewhere(T: Array) -> Array:
-        density = before(T) if before is not None else np.zeros(len(T))
-        return density + np.sum([other.log_density(T) for other in others], axis=0)
-
     return replace(
         first,
-        elsewhere=elsewhere,
+        elsewhere=NothingFelt(others, prior_log_density(prior, first.mesh, first.frame)),
         observations=[o for touch in touches for o in touch.observations],
         settings=first.settings | _said(touches),
         warnings=_warnings(touches),

@@ -40,6 +40,8 @@ from geomtact.sensing.contact import Contact, Shown
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
 
+RESOLVED = ("blocks", "cells", "all")
+
 
 @dataclass(frozen=True)
 class Effort:
@@ -59,6 +61,14 @@ class Effort:
     modes: int
     thorough: bool = True
     outlines: bool = False
+
+    def __post_init__(self) -> None:
+        if self.resolved not in RESOLVED:
+            raise UsageError(
+                f"Effort: no way to resolve named {self.resolved!r}{nearest_name(self.resolved, RESOLVED)}"
+            )
+        if self.modes < 0:
+            raise UsageError(f"Effort: expected 0 refined modes or more, got {self.modes}; give 0 for none")
 
 
 _HOLLOW = 0.01  # share of the surface in hollows that the sensor may fit into, from which it is warned of
@@ -118,6 +128,8 @@ class Localizer:
         Raises
         ------
         MeshError, SensorError, UsageError, CacheError
+        InputError
+            Weights that cannot be used.
         """
         if not isinstance(sensor, str | Path | Sensor):
             if not sensor:

@@ -211,7 +211,7 @@ class Posterior:
         return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """``n`` poses (n, 4, 4) drawn from the posterior, uniform within each cell and over the object's symmetry.
+        """``n`` poses (n, 4, 4) drawn from the posterior, uniform within each cell, even a refined one, and over the symmetry.
 
         Raises
         ------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring.calibration import normalised
-from geomtact.se3 import Array, check_pose, check_transforms, hat, inverse, log
+from geomtact.se3 import Array, check_pose, check_transforms, exp, hat, inverse, log
 
 LogDensity = Callable[[Array], Array]
 
@@ -26,6 +26,12 @@ _EXPECTED = (
     "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)), a GaussianPrior or a "
     "function of poses, got {}"
 )
+_DRAWN, _BATCHES, _TOUCHING = (
+    1024,
+    8,
+    1000,
+)  # poses drawn of a Gaussian at a time, how often at most, until so many touch
+_LOOK = (24, 32)  # rays that tell whether they do
 _TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
 
 
@@ -33,7 +39,8 @@ _TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a pr
 class GaussianPrior:
     """A pose known with an uncertainty, T exp(xi^) with xi ~ N(0, covariance): a vision system's, or that of a ``Mode``.
 
-    Where it is narrower than a cell, it is widened to a cell's own spread.
+    Its share of a cell is that of poses drawn from it, of those that touch; where it covers too many cells for that, its density
+    at the cell's pose, widened by a cell's own spread.
 
     Attributes
     ----------
@@ -85,6 +92,25 @@ class GaussianPrior:
         return GaussianPrior(self.T, self.covariance + spread)
 
 
+@dataclass(frozen=True, eq=False)
+class NothingFelt:
+    """Log density, not normalised, where the object touches none of several sensors.
+
+    Attributes
+    ----------
+    others : what each sensor but the first told, all without contact
+    before : what was known before that; None for nothing
+    """
+
+    others: Sequence[Posterior]
+    before: LogDensity | None
+
+    def __call__(self, T: Array) -> Array:
+        """At poses (n, 4, 4), touching the first sensor or not."""
+        density = np.zeros(len(T)) if self.before is None else self.before(T)
+        return density + np.sum([other.log_density(T) for other in self.others], axis=0)
+
+
 def opened(prior: Any, cache_dir: str | Path | None = None) -> Any:
     """``prior``, read where it is the path of a saved posterior."""
     return Posterior.load(prior, cache_dir) if isinstance(prior, str | Path) else prior
@@ -109,9 +135,9 @@ def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) 
         return uniform
     if isinstance(prior, Posterior):
         density = _of_posterior(index, prior, T_frame_sensor, frame)
+    elif isinstance(prior, GaussianPrior):
+        return _of_gaussian(index, prior, T_frame_sensor)
     elif callable(prior):
-        if isinstance(prior, GaussianPrior):
-            prior = prior.over_cells(index, T_frame_sensor)
         density = _over_images(index, lambda T: _checked(prior(T_frame_sensor @ T), len(T)))
     elif isinstance(prior, tuple | list) and len(prior) == 2:
         return normalised(_of_poses(index, prior[0], prior[1], T_frame_sensor))
@@ -121,12 +147,36 @@ def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) 
         raise InputError(
             "prior: the log density is NaN or infinite at some poses; return -inf where a pose is ruled out"
         )
-    out = uniform + density
-    if not np.isfinite(out).any():
+    return _normalised(uniform + density)
+
+
+def _normalised(log_mass: NDArray[np.floating]) -> NDArray[np.floating]:
+    if not np.isfinite(log_mass).any():
         raise InputError(
             "prior: it rules out every pose that touches the sensor; check its frame and its units (metres)"
         )
-    return normalised(out)
+    return normalised(log_mass)
+
+
+def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> NDArray[np.floating]:
+    """Log mass (N,) of every cell. Of n poses drawn that touch and k cells among which the widened density spreads, the draws
+    count n times, that density k times: as many as it takes to see all those cells."""
+    wide = prior.over_cells(index, T_frame_sensor)
+    log_mass = _normalised(index.log_weight + _over_images(index, lambda T: wide(T_frame_sensor @ T)))
+    mass = np.exp(log_mass.astype(float))
+    spread = np.exp(-float(mass @ np.maximum(log_mass, -700)))
+    rng, drawn = np.random.default_rng(0), np.zeros(len(index))
+    for _ in range(_BATCHES):
+        xi = rng.multivariate_normal(np.zeros(6), prior.covariance, _DRAWN)
+        T = inverse(T_frame_sensor) @ prior.T @ exp(xi)
+        depth = index.space.caster.depths(index.sensor, T, index.sensor.along(_LOOK)).max((1, 2))
+        touches = (depth >= 0) & (depth <= index.sensor.max_penetration)
+        touches[touches] = index.space.admits(T[touches])
+        np.add.at(drawn, index.lookup(T[touches], depth[touches]), 1)
+        if drawn.sum() >= _TOUCHING:
+            break
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log((drawn + spread * mass) / (drawn.sum() + spread)), np.float32)
 
 
 def prior_log_density(prior: Any, mesh: Mesh, frame: str) -> LogDensity | None:
@@ -161,7 +211,9 @@ def check_same(heading: tuple[str, str, str], mesh: Mesh, frame: str) -> None:
     """
     name, sha256, its_frame = heading
     if sha256 != mesh.sha256:
-        raise InputError(f"prior: it is for the object {name!r}, not for {mesh.name!r} as loaded here")
+        raise InputError(
+            f"prior: it is for the object {name!r}, not for {mesh.name!r} as loaded here; give the same mesh"
+        )
     if its_frame != frame:
         raise InputError(
             f"prior: its frame is {its_frame!r} but this posterior's is {frame!r}; give the sensor's pose in the world "
@@ -178,8 +230,9 @@ def _pair(poses: Any, log_masses: Any) -> tuple[Array, Array]:
     T = check_transforms(poses, "prior poses").reshape(-1, 4, 4)
     mass = np.asarray(log_masses, float)
     if mass.shape != (len(T),) or not (mass < np.inf).all():
+        got = f"shape {mass.shape}" if mass.shape != (len(T),) else f"{int((~(mass < np.inf)).sum())} that are"
         raise InputError(
-            f"prior: expected one log weight a pose, ({len(T)},), neither NaN nor +inf, got shape {mass.shape}"
+            f"prior: expected one log weight a pose, ({len(T)},), neither NaN nor +inf, got {got}; -inf rules out"
         )
     return T, mass
 
@@ -189,7 +242,9 @@ def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: 
     same_place = np.allclose(prior.T_frame_sensor, T_frame_sensor, atol=1e-9)
     if prior.index.key == index.key and same_place:
         if not prior.contact:
-            raise InputError("prior: it says that the object does not touch the sensor, but this image shows a contact")
+            raise InputError(
+                "prior: it says that the object does not touch the sensor, but this image shows one; leave it out"
+            )
         return prior.cell_log_density(np.arange(len(index)))
     if same_place:
         # another grid: the prior's own sensor saw the object at some depth, and casting it there decides what was ruled out
@@ -200,12 +255,16 @@ def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: 
 def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
     """Log density (N,) of a prior that a sensor elsewhere told, in the cells of ``index``: the mean over each, for a cell is
     wider than the gel is deep, so that its own pose seldom touches there."""
-    carry = Carry(index, prior.index, inverse(prior.T_frame_sensor) @ T_frame_sensor)
-    density = carry.mean(prior.densities)[0] if prior.contact else carry.nothing_felt()
+    apart = prior.elsewhere
+    others, before = (apart.others, apart.before) if isinstance(apart, NothingFelt) else ((), apart)
+    density = np.ones(index.places)
+    for told in (prior, *others):
+        carry = Carry(index, told.index, inverse(told.T_frame_sensor) @ T_frame_sensor)
+        density *= carry.mean(told.densities)[0] if told.contact else carry.nothing_felt()
     with np.errstate(divide="ignore"):
-        out = np.tile(np.log(density.astype(float)), len(index.height))
-    if prior.elsewhere is not None:
-        out += _by_chunks(index, lambda T: prior.elsewhere(T_frame_sensor @ T))
+        out = np.tile(np.log(density), len(index.height))
+    if before is not None:
+        out += _by_chunks(index, lambda T: before(T_frame_sensor @ T))
     return out
 
 

@@ -58,7 +58,7 @@ class Refinery:
 
         Parameters
         ----------
-        contact : its mask on any grid over the window; its height, unless None, is believed
+        contact : on any grid over the window; its heights are not looked at
         thorough : whether every registration has a try, or only the one that does best
         """
         cells = posterior.leading_cells(k)
@@ -66,7 +66,7 @@ class Refinery:
             return posterior
         index, sensor = posterior.index, self.space.sensor
         shown = cleaned(contact.shown, sensor)
-        problem, mask = make_problem(shown, sensor, contact.height), shown > 0.5
+        problem, mask = make_problem(shown, sensor), shown > 0.5
         start = index.poses(cells)
         candidates = [start, self._centred(posterior, mask, cells, start)]
         refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index, thorough)]
@@ -76,10 +76,11 @@ class Refinery:
         for i, cell in enumerate(cells):
             best = int(winner[i])
             T = poses[best, i]
-            covariance, observable = index.cell_covariance(T), np.zeros((0, 6))
             if best >= len(candidates):
                 found = refinements[best - len(candidates)]
                 covariance, observable = found.covariance[i], found.observable[i]
+            else:
+                covariance, observable = index.cell_covariance(T), np.zeros((0, 6))
             refined[int(cell)] = Refined(T, covariance, observable, problem.length, best > 0)
         return replace(posterior.shared_anew(cells, TRUST * likelihood), refined=refined)
 

@@ -268,8 +268,9 @@ class Search:
         found = self.filterreg.refine(self.problem, T)
         out = {}
         for i, cell in enumerate(cells):
-            covariance, observable = self.index.cell_covariance(T[i]), np.zeros((0, 6))
             if found.converged[i]:
                 covariance, observable = found.covariance[i], found.observable[i]
+            else:
+                covariance, observable = self.index.cell_covariance(T[i]), np.zeros((0, 6))
             out[int(cell)] = Refined(T[i], covariance, observable, self.problem.length, True)
         return out

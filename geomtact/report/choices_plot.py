@@ -30,9 +30,6 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
     ways = {name: way for part in content["parts"].values() for name, way in part["ways"].items()}
     choices = list(dict.fromkeys(way["choice"] for way in ways.values() if way["choice"] != _SAME))
     looks = dict(zip(choices, zip(cycle(COLOURS), cycle(_SHAPES), strict=False), strict=False))
-    figure = Figure(figsize=(25, 3.9 * len(rows) + 0.5), dpi=90, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    grid = figure.subplots(len(rows), 6, squeeze=False)
     panels = (
         ("one touch", "ms", "gain", "time of a touch [ms]", "one touch: information [nats]", 1),
         ("one touch", "ms", "mssd", "time of a touch [ms]", "one touch: median MSSD [mm]", -1),
@@ -41,9 +38,14 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
         ("known side", "ms", "mssd", "time of a touch [ms]", "known side: median MSSD [mm]", -1),
         ("one touch", "ready", "gain", "time of preparing [s]", "one touch: information [nats]", 1),
     )
+    judged = [panel for panel in panels if any(panel[0] in points for points in rows.values())]
+    width, height = 25 / len(panels) * len(judged), 3.9 * len(rows) + 0.5
+    figure = Figure(figsize=(width, height), dpi=90, layout="constrained", facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    grid = figure.subplots(len(rows), len(judged), squeeze=False)
     named: list[tuple[Any, list[Named]]] = []
     for line, (title, points) in zip(grid, rows.items(), strict=True):
-        for axes, (scene, x, y, xlabel, ylabel, best) in zip(line, panels, strict=True):
+        for axes, (scene, x, y, xlabel, ylabel, best) in zip(line, judged, strict=True):
             known = {n: (p[x], p[y]) for n, p in points.get(scene, {}).items()}
             some = {n: (a, b) for n, (a, b) in known.items() if a is not None and b is not None}
             if x == "ready":  # most ways are prepared as the default is
@@ -70,7 +72,7 @@ def draw_modelled(content: Mapping[str, Any]) -> bytes:
 
     parts = content["parts"]
     kinds = ("one touch", "three sensors", "known side")
-    scenes = [s for s in kinds if any(p["scenes"][s]["modelled"] for p in parts.values())]
+    scenes = [s for s in kinds if any(p["scenes"].get(s, {}).get("modelled") for p in parts.values())]
     names = list(dict.fromkeys(n for p in parts.values() for s in scenes for n in p["scenes"][s]["modelled"]))
     figure = Figure(
         figsize=(6.2 * len(scenes) + 1, 0.42 * len(names) + 1.4), dpi=100, layout="constrained", facecolor="white"

@@ -22,8 +22,8 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
 
     Parameters
     ----------
-    image : (H, W, 3) uint8 or float 0..1, RGB
-    background : (H, W, 3) the same sensor without contact, under the same light
+    image : (H, W, 3) uint8 or float 0..1, RGB; or a path
+    background : (H, W, 3) the same sensor without contact, under the same light; or a path
     sensor : calibrated by :func:`geomtact.calibrate`, as its file or as it comes from there
 
     Returns

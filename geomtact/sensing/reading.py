@@ -63,6 +63,8 @@ def read_observation(
     ------
     ImageError
         Unreadable, of another size, not finite, negative heights, heights in another unit.
+    SensorError, UsageError
+        No such sensor; no such ``kind``.
     """
     sensor = Sensor.load(sensor)
     if kind not in KINDS:

@@ -110,7 +110,10 @@ class Sensor:
             f"membrane_radius_mm must be 0 (flat) or exceed the window's half diagonal, {1e3 * half_diagonal:.2f} mm, "
             f"got {1e3 * self.membrane_radius:g}",
         )
-        need(self.housing_depth is None or self.housing_depth >= 0, "housing_depth_mm must be >= 0")
+        need(
+            self.housing_depth is None or self.housing_depth >= 0,
+            f"housing_depth_mm must be >= 0, got {1e3 * (self.housing_depth or 0):g}",
+        )
         need(self.height_noise > 0, f"height_noise_mm must be positive, got {1e3 * self.height_noise:g}")
         need(
             self.contact_method in CONTACT_METHODS,

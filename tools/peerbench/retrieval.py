@@ -24,7 +24,7 @@ def retrieval(given: argparse.Namespace) -> list[dict[str, Any]]:
 
     localizer = Localizer.prepare(given.part, sensor=given.sensor)
     index = localizer.index
-    masks = [touch.mask for touch in random_touches(localizer, given.touches + 1, given.seed)]
+    masks = [touch.mask for touch in random_touches(localizer.space, given.touches + 1, given.seed)]
     rows = []
     for score in ("encoder", "cosine", "l1"):
         ways, alike = (bit_ways if score == "l1" else vector_ways)(index, score, given.threads)
