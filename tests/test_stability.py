@@ -66,10 +66,10 @@ def test_whatever_is_said_of_another_part_is_wrong(plug):
 
 
 def test_a_sequence_is_judged_at_its_last_frame(flat_nut, monkeypatch):
-    monkeypatch.setattr(stability, "_FRAMES", 4)
+    monkeypatch.setattr(stability, "_FRAMES", 8)
     told = list(stability.swept(flat_nut, SWEEPS["slips"], 1, 2, 3, "fast"))
     for number, answer in enumerate(told):
-        made = random_trajectory(flat_nut.space, 4, 3000 + number, 2 * MM, slips=(2,), elastic=number % 2 == 1)
+        made = random_trajectory(flat_nut.space, 8, 3000 + number, 2 * MM, slips=(4,), elastic=number % 2 == 1)
         frames = list(flat_nut.track(made.masks, effort="fast", kind="mask", seed=3))
         slipped = any("slip?" in warning for frame in frames for warning in frame.warnings)
         assert answer == replace(judged(flat_nut.mesh, made.T_sensor_object[-1], frames[-1]), warned=slipped)

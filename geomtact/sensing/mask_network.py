@@ -1,6 +1,7 @@
 """The network that tells the contact from a change of colour: a small U-Net, trained on simulated readings alone.
 
-Where a channel is as bright as it can be, its change tells no slope: so it is said, too, how much of each pixel is blown out.
+Where a channel is as bright as it can be, its change tells no slope; near a lamp the same slope changes it more than far off. So
+it is said, too, how much of each pixel is blown out, and how the gel is lit at rest.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ WEIGHTS = Path(__file__).with_name("mask_network.safetensors")
 WIDTHS = (12, 24, 48, 64)  # channels, at each halving
 _SIDE = 60  # px of the shorter side of what it sees
 _STEP = 8  # px that sides are multiples of: they are halved three times
-CHANNELS = 6  # three of change, three of what is blown out
+CHANNELS = 9  # three of change, three of what is blown out, three of how bright it is at rest
 _BLOWN_OUT = 0.98  # brightness from which on
 
 Image = NDArray[np.float32]
@@ -65,10 +66,12 @@ def contact_probability(change: ArrayLike, image: ArrayLike) -> Image:
 def seen(change: ArrayLike, image: ArrayLike) -> Image:
     """What the network sees (``CHANNELS``, h, w) of a change of colour (H, W, 3) in an ``image`` (H, W, 3) 0..1: all smaller,
     the change in shares of what hardly any pixel exceeds."""
+    image = np.asarray(image, np.float32)
     small = to_side(np.asarray(change, np.float32))
     strongest = float(np.quantile(np.linalg.norm(small, axis=-1), 0.98))
-    blown_out = to_side((np.asarray(image) >= _BLOWN_OUT).astype(np.float32))
-    return np.ascontiguousarray(np.concatenate([small / max(strongest, 1e-6), blown_out], -1).transpose(2, 0, 1))
+    blown_out = to_side((image >= _BLOWN_OUT).astype(np.float32))
+    all_of_it = [small / max(strongest, 1e-6), blown_out, to_side(image) - small]
+    return np.ascontiguousarray(np.concatenate(all_of_it, -1).transpose(2, 0, 1))
 
 
 def to_side(image: Image) -> Image:

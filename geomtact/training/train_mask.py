@@ -13,7 +13,7 @@ import torch.nn.functional as F
 
 from geomtact.errors import GeomtactError, InputError
 from geomtact.progress import Progress
-from geomtact.sensing.mask_network import MaskNetwork
+from geomtact.sensing.mask_network import CHANNELS, MaskNetwork
 from geomtact.training import presses, readings
 from geomtact.training.card import write_network
 from geomtact.training.presses import Presses
@@ -21,6 +21,7 @@ from geomtact.training.state import begin_with, not_a_number, resume, save_state
 from geomtact.training.train import schedule
 
 SCHEMA = "geomtact/mask-network/1"
+_FIRST = "down.0.0.weight"  # of what the network sees
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def train_mask(
     torch.manual_seed(settings.seed)
     network = MaskNetwork()
     if start is not None:
-        begin_with(network, start)
+        begin_with(network, _widened(start))
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay)
     first, curve = resume(folder, network, optimizer, asdict(settings))
@@ -138,6 +139,15 @@ def _tensors(parts: Sequence[Presses]) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(seen), torch.from_numpy(contact)
 
 
+def _widened(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """``weights``, those of a network that saw fewer channels too: what it did not see counts for nothing at first."""
+    out = dict(weights)
+    first = out.get(_FIRST)
+    if first is not None and first.ndim == 4 and first.shape[1] < CHANNELS:
+        out[_FIRST] = F.pad(first, (0, 0, 0, 0, 0, CHANNELS - first.shape[1]))
+    return out
+
+
 def _varied(seen: torch.Tensor, contact: torch.Tensor, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
     """Mirrored and turned by quarters, the colours exchanged: all of it is another gel with other lamps."""
     for axis in (-1, -2):
@@ -146,6 +156,6 @@ def _varied(seen: torch.Tensor, contact: torch.Tensor, rng: np.random.Generator)
     if rng.random() < 0.5:
         seen, contact = seen.transpose(-1, -2), contact.transpose(-1, -2)
     order = torch.from_numpy(rng.permutation(3))
-    change, blown_out = seen[:, order], seen[:, order + 3]
+    change, *others = (seen[:, order + first] for first in range(0, CHANNELS, 3))
     strength = torch.from_numpy(rng.uniform(0.7, 1.4, (len(seen), 1, 1, 1))).float()
-    return torch.cat([change * strength, blown_out], 1), contact
+    return torch.cat([change * strength, *others], 1), contact
