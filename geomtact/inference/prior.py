@@ -26,11 +26,8 @@ _EXPECTED = (
     "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)), a GaussianPrior or a "
     "function of poses, got {}"
 )
-_DRAWN, _BATCHES, _TOUCHING = (
-    1024,
-    8,
-    1000,
-)  # poses drawn of a Gaussian at a time, how often at most, until so many touch
+_DRAWN = 1024  # poses of a Gaussian at a time
+_BATCHES, _TOUCHING = 8, 1000  # how often at most, and until how many touch
 _LOOK = (24, 32)  # rays that tell whether they do
 _TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
 
@@ -243,7 +240,7 @@ def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: 
     if prior.index.key == index.key and same_place:
         if not prior.contact:
             raise InputError(
-                "prior: it says that the object does not touch the sensor, but this image shows one; leave it out"
+                "prior: it says that the object does not touch the sensor, but this image shows a contact; leave it out"
             )
         return prior.cell_log_density(np.arange(len(index)))
     if same_place:
