@@ -227,10 +227,10 @@ def test_a_gaussian_prior_is_where_it_says(localizer, uniform_poses):
 @pytest.mark.parametrize("std", [0.02, 0.1, 0.5])
 def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_poses, std):
     """Of what touches, by the exact caster; from narrower than a cell, where heights within it differ by more, to far wider."""
-    index, T = plug.index, uniform_poses(plug)[0][:3]
+    index, T = plug.index, uniform_poses(plug)[0][:2]
     spread = np.r_[[std] * 3, [std * 20 * MM] * 3]
     for true in T:
-        drawn = true @ exp(np.random.default_rng(5).normal(size=(12_000, 6)) * spread)
+        drawn = true @ exp(np.random.default_rng(5).normal(size=(8_000, 6)) * spread)
         depth = plug.space.penetration(drawn)
         cells = index.lookup(drawn[np.isfinite(depth)], depth[np.isfinite(depth)])
         own = np.bincount(cells, minlength=len(index)) / len(cells)

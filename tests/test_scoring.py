@@ -199,9 +199,9 @@ def test_fitting_recovers_the_t_distribution_that_was_drawn_from(ball, monkeypat
     n = 6000
     off = multivariate_t(truth.bias, truth.covariance, df=5, seed=rng).rvs(n)
     stored = rng.normal(size=(6, n))
-    index = SimpleNamespace(moments=stored)
+    index = SimpleNamespace(moments=stored, sensor=SENSOR)
     seen = iter((stored + off.T).T)
-    monkeypatch.setattr("geomtact.scoring.moments._seen", lambda index, mask: next(seen))
+    monkeypatch.setattr("geomtact.scoring.moments.moments_of", lambda mask, sensor: next(seen))
     fitted = Moments.fit(index, [None] * n, np.arange(n))
     spread = np.sqrt(np.diag(truth.covariance))
     assert np.abs((fitted.bias - truth.bias) / spread).max() < 0.08

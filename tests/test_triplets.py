@@ -45,7 +45,7 @@ def knows(T, told):
             log_density=lambda pose: 5.0,
             credible_level=lambda pose: 0.25,
             entropy_nats=-4.0,
-            warnings=[],
+            settings={"disagrees": False},
         )
 
     return localize
