@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from geomtact import Localizer, Mesh, Sensor, contact_mask
 from geomtact.cli import app
 from geomtact.contact_space.touch import felt_height, felt_mask
-from geomtact.evaluation.readings import BALLS, calibrations, cameras, circles_of, localize_balls, read_scan
+from geomtact.evaluation.groove import read_scan
+from geomtact.evaluation.readings import BALLS, calibrations, cameras, circles_of, localize_balls
 from geomtact.scoring.fitted import _deeper
 from geomtact.scoring.likelihood import height_log_likelihood
 from geomtact.se3 import transform

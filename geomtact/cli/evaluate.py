@@ -52,7 +52,6 @@ def judge_samples(
 
     Prints a table, half of the touches felt by a rigid threshold and half by an elastic gel, and writes nothing.
     """
-
     import numpy as np
 
     from geomtact.contact_space.space import ContactSpace

@@ -60,11 +60,8 @@ def judge_choices(
     from geomtact.report.result import plain
     from geomtact.sensing.sensor import Sensor
 
-    content, gel, ways = (
-        study_file.load(out, SCHEMA),
-        Sensor.load(sensor),
-        choices.ways_of(weights or [], only or []),
-    )
+    content, gel = study_file.load(out, SCHEMA), Sensor.load(sensor)
+    ways = choices.ways_of(weights or [], only or [])
     for mesh in study_options.meshes(parts, unit, gel):
         settings = plain(
             {

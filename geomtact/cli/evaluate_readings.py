@@ -34,7 +34,7 @@ def judge_readings(
 
     Prints a table of each, and writes them and every outcome to --out.
     """
-    from geomtact.evaluation import readings
+    from geomtact.evaluation import groove, readings
     from geomtact.sensing.sensor import CONTACT_METHODS
 
     content = study_file.load(out, SCHEMA)
@@ -63,7 +63,7 @@ def judge_readings(
             sensors = {ball: each.sensor for ball, each in by_ball.items()}
             _judge_balls(folder, circles, sensors, camera, out, content, cache_dir)
     with progress_bar("localizing a groove"):
-        density, modes = readings.localize_groove(folder, cache_dir)
+        density, modes = groove.localize_groove(folder, cache_dir)
     figures = {"log_density_at_truth": density, "modes": [asdict(m) for m in modes]}
     study_file.keep(out, content, "groove", settings={"height_noise_mm": 0.02}, figures=figures, outcomes=[])
     headings = ("probability", "across [mm]", "along", "height", "turn [deg]", "tilt", "told", "of it along")

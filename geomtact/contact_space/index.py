@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.resolution import Resolution
 from geomtact.contact_space.space import ContactSpace
-from geomtact.geometry.approach import Approach
+from geomtact.geometry.approach import NO_TILT, Approach
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Directions
@@ -24,7 +24,6 @@ from geomtact.sensing.sensor import Sensor
 
 _TURNED = 8  # rotations of a cell that stand for all of it
 _DRAWN = 30_000  # poses that stand for all
-_NO_TILT = 1e-8  # rad that an exact approach leaves
 # poses about one, in widths of a cell in tilts, turn, x and y, whose heights tell how those of its cell differ
 _AROUND = np.random.default_rng(0).uniform(-0.75, 0.75, (32, 5))
 _AROUND = np.concatenate([_AROUND, -_AROUND])
@@ -160,7 +159,7 @@ class Index:
         # an approach leaves no more tilt than its cones are wide
         cones = self.directions.cones
         turn, step = self.angle_step, self.resolution.step
-        tilt = turn if cones is None else min(turn, max(_NO_TILT, 2 * max(half for _, half in cones)))
+        tilt = turn if cones is None else min(turn, max(NO_TILT, 2 * max(half for _, half in cones)))
         sideways = np.linalg.svd(up[None])[2][1:]
         turned = np.stack([tilt * sideways[0], tilt * sideways[1], turn * up, np.zeros(3), np.zeros(3)])
         moved = np.zeros((5, 3))

@@ -19,7 +19,7 @@ command          module                        what is judged
 ``next-touch``   ``next_touch_study``          touches until sure
 ``kitting``      ``kitting_study``,            parts placed in a fixture
                  ``kitting``, ``fixture``
-``readings``     ``readings``                  real readings
+``readings``     ``readings``, ``groove``      real readings
 ===============  ============================  =====================================================
 
 What they share: ``touches`` makes touches at known poses, ``contact_class`` names their kind, ``answer`` holds an answer against

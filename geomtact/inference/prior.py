@@ -162,18 +162,19 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     log_mass = _normalised(index.log_weight + _over_images(index, lambda T: wide(T_frame_sensor @ T)))
     mass = np.exp(log_mass.astype(float))
     spread = np.exp(-float(mass @ np.maximum(log_mass, -700)))
-    rng, drawn = np.random.default_rng(0), np.zeros(len(index))
+    rng, cells = np.random.default_rng(0), np.zeros(0, np.int64)
     for _ in range(_BATCHES):
         xi = rng.multivariate_normal(np.zeros(6), prior.covariance, _DRAWN)
         T = inverse(T_frame_sensor) @ prior.T @ exp(xi)
         depth = index.space.caster.depths(index.sensor, T, index.sensor.along(_LOOK)).max((1, 2))
         touches = (depth >= 0) & (depth <= index.sensor.max_penetration)
         touches[touches] = index.space.admits(T[touches])
-        np.add.at(drawn, index.lookup(T[touches], depth[touches]), 1)
-        if drawn.sum() >= _TOUCHING:
+        cells = np.append(cells, index.lookup(T[touches], depth[touches]))
+        if len(cells) >= _TOUCHING:
             break
+    drawn = np.bincount(cells, minlength=len(index))
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log((drawn + spread * mass) / (drawn.sum() + spread)), np.float32)
+        return np.asarray(np.log((drawn + spread * mass) / (len(cells) + spread)), np.float32)
 
 
 def prior_log_density(prior: Any, mesh: Mesh, frame: str) -> LogDensity | None:

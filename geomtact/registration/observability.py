@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomtact.errors import PoseError
-from geomtact.geometry.approach import Approach
+from geomtact.geometry.approach import NO_TILT, Approach
 from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array, apply, exp, hat, inverse, log, transform
 
 _LEAST_TURN = 0.02  # rad
-_NO_TILT = 1e-8  # rad that an exact approach leaves
 GAIN = 4 / 3  # information over what was known before from which a direction is told: to a quarter of the grid's step
 
 
@@ -47,7 +46,7 @@ class Spread:
         symmetry leaves no rotation to search, registration is still free to turn a little."""
         rotation, tilt = max(angle_step, _LEAST_TURN) / np.sqrt(12), None
         if approach is not None:
-            tilt = min(rotation, max(_NO_TILT, 2 * max(half for _, half in approach) / np.sqrt(12)))
+            tilt = min(rotation, max(NO_TILT, 2 * max(half for _, half in approach) / np.sqrt(12)))
         return cls(rotation, step / np.sqrt(12), tilt)
 
     def metres(self, length: float) -> Array:

@@ -72,16 +72,17 @@ def draw_modelled(content: Mapping[str, Any]) -> bytes:
 
     parts = content["parts"]
     kinds = ("one touch", "three sensors", "known side")
-    scenes = [s for s in kinds if any(p["scenes"].get(s, {}).get("modelled") for p in parts.values())]
-    names = list(dict.fromkeys(n for p in parts.values() for s in scenes for n in p["scenes"][s]["modelled"]))
+    modelled = {name: {s: p["scenes"].get(s, {}).get("modelled", {}) for s in kinds} for name, p in parts.items()}
+    scenes = [s for s in kinds if any(of[s] for of in modelled.values())]
+    names = list(dict.fromkeys(n for of in modelled.values() for s in scenes for n in of[s]))
     figure = Figure(
         figsize=(6.2 * len(scenes) + 1, 0.42 * len(names) + 1.4), dpi=100, layout="constrained", facecolor="white"
     )
     canvas = FigureCanvasAgg(figure)
     grid = figure.subplots(1, len(scenes), squeeze=False, sharey=True)[0]
     for axes, scene in zip(grid, scenes, strict=True):
-        for k, ((part, entry), colour) in enumerate(zip(parts.items(), cycle(COLOURS), strict=False)):
-            told = entry["scenes"][scene]["modelled"]
+        for k, ((part, of), colour) in enumerate(zip(modelled.items(), cycle(COLOURS), strict=False)):
+            told = of[scene]
             for i, name in enumerate(names):
                 if name in told:
                     mean, low, high = told[name]["adds"]

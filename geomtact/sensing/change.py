@@ -130,6 +130,11 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
     raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
 
 
+def background_of(background: Any, image: Array) -> Array:
+    """The ``background`` of an ``image`` (H, W, 3), by :func:`as_unit_rgb`; one of another size is refused."""
+    return same_size(as_unit_rgb(background, "background"), image, "background", "image")
+
+
 def same_size(image: Array, other: Array, name: str, of: str) -> Array:
     """``image`` (H, W, 3), which is refused under its ``name`` if it is not of the size of the ``other``, which is ``of``."""
     if image.shape != other.shape:

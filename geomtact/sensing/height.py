@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import SensorError
 from geomtact.se3 import Array
-from geomtact.sensing.change import as_unit_rgb, check_size, colour_change, same_size
+from geomtact.sensing.change import as_unit_rgb, background_of, check_size, colour_change
 from geomtact.sensing.colour import ColourTable
 from geomtact.sensing.sensor import Sensor
 from geomtact.sensing.slope import integrate
@@ -45,7 +45,7 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
         )
     image = as_unit_rgb(image, "image")
     check_size(image, sensor, "image")
-    change, felt = colour_change(image, same_size(as_unit_rgb(background, "background"), image, "background", "image"))
+    change, felt = colour_change(image, background_of(background, image))
     return (np.maximum(relief(change, felt, sensor.colour, sensor.pixel_pitch), 0) * felt).astype(np.float32)
 
 

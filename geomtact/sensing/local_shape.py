@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import UsageError, nearest_name
 from geomtact.se3 import Array
-from geomtact.sensing.change import GRID, as_unit_rgb, change_from, check_size, same_size
+from geomtact.sensing.change import GRID, as_unit_rgb, background_of, change_from, check_size
 from geomtact.sensing.pixels import Mask, blurred, filled, opened, size_of, transformed
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 from geomtact.sensing.slope import integrate, of_gradient, slope_field
@@ -74,9 +74,7 @@ def find_contact(
         method = method or sensor.contact_method
         pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
         check_size(image, sensor, "image")
-    reference = (
-        None if background is None else same_size(as_unit_rgb(background, "background"), image, "background", "image")
-    )
+    reference = None if background is None else background_of(background, image)
     return contact_of(image, reference, method, pitch)
 
 

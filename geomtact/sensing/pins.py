@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import ImageError, UsageError
 from geomtact.se3 import Array
-from geomtact.sensing.change import GRID, as_unit_rgb, same_size
+from geomtact.sensing.change import GRID, as_unit_rgb, background_of
 
 _FEWEST, _MANY = 12, 36  # pins, for a cubic over the image, and for a quintic
 _SMOOTH = 1 / GRID  # of the image's shorter side, as for contacts
@@ -58,7 +58,7 @@ def pixel_pitch_of_pins(image: Any, background: Any, spacing: float) -> PinBoard
     if not _SPACINGS[0] <= spacing <= _SPACINGS[1]:
         raise UsageError(f"spacing: expected metres, 0.0001 to 0.02, got {spacing}; 2.5 mm is 0.0025")
     image = as_unit_rgb(image, "image")
-    peaks = _peaks(image - same_size(as_unit_rgb(background, "background"), image, "background", "image"))
+    peaks = _peaks(image - background_of(background, image))
     half = np.array(image.shape[1::-1]) / 2 - 0.5
     rows, places = _in_grid(peaks, half)
     if len(rows) < _FEWEST or (np.ptp(places, axis=0) < 3).any():
