@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,6 +16,7 @@ from geomtact.cli.shell import NO_CONTACT, check_folder, posterior_file, print_t
 from geomtact.errors import InputError, UsageError, nearest_name
 
 if TYPE_CHECKING:
+    from geomtact.cli.sensor_poses import SensorPoses
     from geomtact.inference.identify import Identification
     from geomtact.inference.localizer import Localizer
 
@@ -104,15 +107,10 @@ def localize(
     What is not given is taken from the nearest geomtact.toml (this folder or above), then from the image's metadata.
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in the image.
     """
-    import time
-    from dataclasses import asdict, replace
-
     from geomtact.cli.parts import parts_of
     from geomtact.cli.project import resolve
     from geomtact.cli.sensor_poses import read_sensor_poses
-    from geomtact.geometry.catalogue import catalogue
-    from geomtact.inference.identify import identify
-    from geomtact.sensing.reading import read_metadata, read_observation
+    from geomtact.sensing.reading import read_metadata
 
     given = {
         "object": object_name,
@@ -132,23 +130,14 @@ def localize(
     if live:
         unsuited = {"--out": out, "--sensor-poses": sensor_poses, "--json": as_json or None}
         _check_live(images, camera, watch, [name for name, value in unsuited.items() if value is not None])
-    elif not images:
-        raise UsageError("expected an image, got none; give one, or --camera 0")
-    for image in images:
-        if image.is_dir() and not watch:
-            raise InputError(
-                f"{image}: is a folder; give the images in it, localize the newest with --watch, or follow them as a sequence "
-                "with 'geomtact track'"
-            )
+    else:
+        _check_images(images, sensor_poses)
     placed = read_sensor_poses(sensor_poses, len(images)) if sensor_poses is not None else None
-    if placed is None and len(images) > 1:
-        raise UsageError(f"{len(images)} images need --sensor-poses FILE.json; or localize them one at a time")
     metadata = {} if live else read_metadata(images[0])
     values, sources = resolve(given, metadata)
+    values["effort"] = chosen = values["effort"] or Effort.balanced.value
     _check_name("kind", kind, Kind)
-    chosen = values["effort"] or Effort.balanced.value
     _check_name("effort", chosen, Effort, sources.get("effort"))
-
     parts = parts_of(values["object"])
     if len(parts) > 1 and (live or prior is not None):
         raise UsageError(
@@ -156,97 +145,178 @@ def localize(
         )
     if len(parts) == 1:
         values["object"] = parts[0]
+
+    asked = _Asked(images, kind, values, sources, prior, scorer, seed, max_poses, cache_dir)
     if live:
-        from geomtact.cli.frames import camera_frames, newest_in
-        from geomtact.cli.live import localize_live
-
-        # a camera that is not there is told before minutes go into an index
-        frames = newest_in(images[0]) if camera is None else camera_frames(camera, values["sensor"])
-        localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior)
-        options = {"kind": kind, "prior": prior, "effort": chosen, "seed": seed}
-        if not localize_live(localizer, frames, values["background"], options):
-            raise typer.Exit(NO_CONTACT)
+        _follow(asked, camera)
         return
+    made_of = metadata.get("geomtact:object")
+    if made_of and len(parts) == 1 and parts[0] and Path(made_of).stem != Path(parts[0]).stem:
+        tell(f"{images[0]}: was made of {made_of}, as its metadata says, and is localized on {parts[0]}")
+    found, timing = _identified(asked, parts, placed)
+    for warning in found.posterior.warnings:
+        tell(f"warning: {warning}")
+    _give(asked, found, timing, out, _reports(report), as_json)
+    if not found.posterior.contact:
+        tell(_without_contact(asked, found.posterior.observation.kind))
+        raise typer.Exit(NO_CONTACT)
 
+
+@dataclass(frozen=True)
+class _Asked:
+    """What is asked for, the command line, project files and metadata taken together.
+
+    Attributes
+    ----------
+    values : object, unit, sensor, background and effort
+    sources : the files that those which the command line did not give were taken from
+    """
+
+    images: list[Path]
+    kind: str
+    values: dict[str, Any]
+    sources: dict[str, str]
+    prior: Path | None
+    scorer: str | None
+    seed: int
+    max_poses: int | None
+    cache_dir: Path | None
+
+    def opened(self, own: dict[str, Any], quiet: bool = False, frame: str = "sensor") -> Localizer:
+        """The localizer of what is asked for, but for what it has of its ``own``; ``quiet`` on where values come from."""
+        sources = {} if quiet else self.sources
+        values = {**self.values, **own}
+        return open_localizer(values, sources, self.scorer, self.cache_dir, self.max_poses, self.prior, frame)
+
+
+def _follow(asked: _Asked, camera: str | None) -> None:
+    """Localize the newest image of a camera, or of a folder, again and again."""
+    from geomtact.cli.frames import camera_frames, newest_in
+    from geomtact.cli.live import localize_live
+
+    # a camera that is not there is told before minutes go into an index
+    frames = newest_in(asked.images[0]) if camera is None else camera_frames(camera, asked.values["sensor"])
+    options = {"kind": asked.kind, "prior": asked.prior, "effort": asked.values["effort"], "seed": asked.seed}
+    if not localize_live(asked.opened({}), frames, asked.values["background"], options):
+        raise typer.Exit(NO_CONTACT)
+
+
+def _identified(
+    asked: _Asked, parts: Sequence[str | None], placed: SensorPoses | None
+) -> tuple[Identification, dict[str, float]]:
+    """Which of ``parts`` is touched and where, and how long indexes took to prepare or read [ms]."""
+    import time
+    from dataclasses import replace
+
+    from geomtact.geometry.catalogue import catalogue
+    from geomtact.inference.identify import identify
+    from geomtact.sensing.reading import read_observation
+
+    images, values = asked.images, asked.values
     gels = placed.sensor if placed is not None and placed.sensor is not None else [values["sensor"]] * len(images)
     for image, gel in zip(images, gels, strict=True):
         if gel is not None:
             # a bad image is told before minutes go into an index
-            read_observation(image, gel, kind, values["background"])
-    timing, frame = {"prepare": 0.0}, "sensor" if placed is None else "world"
+            read_observation(image, gel, asked.kind, values["background"])
+    frame = "sensor" if placed is None else "world"
+    took = 0.0
 
     def opened(part: str | None) -> Localizer:
+        nonlocal took
         began = time.perf_counter()
-        told = sources if part == parts[0] else {}
         # in a folder of several, bundled parts have units of their own
         own = {"object": part, "unit": None if len(parts) > 1 and part in catalogue() else values["unit"]}
-        on = {
-            gel: open_localizer({**values, **own, "sensor": gel}, told, scorer, cache_dir, max_poses, prior, frame)
-            for gel in dict.fromkeys(gels)
-        }
-        timing["prepare"] += 1e3 * (time.perf_counter() - began)
+        on = {gel: asked.opened({**own, "sensor": gel}, part != parts[0], frame) for gel in dict.fromkeys(gels)}
+        took += 1e3 * (time.perf_counter() - began)
         first, *others = (on[gel] for gel in gels)
         return replace(first, others=tuple(others)) if len(on) > 1 else first
 
-    made_of = metadata.get("geomtact:object")
-    if made_of and len(parts) == 1 and parts[0] and Path(made_of).stem != Path(parts[0]).stem:
-        tell(f"{images[0]}: was made of {made_of}, as its metadata says, and is localized on {parts[0]}")
     found = identify(
         map(opened, parts),
         [str(image) for image in images],
-        kind=kind,
+        kind=asked.kind,
         background=values["background"],
         T_world_sensor=None if placed is None else placed.T_world_sensor,
-        prior=prior,
-        effort=chosen,
-        seed=seed,
+        prior=asked.prior,
+        effort=values["effort"],
+        seed=asked.seed,
         rig=None if placed is None else placed.rig,
     )
-    localizer, posterior = found.localizer, found.posterior
-    localized = time.perf_counter()
-    modes = posterior.modes(MODES)
     if len(parts) > 1 and found.foreign:
         tell("warning: what is shown is unlike all of the parts: is it another one?")
-    for warning in posterior.warnings:
-        tell(f"warning: {warning}")
+    return found, {"prepare": took}
 
-    settings: dict[str, Any] = {
+
+def _give(
+    asked: _Asked, found: Identification, timing: dict[str, float], out: Path | None, reports: list[str], as_json: bool
+) -> None:
+    """Print what was found, and write it into ``out``."""
+    import time
+    from dataclasses import asdict
+
+    images, posterior = asked.images, found.posterior
+    began = time.perf_counter()
+    modes = posterior.modes(MODES)
+    timing["modes"] = 1e3 * (time.perf_counter() - began)
+    settings = {
         "image": str(images[0]) if len(images) == 1 else [str(image) for image in images],
-        "kind": kind,
-        "prior": prior and str(prior),
-        **values,
-        "taken_from": sources,
-        "cache_dir": cache_dir and str(cache_dir),
+        "kind": asked.kind,
+        "prior": asked.prior and str(asked.prior),
+        **asked.values,
+        "taken_from": asked.sources,
+        "cache_dir": asked.cache_dir and str(asked.cache_dir),
     }
-    told_parts = [asdict(candidate) for candidate in found.candidates] if len(parts) > 1 else None
-    timing["modes"] = 1e3 * (time.perf_counter() - localized)
+    candidates = [asdict(candidate) for candidate in found.candidates] if len(found.candidates) > 1 else None
     if out is not None:
         from geomtact.report.shown import shown_of
         from geomtact.report.write import write_all
 
-        shown = shown_of(posterior, localizer)
-        content = write_all(out, posterior, modes, shown, settings, timing, told_parts, _reports(report))
+        shown = shown_of(posterior, found.localizer)
+        content = write_all(out, posterior, modes, shown, settings, timing, candidates, reports)
     elif as_json:
         from geomtact.report.result import result
 
-        content = result(posterior, modes, settings, timing, told_parts)
+        content = result(posterior, modes, settings, timing, candidates)
     if as_json:
         from geomtact.report.result import to_text
 
         typer.echo(to_text(content), nl=False)
     else:
-        if len(parts) > 1:
+        if candidates:
             _print_parts(found)
-        _print(posterior, modes, out, _reports(report))
-    if not posterior.contact:
-        where = "the image" if len(images) == 1 else f"any of the {len(images)} images"
-        advice = "give a --background, or say what it is with --kind"
-        if posterior.observation.kind == "mask":
-            advice = "a mask's contact is what is not 0"
-        elif values["background"] is not None:
-            advice = "nothing stands out of the --background; look whether that is of the untouched gel, and touch more firmly"
-        tell(f"no contact found in {where}; {advice}")
-        raise typer.Exit(NO_CONTACT)
+        _print(posterior, modes, out, reports)
+
+
+def _without_contact(asked: _Asked, kind: str) -> str:
+    """What is said where nothing is felt; ``kind`` of what was read."""
+    where = "the image" if len(asked.images) == 1 else f"any of the {len(asked.images)} images"
+    advice = "give a --background, or say what it is with --kind"
+    if kind == "mask":
+        advice = "a mask's contact is what is not 0"
+    elif asked.values["background"] is not None:
+        advice = (
+            "nothing stands out of the --background; look whether that is of the untouched gel, and touch more firmly"
+        )
+    return f"no contact found in {where}; {advice}"
+
+
+def _check_images(images: list[Path], sensor_poses: Path | None) -> None:
+    """Refuse no images, folders, and several images that nothing places.
+
+    Raises
+    ------
+    UsageError, InputError
+    """
+    if not images:
+        raise UsageError("expected an image, got none; give one, or --camera 0")
+    for image in images:
+        if image.is_dir():
+            raise InputError(
+                f"{image}: is a folder; give the images in it, localize the newest with --watch, or follow them as a sequence "
+                "with 'geomtact track'"
+            )
+    if sensor_poses is None and len(images) > 1:
+        raise UsageError(f"{len(images)} images need --sensor-poses FILE.json; or localize them one at a time")
 
 
 def _check_live(images: list[Path], camera: str | None, watch: bool, unsuited: list[str]) -> None:

@@ -253,7 +253,7 @@ def localize_balls(
         prepared = Localizer.prepare(_ball(ball), sensor=list(sensors.values()), cache_dir=cache_dir)
         for used, localizer in zip(sensors, (prepared, *prepared.others), strict=True):
             balls[ball, used] = localizer
-    for row in circles_of(circles, _BY_EYE)[first:]:
+    for row in circles_of(circles, (*_BY_EYE, "ball_mm"))[first:]:
         pressed = float(row["ball_mm"])
         (other,) = (ball for ball in BALLS if ball != pressed)
         told = {

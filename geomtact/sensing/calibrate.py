@@ -33,6 +33,7 @@ _PIXELS, _FLAT_PIXELS = 3000, 1000  # of a press that are used, at most
 _EVERYWHERE = 0.9  # share of presses that may change one place: more, and all lie there or the background shows one
 _SPAN = 0.5  # of the window along each side, over which presses should be spread
 _AGREES, _HOPELESS = 0.1, 2.0  # by which presses may measure the ball wrongly, in the median: unnoticed, and at most
+_APART = 0.4  # by which one press may measure it otherwise than the median of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +131,7 @@ def calibrated(
             f"calibrate: {len(found)} presses contradict each other: colours fitted to all but one measure the ball "
             f"{100 * abs(off):.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
         )
-    return Calibrated(sensor, found, left_out, diameters, _doubts(found, off))
+    return Calibrated(sensor, found, left_out, diameters, _doubts(found, diameters, ball_diameter))
 
 
 def _check_rest(presses: Sequence[Press]) -> None:
@@ -155,9 +156,11 @@ def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor
     return replace(sensor, colour=colour, height_noise=height_noise), diameters
 
 
-def _doubts(presses: Sequence[Press], off: float) -> list[str]:
-    """What speaks against a calibration by these presses, by which the ball is measured wrongly by a share ``off``."""
+def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) -> list[str]:
+    """What speaks against a calibration by these presses, on which the ball has ``diameters`` (n,) by all others [m]."""
     out = []
+    middle = float(np.nanmedian(diameters))
+    off = middle / ball_diameter - 1
     window = np.array(presses[0].mask.shape[::-1])
     spans = np.ptp([press.centre for press in presses], axis=0) / window
     if spans.min() < _SPAN:
@@ -170,6 +173,13 @@ def _doubts(presses: Sequence[Press], off: float) -> list[str]:
             f"colours fitted to all presses but one measure the ball {100 * abs(off):.0f} % too "
             f"{'large' if off > 0 else 'small'} on that one: too few presses, or not all of one ball; press it in a dozen times, "
             "all over the window"
+        )
+    odd = [p.name for p, told in zip(presses, diameters, strict=True) if abs(told / middle - 1) > _APART]
+    if odd:
+        named = ", ".join(odd[:3]) + (f" and {len(odd) - 3} more" if len(odd) > 3 else "")
+        out.append(
+            f"on {named} the ball is measured more than {100 * _APART:.0f} % otherwise than on most presses: look whether the "
+            "contact is whole and of the same ball, and leave out what is not"
         )
     return out
 
