@@ -8,7 +8,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.evaluation.fixture import Fixture, upwards
 from geomtact.evaluation.kitting import (
     SURE,
-    Belief,
+    Believed,
     believe,
     choose_jaw,
     close_jaw,
@@ -119,7 +119,7 @@ def test_a_jaw_that_meets_nothing_says_so_from_where_it_is(nut):
 def even(T, shares=None):
     """A belief in poses (m, 4, 4), a hundred draws of each, that has ``shares`` (m,) of the weight there."""
     shares = np.full(len(T), 1 / len(T)) if shares is None else np.array(shares)
-    return Belief(np.repeat(T, 100, axis=0), np.repeat(shares / 100, 100))
+    return Believed(np.repeat(T, 100, axis=0), np.repeat(shares / 100, 100))
 
 
 def test_what_is_certain_is_placed_and_what_may_be_elsewhere_is_refused(nut):
@@ -132,7 +132,7 @@ def test_what_is_certain_is_placed_and_what_may_be_elsewhere_is_refused(nut):
 
 
 def test_one_pose_that_alone_explains_what_was_felt_proves_nothing(nut):
-    alone = decide(Belief(np.eye(4)[None], np.ones(1)), Fixture(nut, 100), CLEARANCES)
+    alone = decide(Believed(np.eye(4)[None], np.ones(1)), Fixture(nut, 100), CLEARANCES)
     assert [decision.probability for decision in alone] == [0.5] * len(CLEARANCES)
 
 
@@ -144,7 +144,7 @@ def test_two_poses_that_are_one_under_the_symmetry_are_no_ambiguity(nut):
 def test_a_wider_fixture_never_fits_less(nut):
     rng = np.random.default_rng(0)
     T = np.array([se3.exp(xi) for xi in rng.normal(size=(40, 6)) * [0.05, 0.05, 0.05, 1e-3, 1e-3, 1e-3]])
-    decisions = decide(Belief(T, np.full(40, 1 / 40)), Fixture(nut, 100), CLEARANCES)
+    decisions = decide(Believed(T, np.full(40, 1 / 40)), Fixture(nut, 100), CLEARANCES)
     assert (np.diff([decision.probability for decision in decisions]) >= 0).all()
 
 

@@ -54,7 +54,7 @@ class Felt:
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class Believed:
     """Poses ``T`` (n, 4, 4) of the part in the world, the heaviest first, and their ``weight`` (n,), which sums to 1."""
 
     T: Array
@@ -84,7 +84,7 @@ class Step:
 
     felt: Felt
     posterior: Posterior
-    belief: Belief
+    belief: Believed
     decisions: list[Decision]
 
 
@@ -145,7 +145,7 @@ def touch_with_jaw(
     return Felt(np.array(T).reshape(-1, 4, 4), masks)
 
 
-def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.random.Generator) -> Belief:
+def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.random.Generator) -> Believed:
     """Poses drawn from ``posterior``, each weighed by how likely all that was ``felt`` is there.
 
     They scatter about what registration found, and lie anywhere within cells that it did not look into. The grid's cells are
@@ -158,10 +158,10 @@ def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.rando
         log_weight += (TRUST if mask.any() else _MISSED) * seen.log_likelihood(poses)
     heaviest = np.argsort(-log_weight)
     weight = np.exp(log_weight - log_weight.max())[heaviest]
-    return Belief(poses[heaviest], weight / weight.sum())
+    return Believed(poses[heaviest], weight / weight.sum())
 
 
-def decide(belief: Belief, fixture: Fixture, clearances: Sequence[float]) -> list[Decision]:
+def decide(belief: Believed, fixture: Fixture, clearances: Sequence[float]) -> list[Decision]:
     """For each of ``clearances`` [m] the probability that the part fits, placed by the pose that explains best what was felt.
 
     P(fits | T) = W n / (n + 1), W the weight of the poses T' believed at which inv(T) T' needs no more than the clearance, n
@@ -174,7 +174,7 @@ def decide(belief: Belief, fixture: Fixture, clearances: Sequence[float]) -> lis
     return [Decision(belief.T[0], float((needed <= clearance).mean() * trust)) for clearance in clearances]
 
 
-def choose_jaw(posterior: Posterior, belief: Belief, made: Array, rng: np.random.Generator) -> Array:
+def choose_jaw(posterior: Posterior, belief: Believed, made: Array, rng: np.random.Generator) -> Array:
     """The jaw's pose (4, 4) whose first finger is expected to tell most about the pose (thesis 8.2).
 
     As in ``planning.next_touch``, but the places to be told apart are drawn as for the decision, finer than the grid's cells.

@@ -13,7 +13,7 @@ import numpy as np
 from geomtact.report.marginals import Samples, marginals
 from geomtact.report.shown import Shown
 from geomtact.report.summary import ModeSummary, caution, facts, percent
-from geomtact.report.view import View, Viewer
+from geomtact.report.view import Painter, PartView
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.sensor import Sensor
@@ -107,7 +107,7 @@ def _modes(
     band: SubFigure,
     posterior: Posterior,
     modes: Sequence[Mode],
-    views: Sequence[View],
+    views: Sequence[PartView],
     part: float,
     shown: Sequence[Shown],
 ) -> None:
@@ -165,13 +165,13 @@ def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
     band.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", frameon=False)
 
 
-def _views(posterior: Posterior, modes: Sequence[Mode]) -> list[View]:
+def _views(posterior: Posterior, modes: Sequence[Mode]) -> list[PartView]:
     """The part at each mode."""
-    viewer = Viewer(posterior.mesh, posterior.sensor)
-    return [viewer.view(inverse(posterior.T_frame_sensor) @ mode.T) for mode in modes]
+    painter = Painter(posterior.mesh, posterior.sensor)
+    return [painter.paint(inverse(posterior.T_frame_sensor) @ mode.T) for mode in modes]
 
 
-def _filled(view: View) -> tuple[float, float]:
+def _filled(view: PartView) -> tuple[float, float]:
     """Bottom and top [mm] of what a picture shows, with a little air."""
     _, _, bottom, top = view.extent
     height = (top - bottom) / len(view.image)
@@ -179,7 +179,7 @@ def _filled(view: View) -> tuple[float, float]:
     return top - (rows[-1] + 12) * height, top - (rows[0] - 12) * height
 
 
-def _tallness(view: View) -> float:
+def _tallness(view: PartView) -> float:
     """Height of what a picture shows over the picture's width."""
     low, high = _filled(view)
     return (high - low) / (view.extent[1] - view.extent[0])

@@ -19,7 +19,7 @@ _TOWARDS_VIEWER = np.array([-0.45, -0.75, 0.5])
 
 
 @dataclass(frozen=True)
-class View:
+class PartView:
     """A picture and how to draw upon it.
 
     Attributes
@@ -38,7 +38,7 @@ class View:
         return np.asarray(points_mm, float) @ self.axes.T
 
 
-class Viewer:
+class Painter:
     """Draws one part at several poses; its ray caster is built once."""
 
     def __init__(self, mesh: Mesh, sensor: Sensor, pixels: int = 300):
@@ -46,7 +46,7 @@ class Viewer:
         self._centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
         self._scene = scene_of((mesh.vertices - self._centre).astype(np.float32)[mesh.faces])
 
-    def view(self, T_sensor_object: Array) -> View:
+    def paint(self, T_sensor_object: Array) -> PartView:
         """The part at ``T_sensor_object`` (4, 4), with the sensor's window; far ends of a long part are cut off."""
         back = _TOWARDS_VIEWER / np.linalg.norm(_TOWARDS_VIEWER)
         right = np.cross([0.0, 0.0, 1.0], back)
@@ -63,7 +63,7 @@ class Viewer:
         u, v = np.meshgrid(middle[0] + half * steps, middle[1] - half * steps)
         image = self._shade(T_sensor_object, u.ravel(), v.ravel(), plane, back, far)
         extent = tuple(1e3 * np.array([middle[0] - half, middle[0] + half, middle[1] - half, middle[1] + half]))
-        return View(image.reshape(self.pixels, self.pixels, 3), extent, plane)
+        return PartView(image.reshape(self.pixels, self.pixels, 3), extent, plane)
 
     def _window_corners(self) -> Array:
         x, y = self.sensor.half_window

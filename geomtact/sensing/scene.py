@@ -28,7 +28,7 @@ class Hits:
     normal: NDArray[np.float32]
 
 
-class Scene(Protocol):
+class RayScene(Protocol):
     """Rays (m, 3) from ``origin`` along ``direction``, single precision, which may be cast by several threads at once.
 
     A distance is beyond ``MISSED``, and a face -1, where nothing is met.
@@ -39,7 +39,7 @@ class Scene(Protocol):
     def hits(self, origin: Rays, direction: Rays) -> Hits: ...
 
 
-def scene_of(corners: ArrayLike) -> Scene:
+def scene_of(corners: ArrayLike) -> RayScene:
     """A scene of triangles, their corners (f, 3, 3)."""
     triangles = np.ascontiguousarray(corners, np.float32)
     try:
