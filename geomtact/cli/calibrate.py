@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from geomtact.cli.prepare import SensorName
+from geomtact.cli.options import SensorName
 from geomtact.cli.shell import tell
 from geomtact.errors import UsageError
 from geomtact.files import write_bytes, write_text

@@ -27,9 +27,7 @@ from geomtact.cli.evaluate_thesis import judge_thesis_table
 from geomtact.cli.evaluate_touches import judge_touches
 from geomtact.cli.evaluate_track import judge_track
 from geomtact.cli.evaluate_triplets import judge_triplets
-from geomtact.cli.library import CacheDir
-from geomtact.cli.localize import Effort
-from geomtact.cli.prepare import Unit
+from geomtact.cli.options import CacheDir, Effort, Unit
 from geomtact.cli.shell import one_line_errors, print_table, tell
 from geomtact.cli.simulate import NoiseName
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.prepare import Unit
+from geomtact.cli.options import Unit
 from geomtact.cli.shell import print_table, progress_bar, tell
 
 if TYPE_CHECKING:

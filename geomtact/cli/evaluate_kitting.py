@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.library import CacheDir
-from geomtact.cli.prepare import Unit
+from geomtact.cli.options import CacheDir, Unit
 from geomtact.cli.shell import print_table, tell
 from geomtact.cli.simulate import NoiseName
 

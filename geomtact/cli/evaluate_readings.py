@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.library import CacheDir
+from geomtact.cli.options import CacheDir
 from geomtact.cli.shell import print_table, progress_bar, tell
 
 SCHEMA = "geomtact/readings/1"

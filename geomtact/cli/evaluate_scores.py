@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.library import CacheDir
-from geomtact.cli.localize import Effort
-from geomtact.cli.prepare import MaxPoses, Unit
+from geomtact.cli.options import CacheDir, Effort, MaxPoses, Unit
 from geomtact.cli.shell import print_table, progress_bar, tell
 from geomtact.cli.simulate import NoiseName
 

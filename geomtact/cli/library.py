@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from geomtact.cli.options import CacheDir
 from geomtact.cli.shell import print_table, tell
 from geomtact.errors import UsageError
-
-CacheDir = Annotated[
-    Path | None,
-    typer.Option(
-        "--cache-dir", help="Folder of the cached indexes; else $GEOMTACT_CACHE, else the user's cache folder."
-    ),
-]
 
 
 def sensors() -> None:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.library import CacheDir
-from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit, open_localizer
+from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
+from geomtact.cli.prepare import open_localizer
 from geomtact.cli.shell import NO_CONTACT, check_folder, posterior_file, print_table, tell
-from geomtact.errors import InputError, UsageError, nearest_name
+from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from geomtact.cli.sensor_poses import SensorPoses
@@ -21,19 +21,6 @@ if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
 
 MODES = 5
-
-
-class Kind(StrEnum):
-    auto = "auto"
-    mask = "mask"
-    height = "height"
-    reading = "reading"
-
-
-class Effort(StrEnum):
-    fast = "fast"
-    balanced = "balanced"
-    exact = "exact"
 
 
 class Report(StrEnum):
@@ -121,7 +108,7 @@ def localize(
     }
     check_folder(out)
     if report is not None:
-        _check_name("report", report, Report)
+        check_name("report", report, Report)
         if out is None:
             raise UsageError("--report needs --out, the folder that it is written into")
     prior = prior and posterior_file(prior, "--prior")
@@ -136,8 +123,8 @@ def localize(
     metadata = {} if live else read_metadata(images[0])
     values, sources = resolve(given, metadata)
     values["effort"] = chosen = values["effort"] or Effort.balanced.value
-    _check_name("kind", kind, Kind)
-    _check_name("effort", chosen, Effort, sources.get("effort"))
+    check_name("kind", kind, Kind)
+    check_name("effort", chosen, Effort, sources.get("effort"))
     parts = parts_of(values["object"])
     if len(parts) > 1 and (live or prior is not None):
         raise UsageError(
@@ -336,19 +323,6 @@ def _check_live(images: list[Path], camera: str | None, watch: bool, unsuited: l
         raise UsageError(
             f"{unsuited[0]} does not go with --camera and --watch, which print a line of JSON an image; leave it"
         )
-
-
-def _check_name(option: str, name: str, known: type[StrEnum], file: str | None = None) -> None:
-    """Refuse an unknown name, which the command line gave or a ``geomtact.toml``.
-
-    Raises
-    ------
-    UsageError, InputError
-    """
-    names = [k.value for k in known]
-    if name not in names:
-        what = f"no {option} named {name!r}{nearest_name(name, names)}"
-        raise InputError(f"{file}: {what}") if file else UsageError(f"--{option}: {what}")
 
 
 def _print_parts(found: Identification) -> None:

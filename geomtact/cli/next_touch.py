@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.library import CacheDir
+from geomtact.cli.options import CacheDir
 from geomtact.cli.shell import check_folder, posterior_file, print_table
 from geomtact.errors import GeomtactError, InputError, nearest_name
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, part_of_task
-from geomtact.cli.library import CacheDir
+from geomtact.cli.options import CacheDir, MaxPoses, ScorerName, SensorName, Unit
 from geomtact.cli.shell import progress_bar, tell
 
 if TYPE_CHECKING:
@@ -18,15 +18,6 @@ if TYPE_CHECKING:
     from geomtact.sensing.sensor import Sensor
 
 _MANY_WINDOWS = 10  # long sides of the window, from which on a part's unit is doubted
-Unit = Annotated[str | None, typer.Option("--unit", help="Unit of a mesh file without one: mm, cm, m or inch.")]
-ScorerName = Annotated[
-    str | None, typer.Option("--scorer", help="How contacts are compared: a score by name, or weights (.safetensors).")
-]
-MaxPoses = Annotated[
-    int | None,
-    typer.Option("--max-poses", min=1, help="About how many poses; 1.2 million by default.", show_default=False),
-]
-SensorName = Annotated[str | None, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
 
 
 def prepare(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.prepare import SensorName, Unit
+from geomtact.cli.options import SensorName, Unit
 from geomtact.cli.shell import check_folder
 from geomtact.errors import InputError
 

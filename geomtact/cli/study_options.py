@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from geomtact.cli.localize import Effort
+from geomtact.cli.options import Effort
 from geomtact.cli.shell import progress_bar
 from geomtact.cli.simulate import NoiseName
 

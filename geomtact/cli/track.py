@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.frames import Frame, all_frames, listed
-from geomtact.cli.library import CacheDir
 from geomtact.cli.lines import line_of, to_line
-from geomtact.cli.localize import Effort, Kind, _check_name
-from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit, open_localizer
+from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
+from geomtact.cli.prepare import open_localizer
 from geomtact.cli.shell import NO_CONTACT, posterior_file, tell
 from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text
@@ -143,13 +142,13 @@ def open_track(
     """The localizer, and the time, if the source tells one, and the posterior of each frame; parameters as of :func:`track`."""
     from geomtact.cli.project import resolve
 
-    _check_name("kind", kind, Kind)
+    check_name("kind", kind, Kind)
     prior = prior and posterior_file(prior, "--prior")
     if follow and not Path(source).is_dir():
         raise UsageError(f"--follow: expected a folder to watch, got {source}")
     values, sources = resolve(given, _metadata(source))
     effort = values["effort"] or Effort.balanced.value
-    _check_name("effort", effort, Effort, sources.get("effort"))
+    check_name("effort", effort, Effort, sources.get("effort"))
     frames = all_frames(source, follow, values["sensor"])
     localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior)
 

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, part_of_task, quietly
+from geomtact.cli.options import Unit
 from geomtact.cli.parts import parts_of
-from geomtact.cli.prepare import Unit
 from geomtact.cli.shell import progress_bar, tell
 from geomtact.errors import InputError, UsageError
 

@@ -7,9 +7,7 @@ from typing import Annotated
 
 import typer
 
-from geomtact.cli.library import CacheDir
-from geomtact.cli.localize import Kind
-from geomtact.cli.prepare import MaxPoses, ScorerName, SensorName, Unit
+from geomtact.cli.options import CacheDir, Kind, MaxPoses, ScorerName, SensorName, Unit
 from geomtact.cli.shell import NO_CONTACT, tell
 from geomtact.cli.track import (
     MOTION_MM,

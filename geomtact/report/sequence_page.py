@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.report.figure import OBSERVED, SIMULATED, _displayable, _rgb
-from geomtact.report.page import _STYLE
+from geomtact.report.page import STYLE
 from geomtact.report.result import plain
 from geomtact.report.summary import percent
 from geomtact.se3 import Array, inverse
@@ -116,7 +116,7 @@ def sequence_page(name: str, sensor: str, frames: Sequence[Mapping[str, Any]]) -
     script = f"const FRAMES = {data.replace('</', '<' + chr(92) + '/')};{_SCRIPT}"
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{_STYLE}{_EXTRA}</style>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}{_EXTRA}</style>\n'
         f"</head>\n<body>\n{body}\n<script>\n{script}</script>\n</body>\n</html>\n"
     )
 

@@ -1,0 +1,54 @@
+"""The options that several commands share, and the names that they know."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from geomtact.errors import InputError, UsageError, nearest_name
+
+
+class Kind(StrEnum):
+    auto = "auto"
+    mask = "mask"
+    height = "height"
+    reading = "reading"
+
+
+class Effort(StrEnum):
+    fast = "fast"
+    balanced = "balanced"
+    exact = "exact"
+
+
+Unit = Annotated[str | None, typer.Option("--unit", help="Unit of a mesh file without one: mm, cm, m or inch.")]
+ScorerName = Annotated[
+    str | None, typer.Option("--scorer", help="How contacts are compared: a score by name, or weights (.safetensors).")
+]
+MaxPoses = Annotated[
+    int | None,
+    typer.Option("--max-poses", min=1, help="About how many poses; 1.2 million by default.", show_default=False),
+]
+SensorName = Annotated[str | None, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
+CacheDir = Annotated[
+    Path | None,
+    typer.Option(
+        "--cache-dir", help="Folder of the cached indexes; else $GEOMTACT_CACHE, else the user's cache folder."
+    ),
+]
+
+
+def check_name(option: str, name: str, known: type[StrEnum], file: str | None = None) -> None:
+    """Refuse an unknown name, which the command line gave or a ``geomtact.toml``.
+
+    Raises
+    ------
+    UsageError, InputError
+    """
+    names = [k.value for k in known]
+    if name not in names:
+        what = f"no {option} named {name!r}{nearest_name(name, names)}"
+        raise InputError(f"{file}: {what}") if file else UsageError(f"--{option}: {what}")
