@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
+from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name, given_of
 from geomtact.cli.prepare import open_localizer
 from geomtact.cli.shell import NO_CONTACT, check_folder, posterior_file, print_table, tell
 from geomtact.errors import InputError, UsageError
@@ -99,13 +99,6 @@ def localize(
     from geomtact.cli.sensor_poses import read_sensor_poses
     from geomtact.sensing.reading import read_metadata
 
-    given = {
-        "object": object_name,
-        "unit": unit,
-        "sensor": sensor,
-        "background": None if background is None else str(background),
-        "effort": effort,
-    }
     check_folder(out)
     if report is not None:
         check_name("report", report, Report)
@@ -121,7 +114,7 @@ def localize(
         _check_images(images, sensor_poses)
     placed = read_sensor_poses(sensor_poses, len(images)) if sensor_poses is not None else None
     metadata = {} if live else read_metadata(images[0])
-    values, sources = resolve(given, metadata)
+    values, sources = resolve(given_of(object_name, unit, sensor, background, effort), metadata)
     values["effort"] = chosen = values["effort"] or Effort.balanced.value
     check_name("kind", kind, Kind)
     check_name("effort", chosen, Effort, sources.get("effort"))

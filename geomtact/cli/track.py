@@ -11,7 +11,7 @@ import typer
 
 from geomtact.cli.frames import Frame, all_frames, listed
 from geomtact.cli.lines import line_of, to_line
-from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
+from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name, given_of
 from geomtact.cli.prepare import open_localizer
 from geomtact.cli.shell import NO_CONTACT, posterior_file, tell
 from geomtact.errors import InputError, UsageError
@@ -109,19 +109,6 @@ def track(
     if not touched:
         tell(UNTOUCHED)
         raise typer.Exit(NO_CONTACT)
-
-
-def given_of(
-    object_name: str | None, unit: str | None, sensor: str | None, background: Path | None, effort: str | None
-) -> dict[str, str | None]:
-    """What the command line gives, as ``project.resolve`` takes it."""
-    return {
-        "object": object_name,
-        "unit": unit,
-        "sensor": sensor,
-        "background": None if background is None else str(background),
-        "effort": effort,
-    }
 
 
 def open_track(
