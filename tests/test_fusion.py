@@ -357,7 +357,7 @@ def test_sensors_may_differ(make_localizer, plug, cache_dir, rng):
     other = make_localizer("connector_plug", "gelsight-mini", max_poses=8_000, touches=120)
     both = type(plug)(plug.index, plug.scorer, plug.max_poses, plug.cache_dir, (other,))
     gains = []
-    for i in range(12):
+    for i in range(8):
         touches = [random_touches(plug.space, 1, 20 + i)[0], random_touches(other.space, 1, 40 + i)[0]]
         T, sensors = world(touches, rng)
         together = both.localize([t.mask for t in touches], "mask", None, sensors, effort="fast")
@@ -422,7 +422,7 @@ def test_a_jaw_on_a_plain_rod_says_that_it_may_be_shifted(make_localizer):
 def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
     """Each of the sensors but the first off by 5 mm, in a direction of its own: unless the rig is said to be known no better."""
     rng = np.random.default_rng(5)
-    told = {"right": 0, "off": 0, "known to be": 0, "said to be right": 0}
+    told = {"right": 0, "off": 0, "known to be": 0}
     for scene in make_scenes(plug, 6, 9, MODERATE, None, 3):
         masks = [touch.mask for touch in scene.touches]
         off = scene.T_world_sensor.copy()
@@ -432,7 +432,6 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
             "right": (scene.T_world_sensor, None),
             "off": (off, None),
             "known to be": (off, RigStd(0.0, 5e-3)),
-            "said to be right": (off, RigStd()),
         }
         for name, (T, rig) in rigs.items():
             try:
@@ -441,5 +440,4 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
                 continue
             told[name] += any("agree badly" in warning for warning in warnings)
     assert told["right"] <= 1 and told["off"] >= 4 and told["known to be"] == 0, told
-    assert told["said to be right"] == told["off"]
     assert _badly_agreed({"unexplained_nats": None}) and not _badly_agreed({})

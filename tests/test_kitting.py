@@ -53,7 +53,7 @@ def test_an_error_sideways_or_down_needs_as_much_clearance_as_it_is_long_and_one
 
 def test_the_recess_is_what_the_part_sweeps_on_its_way_up(mesh, rng):
     """Held against the least distance from the part of points all the way down, a tenth of a millimetre apart."""
-    fixture, up = Fixture(mesh, 300), upwards(mesh)
+    fixture, up = Fixture(mesh, 100), upwards(mesh)
     about = se3.transform(np.eye(3), mesh.centre)
     xi = rng.normal(size=(3, 6)) * np.repeat([0.02, 5e-4], 3)
     off = about @ np.array([se3.exp(each) for each in xi]) @ se3.inverse(about)

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from geomtact import InputError, Localizer, PoseError, Sensor, UsageError
+from geomtact.contact_space.store import open_index
 from geomtact.evaluation.touches import random_touches
 from geomtact.geometry.approach import approach_of
 from geomtact.geometry.distance import PoseDistance, mode_radius
@@ -493,9 +494,9 @@ def test_no_contact_restricts_the_prior_to_poses_that_do_not_touch(plug, uniform
         plug.localize(nothing, prior=3)
 
 
-def test_a_uniform_prior_of_another_grid_rules_nothing_out(plug, make_localizer):
+def test_a_uniform_prior_of_another_grid_rules_nothing_out(plug, cache_dir):
     """Although some stored poses lie a little off the contact pose space."""
-    index = make_localizer("connector_plug", "gelslim", max_poses=6_000).index
+    index = open_index(plug.mesh, plug.sensor, None, 6_000, cache_dir, None)
     uniform = Posterior(index, index.possible, index.log_possible_weight)
     mass = prior_log_mass(plug.index, uniform, np.eye(4), "sensor")
     held = plug.index.possible

@@ -72,6 +72,7 @@ def test_a_gel_that_bulges_is_touched_by_a_plate_as_hertz_has_it(monkeypatch):
 
 
 def test_presses_are_made_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(presses, "PRESSES", 2)
     first = make_presses(tmp_path, 1, 7, processes=1)
     made = (tmp_path / "0.npz").stat().st_mtime_ns
     second = make_presses(tmp_path, 1, 7, processes=1)

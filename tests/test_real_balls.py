@@ -61,7 +61,7 @@ def balls(data_folder, cache_dir, few_touches):
     for diameter in DIAMETERS:
         ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5 * float(diameter) * MM)
         mesh = Mesh(ball.vertices, ball.faces, f"ball of {diameter} mm", "m")
-        out[diameter] = Localizer.prepare(mesh, sensor="gelsight-mini", cache_dir=cache_dir)
+        out[diameter] = Localizer.prepare(mesh, sensor="gelsight-mini", max_poses=300_000, cache_dir=cache_dir)
     return out
 
 

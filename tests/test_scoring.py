@@ -312,7 +312,7 @@ def test_touches_are_kept_and_read_back(plug, tmp_path):
 
 
 def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
-    monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 60)
+    monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 30)
     names = ("l1", "iou", "moments", "fourier")  # one of each kind
     assert set(names) <= set(SCORERS)
     for name in names:
@@ -330,7 +330,7 @@ def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("damage", ["", "{}", "not json", json.dumps({"format": 999})])
 def test_a_damaged_fit_is_made_anew(ball, tmp_path, monkeypatch, damage):
-    monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 50)
+    monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 30)
     (tmp_path / "iou.json").write_text(damage)
     assert fitted_scorer("iou", ball.index, tmp_path).scorer.name == "iou"
     assert json.loads((tmp_path / "iou.json").read_text())["weights"] == {"iou": 1.0}
@@ -360,7 +360,8 @@ def test_a_part_whose_touches_are_all_alike_is_refused(make_localizer, monkeypat
 @pytest.mark.parametrize(
     "name", ["encoder", "moments", "likelihood", "iou", "l1", "chamfer", "cosine", "hu", "fourier"]
 )
-def test_probabilities_of_0_and_1_score_as_the_mask_does(name, plug, a_touch):
+def test_probabilities_of_0_and_1_score_as_the_mask_does(name, plug, a_touch, monkeypatch):
+    monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 240)  # as of the plug's own score
     _, mask = a_touch(plug)
     scorer = fitted_scorer(name, plug.index, plug.cache_dir / plug.index.key).scorer
     expected = scorer.score(plug.index, mask)

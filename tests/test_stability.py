@@ -250,6 +250,8 @@ def command(plug):
 
 
 def test_a_stopped_study_goes_on_and_its_picture_comes_from_the_file_alone(command, tmp_path, monkeypatch):
+    for name, levels in {"specks": (2, 60), "size": (0, 5)}.items():
+        monkeypatch.setitem(SWEEPS, name, replace(SWEEPS[name], levels=levels, inside=levels[:1]))
     words = ["--touches", 1, "--effort", "fast", "--sweep", "specks", "--sweep", "size"]
     done = command(*words, "--out", tmp_path / "whole.json", "--plot", tmp_path / "whole.png")
     assert "specks of dirt" in done.output and "60*" in done.output

@@ -8,7 +8,7 @@ from geomtact.geometry.distance import PoseDistance
 from geomtact.scoring.resnet import load_resnet, make_network
 from geomtact.training.thesis import FAR, NEAR, Settings, make_pairs, pair_loss, train_thesis
 
-TINY = Settings(pairs=16, batch=4, side=32)
+TINY = Settings(pairs=8, batch=4, side=32)
 
 
 def test_the_loss_is_equation_1():

@@ -37,7 +37,7 @@ def scenes():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scenes_module, "DIRECTIONS", 6)
         return [
-            make_scene(load_mesh(name), Sensor.load(sensor), 200_000, np.random.default_rng(1))
+            make_scene(load_mesh(name), Sensor.load(sensor), 60_000, np.random.default_rng(1))
             for name, sensor in (("bracket", "gelslim"), ("gear", "digit"), ("connector_plug", "gelslim"))
         ]
 
@@ -224,11 +224,11 @@ def test_weights_for_one_part_serve_no_other(weights, tmp_path, ball):
         descriptor_of(str(path), ball.index)
 
 
-def test_scenes_are_made_once_and_repeat(tmp_path, monkeypatch):
+def test_scenes_are_made_once_and_repeat(tmp_path):
     mesh, sensor = load_mesh("hex_nut"), Sensor.load("gelsight-mini")
-    first = part_scenes(tmp_path, mesh, sensor, 100_000, 2, seed=4, processes=1)
+    first = part_scenes(tmp_path, mesh, sensor, 20_000, 2, seed=4, processes=1)
     times = {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()}
-    second = part_scenes(tmp_path, mesh, sensor, 100_000, 2, seed=4, processes=1)
+    second = part_scenes(tmp_path, mesh, sensor, 20_000, 2, seed=4, processes=1)
     assert {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()} == times and len(times) == 2
     for a, b in zip(first, second, strict=True):
         assert (a.stored == b.stored).all() and (a.true == b.true).all()

@@ -57,11 +57,11 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
             raise InputError(f"--sensor-poses {path}: unknown key {key!r}{nearest_name(key, _KEYS)}")
     try:
         T = np.array(content["T_world_sensor"], float)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError):  # matrices of several shapes, or no numbers
         T = np.zeros(0)
     if T.shape != (images, 4, 4):
         listed = content["T_world_sensor"]
-        given = str(len(listed)) if isinstance(listed, list) else "none"
+        given = f"{len(listed)}, not all 4x4" if isinstance(listed, list) else "none"
         if T.shape == (4, 4):
             given = "one 4x4; put it into a list"
         elif T.ndim == 3 and T.shape[1:] != (4, 4):

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.options import SensorName, Unit
-from geomtact.cli.shell import check_folder
-from geomtact.errors import InputError
+from geomtact.cli.shell import check_folder, tell
+from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from geomtact.contact_space.space import ContactSpace
@@ -32,7 +32,10 @@ def simulate(
     unit: Unit = None,
     sensor: SensorName = None,
     out: Annotated[Path, typer.Option(help="Folder for the images and their poses.")] = Path("."),
-    n: Annotated[int, typer.Option("--n", min=1, help="How many touches at random poses.")] = 1,
+    n: Annotated[
+        int | None,
+        typer.Option("--n", min=1, help="How many touches at random poses; one by default.", show_default=False),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     elastic: Annotated[
         bool, typer.Option("--elastic/--geometric", help="Pressure of an elastic gel, or a threshold on the depth.")
@@ -58,6 +61,8 @@ def simulate(
     from geomtact.sensing.sensor import Sensor, bundled_sensors
 
     check_folder(out)
+    if pose is not None and n is not None:
+        raise UsageError("--pose is of one touch, --n of touches at random poses; give one of them")
     values, _ = resolve({"object": object_name, "unit": unit, "sensor": sensor})
     named = require(values, "object", list(catalogue()), "a mesh file with --unit", "OBJECT")
     sensor_named = require(values, "sensor", bundled_sensors(), "a TOML file")
@@ -72,7 +77,7 @@ def simulate(
     else:
         from geomtact.evaluation.touches import random_touches
 
-        touches = random_touches(space, n, seed, elastic=elastic, noise=strength)
+        touches = random_touches(space, n or 1, seed, elastic=elastic, noise=strength)
     # files are named in full, so that the image is understood from any folder
     metadata = {key: str(Path(v).resolve()) if Path(v).is_file() else v for key, v in values.items() if v is not None}
     out.mkdir(parents=True, exist_ok=True)
@@ -103,6 +108,10 @@ def simulate(
         }
         _write(out / stem, shown[k - 1] if reading else touch.mask, truth, metadata)
         typer.echo(f"{out / stem}.png: {100 * touch.mask.mean():.1f} % of the window in contact")
+        if not touch.mask.any():
+            tell(
+                "warning: the part does not touch there: the pose is T_sensor_object, in metres, the membrane at z = 0"
+            )
     if reading:
         typer.echo(f"{out / 'background.png'}: without contact, for --background")
 

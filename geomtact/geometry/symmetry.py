@@ -193,7 +193,8 @@ class _Body:
             turned = points @ R.T
             query = o3d.core.Tensor.from_numpy(turned.astype(np.float32))
             nearest = self.scene.compute_closest_points(query)
-            normals = nearest["primitive_normals"].numpy().astype(float)
+            # a face of no area has none
+            normals = np.nan_to_num(nearest["primitive_normals"].numpy().astype(float))
             residual = ((turned - nearest["points"].numpy()) * normals).sum(1)
             J = np.cross(turned, normals)
             # Turns that the surface does not resist are left alone.

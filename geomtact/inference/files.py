@@ -96,7 +96,8 @@ def heading(path: str | Path) -> tuple[str, str, str]:
 
 
 def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
-    """Read a posterior; its index is opened from the cache, or built anew where it is no longer there.
+    """Read a posterior, from its file or the folder that holds it as posterior.npz; its index is opened from the cache, or built
+    anew where it is no longer there.
 
     Raises
     ------
@@ -141,8 +142,10 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
 
 def _read(path: str | Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
     """The arrays of ``names``, or all, and what is told in words."""
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file; give a posterior.npz")
+    path = Path(path)
+    path = path / "posterior.npz" if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a posterior.npz, or its folder")
     try:
         if not zipfile.is_zipfile(path):  # numpy would take it for a pickle
             raise ValueError("it is no .npz file, or not a whole one")

@@ -210,8 +210,9 @@ class Posterior:
                 out[i] = before + _share(pose, self.seed) * (above[j] - before)
         return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
 
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """``n`` poses (n, 4, 4) drawn from the posterior, uniform within each cell, even a refined one, and over the symmetry.
+    def sample(self, n: int, rng: np.random.Generator | int) -> Array:
+        """``n`` poses (n, 4, 4) drawn from the posterior, uniform within each cell, even a refined one, and over the symmetry;
+        ``rng``, or the seed of one.
 
         Raises
         ------
@@ -220,6 +221,7 @@ class Posterior:
         """
         if not self.contact:
             raise UsageError("sample: the image shows no contact, so there is no distribution of touching poses")
+        rng = np.random.default_rng(rng)
         cells = self._draw_cells(n, rng)
         return self.T_frame_sensor @ draw_within(self.index, self.space, cells, rng)[0]
 

@@ -28,6 +28,7 @@ _EXPECTED = (
 )
 _DRAWN = 1024  # poses of a Gaussian at a time
 _BATCHES, _TOUCHING = 8, 1000  # how often at most, and until how many touch
+_IMPOSSIBLE = -32.0  # log of a Gaussian's density over its peak, eight standard deviations out: no pose beyond that
 _LOOK = (24, 32)  # rays that tell whether they do
 _TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
 
@@ -159,7 +160,13 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     """Log mass (N,) of every cell. Of n poses drawn that touch and k cells among which the widened density spreads, the draws
     count n times, that density k times: as many as it takes to see all those cells."""
     wide = prior.over_cells(index, T_frame_sensor)
-    log_mass = _normalised(index.log_weight + _over_images(index, lambda T: wide(T_frame_sensor @ T)))
+    density = _over_images(index, lambda T: wide(T_frame_sensor @ T))
+    if density[index.possible].max() < _IMPOSSIBLE:
+        raise InputError(
+            f"prior: no pose that touches the sensor lies within {np.sqrt(-2 * _IMPOSSIBLE):.0f} of its standard deviations; "
+            "check its frame and its units (metres, radians)"
+        )
+    log_mass = _normalised(index.log_weight + density)
     mass = np.exp(log_mass.astype(float))
     spread = np.exp(-float(mass @ np.maximum(log_mass, -700)))
     rng, cells = np.random.default_rng(0), np.zeros(0, np.int64)

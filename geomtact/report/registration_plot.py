@@ -31,7 +31,7 @@ def draw_registration(content: Mapping[str, Any]) -> bytes:
         size = (_PANEL[0] * len(names) + 1.2, _PANEL[1] * len(kinds) + 0.9)
         figure = Figure(figsize=size, dpi=120, layout="constrained", facecolor="white")
         canvas = FigureCanvasAgg(figure)
-        grid = figure.subplots(len(kinds), len(names), squeeze=False, sharex=True, sharey=True)
+        grid = figure.subplots(len(kinds), len(names), squeeze=False)  # a hundred axes that share take minutes
         for i, (kind, cells) in enumerate(kinds.items()):
             turns, shifts = (sorted({cell[key] for cell in cells}) for key in ("turn_deg", "shift_mm"))
             for axes, name in zip(grid[i], names, strict=True):
@@ -45,6 +45,7 @@ def draw_registration(content: Mapping[str, Any]) -> bytes:
                     axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", fontsize=6.5, color=colour)
                 axes.set(xticks=range(len(shifts)), xticklabels=[f"{s:g}" for s in shifts])
                 axes.set(yticks=range(len(turns)), yticklabels=[f"{t:g}" for t in turns])
+                axes.label_outer()
                 if i == 0:
                     axes.set_title(name.replace(" point", "\npoint", 1), fontsize=8)
             n = np.median([cell["n"] for cell in cells])

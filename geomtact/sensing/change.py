@@ -96,6 +96,8 @@ def as_unit_rgb(image: Any, name: str) -> Array:
     """An image (H, W, 3), uint8 or float 0..1, or its path, as float32 0..1; what is none is refused under its ``name``."""
     if isinstance(image, str | Path):
         image = read_image(image)[..., :3]
+    if image is None:
+        raise ImageError(f"{name}: expected an RGB image (H, W, 3) or its path, got none; give it")
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
         raise ImageError(f"{name}: expected an RGB image (H, W, 3), got an array of shape {image.shape}")
@@ -117,7 +119,10 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
     wanted, given = "{} x {} px".format(*sensor.image_size_px), f"{width} x {height} px"
     if (height, width) == sensor.image_size_px:
         turned = "array.T" if array.ndim == 2 else "array.swapaxes(0, 1)"
-        hint = f"the image is transposed: transpose it ({turned}) or rotate it by 90 degrees, as it was taken"
+        hint = (
+            f"the image is transposed: transpose it ({turned}) or rotate it by 90 degrees, as it was taken; or name the sensor "
+            "that took it"
+        )
     elif do is not None:
         hint = do
     elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:

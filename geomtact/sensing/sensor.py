@@ -179,6 +179,10 @@ class Sensor:
                 raise SensorError(f"{origin}: {key} must be two numbers (along x, along y), got {value!r}")
         if any(v != int(v) for v in data["image_size_px"]):
             raise SensorError(f"{origin}: image_size_px must be whole numbers, got {data['image_size_px']}")
+        if max(data["pixel_pitch_mm"]) > 10:
+            raise SensorError(
+                f"{origin}: pixel_pitch_mm {data['pixel_pitch_mm']} is over a centimetre; give millimetres a pixel"
+            )
         housing = data.get("housing_depth_mm")
         width, height = data["image_size_px"]
         pitch_x, pitch_y = data["pixel_pitch_mm"]
