@@ -241,6 +241,23 @@ def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_po
         assert mass[among].sum() > 0.4
 
 
+def test_a_prior_that_cannot_be_is_refused_and_one_that_the_image_contradicts_is_often_told(plug, uniform_poses):
+    """About the true pose nothing is said; about those of far larger or smaller contacts, in a third of the cases at least."""
+    T = uniform_poses(plug)[0][:60]
+    masks = [plug.simulate(pose).mask for pose in T]
+    some = np.argsort([mask.sum() for mask in masks])[[0, 30, 59]]
+    covariance = np.diag([0.02**2] * 3 + [(0.5 * MM) ** 2] * 3)
+    told = np.zeros((3, 3), bool)
+    for i, j in np.ndindex(told.shape):
+        prior = GaussianPrior(T[some[i]], covariance)
+        warnings = plug.localize(masks[some[j]], "mask", prior=prior, effort="fast").warnings
+        told[i, j] = any("contradict each other" in warning for warning in warnings)
+    assert not told.diagonal().any() and told.sum() >= 2
+    away = GaussianPrior(transform(T[0, :3, :3], [0, 0, 1]), covariance)
+    with pytest.raises(InputError, match="no pose that touches the sensor lies within 8 of its standard deviations"):
+        plug.localize(masks[0], "mask", prior=away)
+
+
 def test_a_gaussian_prior_is_the_density_of_what_it_draws(rng):
     """What is drawn from it is turned as far, in the mean, as its density over evenly drawn poses says."""
     prior = GaussianPrior(np.eye(4), np.diag([0.8**2] * 3 + [1.0] * 3))
