@@ -150,7 +150,7 @@ def _bars(axes: Axes, ranked: Sequence[Action]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     title = "Expected information"
     if len(some) < len(ranked):
-        title = f"The best of {len(ranked)} actions, and the last of those tried at all poses"
+        title = f"The best of {len(ranked)} actions,\nand the last of those tried at all poses"
     axes.set(title=title, xlabel="nats about the pose; 0.7 tells two possibilities apart")
 
 

@@ -14,6 +14,7 @@ from geomtact.sensing.sensor import Sensor
 
 _PART, _WINDOW, _BACKGROUND = np.array([0.72, 0.75, 0.80]), np.array([0.0, 0.45, 0.70]), np.array([1.0, 1.0, 1.0])
 _WINDOW_OPACITY = 0.35
+_SHOWN = 4  # diagonals of the window around it, within which the part is shown
 # The viewer stands beyond the image's top edge, so x points right and z up, a little to the left of the middle.
 _TOWARDS_VIEWER = np.array([-0.45, -0.75, 0.5])
 
@@ -47,7 +48,7 @@ class Painter:
         self._scene = scene_of((mesh.vertices - self._centre).astype(np.float32)[mesh.faces])
 
     def paint(self, T_sensor_object: Array) -> PartView:
-        """The part at ``T_sensor_object`` (4, 4), with the sensor's window; far ends of a long part are cut off."""
+        """The part at ``T_sensor_object`` (4, 4), with the sensor's window; far ends of a very long part are cut off."""
         back = _TOWARDS_VIEWER / np.linalg.norm(_TOWARDS_VIEWER)
         right = np.cross([0.0, 0.0, 1.0], back)
         right /= np.linalg.norm(right)
@@ -55,7 +56,7 @@ class Painter:
         window = 2 * float(np.hypot(*self.sensor.half_window))
         placed = apply(T_sensor_object, self.mesh.vertices)
         distance = np.linalg.norm(placed, axis=1)
-        near, far = placed[distance < 2 * window], 2 * float(distance.max()) + window
+        near, far = placed[distance < _SHOWN * window], 2 * float(distance.max()) + window
         corners = np.concatenate([near, self._window_corners()]) @ plane.T
         middle = 0.5 * (corners.min(0) + corners.max(0))
         half = 0.53 * float(np.ptp(corners, axis=0).max())
