@@ -177,7 +177,9 @@ def test_simulate_is_repeatable_and_replays_a_pose(geomtact, touched, tmp_path):
     with Image.open(touched / "ball_2.png") as a, Image.open(tmp_path / "ball_1.png") as b:
         assert np.array_equal(a, b)
     (tmp_path / "pose.json").write_text(json.dumps(np.diag([1.0, 1, 1, 1]).tolist()).replace("0.0]", "9.0]", 1))
-    geomtact("simulate", "ball", "--sensor", "gelslim", "--pose", tmp_path / "pose.json", "--out", tmp_path / "far")
+    far = ("simulate", "ball", "--sensor", "gelslim", "--pose", tmp_path / "pose.json", "--out", tmp_path / "far")
+    assert "the part does not touch there" in geomtact(*far).stderr
+    assert "give one of them" in geomtact(*far, "--n", 2, status=2).stderr
     assert json.loads((tmp_path / "far" / "ball_1.json").read_text())["penetration_mm"] is None
     (tmp_path / "pose.json").write_text('{"T_sensor_object": [[1, 2], [3, 4]]}')
     geomtact("simulate", "ball", "--sensor", "gelslim", "--pose", tmp_path / "pose.json", status=3)

@@ -56,6 +56,14 @@ def test_known_groups_in_any_frame(name, rng):
         assert abs(found.axis @ R[:, 2]) == pytest.approx(1, abs=1e-9)
 
 
+def test_a_real_part_with_faces_of_no_area_has_its_symmetry_found(data_folder):
+    """Such a face has no normal."""
+    part = load_mesh(data_folder / "meshes_trimesh" / "dirty" / "wallhole.obj", "mm")
+    found = find_symmetry(part.vertices, part.faces)
+    assert (found.kind, len(found.elements)) == ("discrete", 2)
+    check_maps_onto_itself(found, part.vertices, part.faces, 5e-5)
+
+
 def check_maps_onto_itself(symmetry: Symmetry, vertices, faces, tolerance):
     """By brute force over all faces, apart from the finder's own way; both ways round since a group holds its inverses."""
     # In millimetres: trimesh's closest point takes small areas for none.

@@ -114,7 +114,7 @@ def _doubt_unit(mesh: Mesh, sensor: Sensor) -> None:
     if windows > _MANY_WINDOWS:
         tell(
             f"warning: {mesh.name} is {1e3 * mesh.diameter:.0f} mm across as read in {mesh.unit}, {windows:.0f} windows of "
-            f"the sensor {sensor.name!r}: if that is not its size, give its --unit"
+            f"the sensor {sensor.name!r}: if that is not its size, give its --unit; so large a part takes long to prepare"
         )
 
 
