@@ -67,6 +67,19 @@ def test_a_torn_gel_is_found_whenever_it_tore(sets, level):
                 assert "torn" in said, name
 
 
+def test_a_background_that_shows_a_contact_is_found(sets):
+    """Exchanged with the image always, another press in its place nine times of ten; an untouched gel's noise is none."""
+    found = []
+    for name in ("gelslam", "gelsight", "digit"):
+        background, images = sets[name]
+        others = images[len(images) // 2 :] + images[: len(images) // 2]
+        assert all("show a contact" in faults(background, image)[0] for image in images), name
+        found += ["show a contact" in " ".join(faults(*pair)) for pair in zip(images, others, strict=True)]
+        noise = 0.02 * np.random.default_rng(0).normal(size=background.shape)
+        assert faults(np.clip(background + noise, 0, 1), background) == []
+    assert np.mean(found) > 0.9
+
+
 def test_markers_are_no_tear(sets):
     """Nine by seven black dots of a thirtieth of the image's width."""
     import cv2

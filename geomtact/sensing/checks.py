@@ -15,6 +15,9 @@ _BRIGHT, _BRIGHT_SHARE = 0.995, 0.4  # any channel above this
 _UNLIKE = 0.085
 _BETTER = 0.5  # of what a reading is off as it is, that it is off otherwise, where it was meant to be so
 _LEAST = 0.02  # off by less, it says nothing
+# widths [px] of structure, fine and less so (moved markers are fine alone, a board of pins is neither), and the share of the
+# change in it that the background may bring: with the own one 0.19 at most, with another press in its place half
+_STRUCTURE, _BRINGS = ((0.0, 3.0), (2.0, 5.0)), 0.27
 _DRIFT = 0.2  # change of brightness since the background
 # brightness over the median around of a hole (in 103 real readings it is 0.55 at least), all channels of a glare where they are
 # not so bright around, and the share of an image that is so
@@ -43,7 +46,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
     seen /= max(gain, 1e-6)
     off = _off(seen, rest)
     if off < _LEAST:
-        return _light_changed(gain)
+        return _not_at_rest(rest, seen) or _light_changed(gain)
     others = {
         "channels": seen[..., ::-1],
         "half": seen[::-1, ::-1],
@@ -60,7 +63,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
             f"the background seems to be of another sensor or light: half of the image is off by more than {100 * off:.0f} % of "
             "full brightness; take one with this sensor, untouched, now"
         ]
-    return _light_changed(gain)
+    return _not_at_rest(rest, seen) or _light_changed(gain)
 
 
 def exposure(image: Array, name: str) -> list[str]:
@@ -106,6 +109,31 @@ def _coarse(image: Array) -> NDArray[np.floating]:
     scale = _COARSE / min(h, w)
     small = cv2.resize(image.astype(np.float32), (round(w * scale), round(h * scale)), interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0))
+
+
+def _not_at_rest(rest: NDArray[np.floating], seen: NDArray[np.floating]) -> list[str]:
+    if _brought_by(rest, seen) <= _BRINGS:
+        return []
+    return ["the background seems to show a contact: give one of the untouched gel"]
+
+
+def _brought_by(rest: NDArray[np.floating], seen: NDArray[np.floating]) -> float:
+    """Which share of the change between two coarse images is structure of ``rest``: none if that is smooth, all if ``seen`` is,
+    half if both show a contact; 0 where hardly anything changes."""
+    import cv2
+
+    def within(image: NDArray[np.floating], least: float, most: float) -> Array:
+        fine = cv2.GaussianBlur(image, (0, 0), least) if least else image
+        return np.asarray(fine - cv2.GaussianBlur(image, (0, 0), most), float)
+
+    shares = []
+    for widths in _STRUCTURE:
+        own = within(rest, *widths)
+        change = within(seen, *widths) - own
+        if np.quantile(np.abs(change), 0.99) < _LEAST:
+            return 0.0
+        shares.append(float(-(own * change).sum() / (change**2).sum()))
+    return min(shares)
 
 
 def _off(seen: NDArray[np.floating], rest: NDArray[np.floating]) -> float:
