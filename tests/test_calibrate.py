@@ -138,8 +138,7 @@ def test_a_press_of_another_ball_is_named(found):
     assert found.warnings == []
     images, background = presses(8 * MM)
     mixed = calibrated([*images, presses(14 * MM, PLACES[:1])[0][0]], 8 * MM, background, PITCH)
-    (said,) = mixed.warnings
-    assert f"on press {len(PLACES) + 1} the ball is measured more than 40 % otherwise" in said
+    assert any(f"on press {len(PLACES) + 1} no ball is seen, or one more than 40 %" in said for said in mixed.warnings)
 
 
 def test_a_background_in_which_the_ball_is_pressed_in_is_refused_as_is_one_place_alone():

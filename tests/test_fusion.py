@@ -440,4 +440,6 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
                 continue
             told[name] += any("agree badly" in warning for warning in warnings)
     assert told["right"] <= 1 and told["off"] >= 4 and told["known to be"] == 0, told
+    exact = plug.localize(masks, "mask", T_world_sensor=off, rig=RigStd())
+    assert np.array_equal(exact.log_prob, plug.localize(masks, "mask", T_world_sensor=off).log_prob)
     assert _badly_agreed({"unexplained_nats": None}) and not _badly_agreed({})

@@ -51,7 +51,7 @@ def judge_touches(
         done = study_file.earlier(content["parts"].get(name), settings)
 
         def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
-            flat = [sensors_study.Outcome(**study_file.numbers(o)) for some in outcomes for o in some]
+            flat = [sensors_study.FusedOutcome(**study_file.numbers(o)) for some in outcomes for o in some]
             figures = sensors_study.summarise(flat)
             study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=outcomes)
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name, given_of
+from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
 from geomtact.cli.prepare import open_localizer
+from geomtact.cli.project import given_of
 from geomtact.cli.shell import NO_CONTACT, check_folder, posterior_file, print_table, tell
 from geomtact.errors import InputError, UsageError
 
@@ -134,6 +135,8 @@ def localize(
     if made_of and len(parts) == 1 and parts[0] and Path(made_of).stem != Path(parts[0]).stem:
         tell(f"{images[0]}: was made of {made_of}, as its metadata says, and is localized on {parts[0]}")
     found, timing = _identified(asked, parts, placed)
+    if len(parts) > 1 and found.foreign:
+        tell("warning: what is shown is unlike all of the parts: is it another one?")
     for warning in found.posterior.warnings:
         tell(f"warning: {warning}")
     _give(asked, found, timing, out, _reports(report), as_json)
@@ -149,7 +152,7 @@ class _Asked:
     Attributes
     ----------
     values : object, unit, sensor, background and effort
-    sources : the files that those which the command line did not give were taken from
+    sources : where those which the command line did not give come from
     """
 
     images: list[Path]
@@ -163,7 +166,8 @@ class _Asked:
     cache_dir: Path | None
 
     def opened(self, own: dict[str, Any], quiet: bool = False, frame: str = "sensor") -> Localizer:
-        """The localizer of what is asked for, but for what it has of its ``own``; ``quiet`` on where values come from."""
+        """The localizer of what is asked for, with ``own`` values in the place of those; ``quiet``: where values come from is not
+        told."""
         sources = {} if quiet else self.sources
         values = {**self.values, **own}
         return open_localizer(values, sources, self.scorer, self.cache_dir, self.max_poses, self.prior, frame)
@@ -222,8 +226,6 @@ def _identified(
         seed=asked.seed,
         rig=None if placed is None else placed.rig,
     )
-    if len(parts) > 1 and found.foreign:
-        tell("warning: what is shown is unlike all of the parts: is it another one?")
     return found, {"prepare": took}
 
 

@@ -52,16 +52,3 @@ def check_name(option: str, name: str, known: type[StrEnum], file: str | None = 
     if name not in names:
         what = f"no {option} named {name!r}{nearest_name(name, names)}"
         raise InputError(f"{file}: {what}") if file else UsageError(f"--{option}: {what}")
-
-
-def given_of(
-    object_name: str | None, unit: str | None, sensor: str | None, background: Path | None, effort: str | None
-) -> dict[str, str | None]:
-    """What the command line gives, as ``project.resolve`` takes it."""
-    return {
-        "object": object_name,
-        "unit": unit,
-        "sensor": sensor,
-        "background": None if background is None else str(background),
-        "effort": effort,
-    }

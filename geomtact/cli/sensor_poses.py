@@ -61,11 +61,13 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
         T = np.zeros(0)
     if T.shape != (images, 4, 4):
         listed = content["T_world_sensor"]
-        given = f"{len(listed)}, not all 4x4" if isinstance(listed, list) else "none"
+        given = str(len(listed)) if isinstance(listed, list) else "none"
         if T.shape == (4, 4):
             given = "one 4x4; put it into a list"
         elif T.ndim == 3 and T.shape[1:] != (4, 4):
             given = "{} of {}x{}".format(*T.shape)
+        elif T.ndim == 1 and listed:
+            given += ", not all 4x4"
         wanted = f"for each of {images} images" if images > 1 else "for the image"
         raise InputError(f"--sensor-poses {path}: T_world_sensor: expected a 4x4 matrix {wanted}, got {given}")
     names = content.get("sensor")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -108,7 +109,7 @@ def simulate(
         }
         _write(out / stem, shown[k - 1] if reading else touch.mask, truth, metadata)
         typer.echo(f"{out / stem}.png: {100 * touch.mask.mean():.1f} % of the window in contact")
-        if not touch.mask.any():
+        if not isfinite(touch.penetration):
             tell(
                 "warning: the part does not touch there: the pose is T_sensor_object, in metres, the membrane at z = 0"
             )

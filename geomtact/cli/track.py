@@ -11,8 +11,9 @@ import typer
 
 from geomtact.cli.frames import Frame, all_frames, listed
 from geomtact.cli.lines import line_of, to_line
-from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name, given_of
+from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
 from geomtact.cli.prepare import open_localizer
+from geomtact.cli.project import given_of
 from geomtact.cli.shell import NO_CONTACT, posterior_file, tell
 from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text

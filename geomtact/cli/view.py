@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from geomtact.cli.options import CacheDir, Kind, MaxPoses, ScorerName, SensorName, Unit, given_of
+from geomtact.cli.options import CacheDir, Kind, MaxPoses, ScorerName, SensorName, Unit
+from geomtact.cli.project import given_of
 from geomtact.cli.shell import NO_CONTACT, tell
 from geomtact.cli.track import (
     MOTION_MM,

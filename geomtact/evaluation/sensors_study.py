@@ -32,7 +32,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FusedOutcome:
     """What the first ``sensors`` of a scene told together. Lengths in millimetres, information in nats.
 
     Attributes
@@ -80,7 +80,7 @@ def make_scenes(
 
 def fuse_scenes(
     localizer: Localizer, scenes: Sequence[Scene], effort: str, seed: int, first: int = 0
-) -> Iterator[list[Outcome]]:
+) -> Iterator[list[FusedOutcome]]:
     """Each scene from ``first`` on localized from its first sensor, its first two, and so on."""
     distance, points = PoseDistance(localizer.mesh), localizer.mesh.surface_points(_POINTS)
     for number, scene in enumerate(scenes[first:], first):
@@ -91,14 +91,14 @@ def fuse_scenes(
             try:
                 posterior = localizer.localize(images, "mask", None, scene.T_world_sensor[:n], effort=effort, seed=seed)
             except NoPoseAgreesError:
-                out.append(Outcome(number, n, -np.inf, 0.0, 1.0, np.inf, np.inf, np.inf, np.inf, 0.0, True, 0.0))
+                out.append(FusedOutcome(number, n, -np.inf, 0.0, 1.0, np.inf, np.inf, np.inf, np.inf, 0.0, True, 0.0))
                 continue
             ms = 1e3 * (time.perf_counter() - began)
             modes = posterior.modes(MODES)
             T, poses = scene.T_world_object, np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
             mean = 1e3 * distance.mean(T, poses)
             out.append(
-                Outcome(
+                FusedOutcome(
                     scene=number,
                     sensors=n,
                     gain=float(posterior.log_density(T)),
@@ -116,7 +116,7 @@ def fuse_scenes(
         yield out
 
 
-def summarise(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
+def summarise(outcomes: Sequence[FusedOutcome]) -> list[dict[str, Any]]:
     """Figures for each number of sensors; ``more`` is the mean gain over one sensor less, with its paired 95 % bootstrap
     interval, and ``ruled_out`` the share of scenes in which the true pose was given no probability: of the others are gain and
     claim."""
@@ -137,6 +137,6 @@ def summarise(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     return out
 
 
-def _column(outcomes: Sequence[Outcome], sensors: int, name: str) -> Array:
+def _column(outcomes: Sequence[FusedOutcome], sensors: int, name: str) -> Array:
     """One field of all scenes with that many sensors."""
     return np.array([getattr(o, name) for o in outcomes if o.sensors == sensors], float)

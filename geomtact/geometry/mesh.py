@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -195,7 +196,7 @@ def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _Se
 
 def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symmetry | None]:
     """Name, file, unit and known symmetry of a catalogue name or a path."""
-    if not isinstance(source, str | Path):
+    if not isinstance(source, str | os.PathLike):
         raise MeshError(
             f"expected a part's name, the path of a mesh file or a geomtact.Mesh, got {type(source).__name__}; make one by "
             'geomtact.Mesh(vertices, faces, "name", "m")'

@@ -91,7 +91,7 @@ def heading(path: str | Path) -> tuple[str, str, str]:
     InputError
         As of :func:`load`.
     """
-    data, meta = _read(path, ("object_sha256", "frame", "meta"))
+    data, meta = _read(_file(path), ("object_sha256", "frame", "meta"))
     return meta["object"], str(data["object_sha256"]), str(data["frame"])
 
 
@@ -104,6 +104,7 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     InputError
         The file cannot be read, or is no posterior.
     """
+    path = _file(path)
     data, meta = _read(path)
     try:
         mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"], symmetry=_symmetry(data, meta))
@@ -140,11 +141,14 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     )
 
 
+def _file(path: str | Path) -> Path:
+    """The file of a posterior that is named by itself or by the folder that it lies in."""
+    return Path(path) / "posterior.npz" if Path(path).is_dir() else Path(path)
+
+
 def _read(path: str | Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
     """The arrays of ``names``, or all, and what is told in words."""
-    path = Path(path)
-    path = path / "posterior.npz" if path.is_dir() else path
-    if not path.is_file():
+    if not Path(path).is_file():
         raise InputError(f"{path}: no such file; give a posterior.npz, or its folder")
     try:
         if not zipfile.is_zipfile(path):  # numpy would take it for a pickle

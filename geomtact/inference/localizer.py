@@ -72,9 +72,9 @@ class Effort:
 
 
 _HOLLOW = 0.01  # share of the surface in hollows that the sensor may fit into, from which it is warned of
-_CONTRADICTS = (
-    5.0  # nats by which an image is likelier without the prior; of true priors at most one in 150 is (Markov)
-)
+# nats by which an image is likelier without the prior: were the moments' likelihood exact, one image in exp(5), or 148, at most
+# would be, its pose drawn from the prior (Markov's inequality)
+_CONTRADICTS = 5.0
 EFFORTS = {
     "fast": Effort("blocks", 0),
     "balanced": Effort("cells", 5, thorough=False),
@@ -272,13 +272,13 @@ class Localizer:
             log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
             evidence, likeliest = self.scorer.witness.evidence(self.index, mask, log_prior)
             posterior = Posterior(self.index, rows.first, log_prob, runs=rows.runs, log_evidence=evidence, **common)
-            usual = evidence if log_prior is None else self.scorer.witness.evidence(self.index, mask)[0]
-        if usual - evidence > _CONTRADICTS:
+            unknown = evidence if log_prior is None else self.scorer.witness.evidence(self.index, mask)[0]
+        if unknown - evidence > _CONTRADICTS:
             warnings.append(
-                f"the prior and the image contradict each other, by {usual - evidence:.0f} nats: look whether the prior is of "
-                "this touch, in this frame, in metres and radians"
+                f"the prior and the image contradict each other, by {unknown - evidence:.0f} nats: look whether both are of this "
+                "touch and part, and at the prior's frame and units"
             )
-        odd = prior is None and self.scorer.witness.odd(evidence, likeliest)
+        odd = self.scorer.witness.odd(unknown, likeliest)
         if odd:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
         if self.space.hollow > _HOLLOW:

@@ -211,8 +211,8 @@ class Posterior:
         return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
 
     def sample(self, n: int, rng: np.random.Generator | int) -> Array:
-        """``n`` poses (n, 4, 4) drawn from the posterior, uniform within each cell, even a refined one, and over the symmetry;
-        ``rng``, or the seed of one.
+        """``n`` poses (n, 4, 4) drawn by ``rng``, or by one of that seed, from the posterior: uniform within each cell, even a
+        refined one, and over the symmetry.
 
         Raises
         ------
@@ -221,7 +221,7 @@ class Posterior:
         """
         if not self.contact:
             raise UsageError("sample: the image shows no contact, so there is no distribution of touching poses")
-        rng = np.random.default_rng(rng)
+        rng = np.random.default_rng(rng) if isinstance(rng, int) else rng
         cells = self._draw_cells(n, rng)
         return self.T_frame_sensor @ draw_within(self.index, self.space, cells, rng)[0]
 

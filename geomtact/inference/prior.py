@@ -28,7 +28,7 @@ _EXPECTED = (
 )
 _DRAWN = 1024  # poses of a Gaussian at a time
 _BATCHES, _TOUCHING = 8, 1000  # how often at most, and until how many touch
-_IMPOSSIBLE = -32.0  # log of a Gaussian's density over its peak, eight standard deviations out: no pose beyond that
+_FARTHEST = 8.0  # standard deviations from a Gaussian, widened by a cell, that touching poses may be
 _LOOK = (24, 32)  # rays that tell whether they do
 _TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
 
@@ -161,10 +161,10 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     count n times, that density k times: as many as it takes to see all those cells."""
     wide = prior.over_cells(index, T_frame_sensor)
     density = _over_images(index, lambda T: wide(T_frame_sensor @ T))
-    if density[index.possible].max() < _IMPOSSIBLE:
+    if density[index.possible].max() < -0.5 * _FARTHEST**2:
         raise InputError(
-            f"prior: no pose that touches the sensor lies within {np.sqrt(-2 * _IMPOSSIBLE):.0f} of its standard deviations; "
-            "check its frame and its units (metres, radians)"
+            f"prior: no pose that touches the sensor lies within about {_FARTHEST:.0f} of its standard deviations, even "
+            "widened by a grid cell; check its frame and its units (metres, radians)"
         )
     log_mass = _normalised(index.log_weight + density)
     mass = np.exp(log_mass.astype(float))

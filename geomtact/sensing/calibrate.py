@@ -131,7 +131,7 @@ def calibrated(
             f"calibrate: {len(found)} presses contradict each other: colours fitted to all but one measure the ball "
             f"{100 * abs(off):.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
         )
-    return Calibrated(sensor, found, left_out, diameters, _doubts(found, diameters, ball_diameter))
+    return Calibrated(sensor, found, left_out, diameters, _doubts(found, diameters, off))
 
 
 def _check_rest(presses: Sequence[Press]) -> None:
@@ -156,11 +156,10 @@ def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor
     return replace(sensor, colour=colour, height_noise=height_noise), diameters
 
 
-def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) -> list[str]:
-    """What speaks against a calibration by these presses, on which the ball has ``diameters`` (n,) by all others [m]."""
+def _doubts(presses: Sequence[Press], diameters: Array, off: float) -> list[str]:
+    """What speaks against a calibration by these presses, on each of which the others measure the ball's ``diameters`` (n,) [m],
+    NaN where they see no ball, wrongly by a share ``off`` in the median."""
     out = []
-    middle = float(np.nanmedian(diameters))
-    off = middle / ball_diameter - 1
     window = np.array(presses[0].mask.shape[::-1])
     spans = np.ptp([press.centre for press in presses], axis=0) / window
     if spans.min() < _SPAN:
@@ -174,12 +173,13 @@ def _doubts(presses: Sequence[Press], diameters: Array, ball_diameter: float) ->
             f"{'large' if off > 0 else 'small'} on that one: too few presses, or not all of one ball; press it in a dozen times, "
             "all over the window"
         )
-    odd = [p.name for p, told in zip(presses, diameters, strict=True) if abs(told / middle - 1) > _APART]
+    like_most = np.abs(diameters / np.nanmedian(diameters) - 1) <= _APART
+    odd = [press.name for press, fits in zip(presses, like_most, strict=True) if not fits]
     if odd:
         named = ", ".join(odd[:3]) + (f" and {len(odd) - 3} more" if len(odd) > 3 else "")
         out.append(
-            f"on {named} the ball is measured more than {100 * _APART:.0f} % otherwise than on most presses: look whether the "
-            "contact is whole and of the same ball, and leave out what is not"
+            f"on {named} no ball is seen, or one more than {100 * _APART:.0f} % larger or smaller than on most presses: look "
+            "whether the contact is whole and of the same ball, and leave out what is not"
         )
     return out
 
