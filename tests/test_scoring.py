@@ -312,7 +312,7 @@ def test_touches_are_kept_and_read_back(plug, tmp_path):
 
 
 def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
-    monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 30)
+    monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 60)
     names = ("l1", "iou", "moments", "fourier")  # one of each kind
     assert set(names) <= set(SCORERS)
     for name in names:
@@ -330,7 +330,7 @@ def test_a_fitted_score_is_kept_and_read_back(ball, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("damage", ["", "{}", "not json", json.dumps({"format": 999})])
 def test_a_damaged_fit_is_made_anew(ball, tmp_path, monkeypatch, damage):
-    monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 30)
+    monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 50)
     (tmp_path / "iou.json").write_text(damage)
     assert fitted_scorer("iou", ball.index, tmp_path).scorer.name == "iou"
     assert json.loads((tmp_path / "iou.json").read_text())["weights"] == {"iou": 1.0}
