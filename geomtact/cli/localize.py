@@ -12,7 +12,7 @@ import typer
 
 from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
 from geomtact.cli.prepare import open_localizer
-from geomtact.cli.project import given_of
+from geomtact.cli.project import given_of, resolve
 from geomtact.cli.shell import NO_CONTACT, check_folder, posterior_file, print_table, tell
 from geomtact.errors import InputError, UsageError
 
@@ -96,7 +96,6 @@ def localize(
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in the image.
     """
     from geomtact.cli.parts import parts_of
-    from geomtact.cli.project import resolve
     from geomtact.cli.sensor_poses import read_sensor_poses
     from geomtact.sensing.reading import read_metadata
 
@@ -134,12 +133,12 @@ def localize(
     made_of = metadata.get("geomtact:object")
     if made_of and len(parts) == 1 and parts[0] and Path(made_of).stem != Path(parts[0]).stem:
         tell(f"{images[0]}: was made of {made_of}, as its metadata says, and is localized on {parts[0]}")
-    found, timing = _identified(asked, parts, placed)
+    found, took = _identified(asked, parts, placed)
     if len(parts) > 1 and found.foreign:
         tell("warning: what is shown is unlike all of the parts: is it another one?")
     for warning in found.posterior.warnings:
         tell(f"warning: {warning}")
-    _give(asked, found, timing, out, _reports(report), as_json)
+    _give(asked, found, took, out, _reports(report), as_json)
     if not found.posterior.contact:
         tell(_without_contact(asked, found.posterior.observation.kind))
         raise typer.Exit(NO_CONTACT)
@@ -185,9 +184,7 @@ def _follow(asked: _Asked, camera: str | None) -> None:
         raise typer.Exit(NO_CONTACT)
 
 
-def _identified(
-    asked: _Asked, parts: Sequence[str | None], placed: SensorPoses | None
-) -> tuple[Identification, dict[str, float]]:
+def _identified(asked: _Asked, parts: Sequence[str | None], placed: SensorPoses | None) -> tuple[Identification, float]:
     """Which of ``parts`` is touched and where, and how long indexes took to prepare or read [ms]."""
     import time
     from dataclasses import replace
@@ -226,20 +223,20 @@ def _identified(
         seed=asked.seed,
         rig=None if placed is None else placed.rig,
     )
-    return found, {"prepare": took}
+    return found, took
 
 
 def _give(
-    asked: _Asked, found: Identification, timing: dict[str, float], out: Path | None, reports: list[str], as_json: bool
+    asked: _Asked, found: Identification, took: float, out: Path | None, reports: list[str], as_json: bool
 ) -> None:
-    """Print what was found, and write it into ``out``."""
+    """Print what was found, after indexes ``took`` so long [ms], and write it into ``out``."""
     import time
     from dataclasses import asdict
 
     images, posterior = asked.images, found.posterior
     began = time.perf_counter()
     modes = posterior.modes(MODES)
-    timing["modes"] = 1e3 * (time.perf_counter() - began)
+    timing = {"prepare": took, "modes": 1e3 * (time.perf_counter() - began)}
     settings = {
         "image": str(images[0]) if len(images) == 1 else [str(image) for image in images],
         "kind": asked.kind,

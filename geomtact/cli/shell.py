@@ -57,10 +57,12 @@ def posterior_file(path: Path, option: str = "") -> Path:
     ------
     InputError
     """
-    found = path / "posterior.npz" if path.is_dir() else path
-    if not found.is_file():
-        raise InputError(f"{option} {path}: no such file; give a posterior.npz, or its folder".strip())
-    return found
+    from geomtact.inference.files import file_of
+
+    try:
+        return file_of(path)
+    except InputError as error:
+        raise InputError(f"{option} {error}".strip()) from None
 
 
 def tell(text: str) -> None:

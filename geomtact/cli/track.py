@@ -13,7 +13,7 @@ from geomtact.cli.frames import Frame, all_frames, listed
 from geomtact.cli.lines import line_of, to_line
 from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
 from geomtact.cli.prepare import open_localizer
-from geomtact.cli.project import given_of
+from geomtact.cli.project import given_of, resolve
 from geomtact.cli.shell import NO_CONTACT, posterior_file, tell
 from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text
@@ -128,7 +128,6 @@ def open_track(
     most: int | None = None,
 ) -> tuple[Localizer, Iterator[tuple[float | None, Posterior]]]:
     """The localizer, and the time, if the source tells one, and the posterior of each frame; parameters as of :func:`track`."""
-    from geomtact.cli.project import resolve
 
     check_name("kind", kind, Kind)
     prior = prior and posterior_file(prior, "--prior")

@@ -91,7 +91,7 @@ def heading(path: str | Path) -> tuple[str, str, str]:
     InputError
         As of :func:`load`.
     """
-    data, meta = _read(_file(path), ("object_sha256", "frame", "meta"))
+    data, meta = _read(file_of(path), ("object_sha256", "frame", "meta"))
     return meta["object"], str(data["object_sha256"]), str(data["frame"])
 
 
@@ -104,7 +104,7 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     InputError
         The file cannot be read, or is no posterior.
     """
-    path = _file(path)
+    path = file_of(path)
     data, meta = _read(path)
     try:
         mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"], symmetry=_symmetry(data, meta))
@@ -141,15 +141,22 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     )
 
 
-def _file(path: str | Path) -> Path:
-    """The file of a posterior that is named by itself or by the folder that it lies in."""
-    return Path(path) / "posterior.npz" if Path(path).is_dir() else Path(path)
+def file_of(path: str | Path) -> Path:
+    """The file of a posterior that is named by itself, or by the folder in which it lies as posterior.npz.
 
-
-def _read(path: str | Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The arrays of ``names``, or all, and what is told in words."""
-    if not Path(path).is_file():
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    file = Path(path) / "posterior.npz" if Path(path).is_dir() else Path(path)
+    if not file.is_file():
         raise InputError(f"{path}: no such file; give a posterior.npz, or its folder")
+    return file
+
+
+def _read(path: Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The arrays of ``names``, or all, and what is told in words."""
     try:
         if not zipfile.is_zipfile(path):  # numpy would take it for a pickle
             raise ValueError("it is no .npz file, or not a whole one")

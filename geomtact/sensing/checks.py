@@ -46,7 +46,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
     seen /= max(gain, 1e-6)
     off = _off(seen, rest)
     if off < _LEAST:
-        return _not_at_rest(rest, seen) or _light_changed(gain)
+        return _background_outdated(rest, seen, gain)
     others = {
         "channels": seen[..., ::-1],
         "half": seen[::-1, ::-1],
@@ -63,7 +63,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
             f"the background seems to be of another sensor or light: half of the image is off by more than {100 * off:.0f} % of "
             "full brightness; take one with this sensor, untouched, now"
         ]
-    return _not_at_rest(rest, seen) or _light_changed(gain)
+    return _background_outdated(rest, seen, gain)
 
 
 def exposure(image: Array, name: str) -> list[str]:
@@ -93,7 +93,10 @@ def _torn(image: Array) -> list[str]:
     ]
 
 
-def _light_changed(gain: float) -> list[str]:
+def _background_outdated(rest: NDArray[np.floating], seen: NDArray[np.floating], gain: float) -> list[str]:
+    """Whether a background ``rest`` of the same sensor shows a contact, or another brightness than ``seen`` by ``gain``."""
+    if _brought_by(rest, seen) > _BRINGS:
+        return ["the background seems to show a contact: give one of the untouched gel"]
     if abs(gain - 1) <= _DRIFT:
         return []
     way = "brighter" if gain > 1 else "darker"
@@ -109,12 +112,6 @@ def _coarse(image: Array) -> NDArray[np.floating]:
     scale = _COARSE / min(h, w)
     small = cv2.resize(image.astype(np.float32), (round(w * scale), round(h * scale)), interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0))
-
-
-def _not_at_rest(rest: NDArray[np.floating], seen: NDArray[np.floating]) -> list[str]:
-    if _brought_by(rest, seen) <= _BRINGS:
-        return []
-    return ["the background seems to show a contact: give one of the untouched gel"]
 
 
 def _brought_by(rest: NDArray[np.floating], seen: NDArray[np.floating]) -> float:
