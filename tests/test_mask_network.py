@@ -23,6 +23,7 @@ from geomtact.evaluation.readings import (
 )
 from geomtact.geometry.mesh import Mesh
 from geomtact.sensing.image_file import read_image
+from geomtact.sensing.local_shape import find_contact
 from geomtact.sensing.mask_network import CHANNELS, WEIGHTS, MaskNetwork, contact_probability, seen
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
@@ -163,6 +164,37 @@ def test_the_sensor_says_how_contact_is_found_and_probabilities_reach_the_locali
     assert np.array_equal(second.mask, second.probability > 0.5) and second.shown is second.probability
 
 
+def test_by_itself_the_network_is_asked_where_light_is_blown_out_and_colours_tell_slopes(data_folder):
+    """On the gels of FOTS and ObjectFolder one channel is blown out beside every ball, on the GelSight Mini none ever is."""
+    for name, some in imprints(data_folder).items():
+        for drawn in some[::4]:
+            found, learned = (find_contact(drawn.image, drawn.background, None, way) for way in (None, "learned"))
+            assert found.method == learned.method == "learned", name
+            assert np.array_equal(found.mask, learned.mask) and np.array_equal(found.probability, learned.probability)
+    presses = data_folder / "gelslam_gsmini_balls"
+    background = read_image(presses / "background.png")
+    for path in sorted((presses / "6.310mm").glob("*.png"))[::6]:
+        image = read_image(path)
+        found, classical = (find_contact(image, background, None, way) for way in (None, "classical"))
+        assert found.method == "classical" and found.probability is None and np.array_equal(found.mask, classical.mask)
+        over = [np.clip(2 * each.astype(int), 0, 255).astype(np.uint8) for each in (image, background)]
+        assert find_contact(*over).method == "learned", "the same reading under twice the light"
+        grey = [np.repeat(each[..., 1:2], 3, -1) for each in over]
+        assert find_contact(*grey).method == "classical", "one colour tells no slope"
+
+
+def test_the_way_that_found_the_contact_is_written_down(data_folder):
+    drawn = imprints(data_folder)["fots"][0]
+    height, width = drawn.image.shape[:2]
+    plain = replace(Sensor.load("gelsight-mini"), image_size_px=(width, height))
+    for method, told in (("auto", "learned"), ("pressure", "pressure")):
+        seen = read_observation(
+            drawn.image, replace(plain, contact_method=method), "reading", background=drawn.background
+        )
+        assert seen.method == told
+    assert read_observation(np.zeros((height, width), bool), plain).method is None
+
+
 def test_an_unknown_method_is_refused(rng):
     image = rng.uniform(0, 1, (120, 160, 3))
     with pytest.raises(UsageError, match="no method named 'classicl'.*classical"):
@@ -201,9 +233,9 @@ def test_the_baseline_takes_the_largest_of_what_differs(rng):
 def test_real_imprints_are_read_and_ours_is_nearer_than_the_baseline(data_folder):
     sets = imprints(data_folder)
     assert {name: len(some) for name, some in sets.items()} == {"fots": 28, "objectfolder": 32}
-    assert set(methods()) == {"classical", "pressure", "learned", "difference"}
+    assert set(methods()) == {"auto", "classical", "pressure", "learned", "difference"}
     some = sets["objectfolder"][::4]
-    ours, baseline = (find(some, name, methods()[name]) for name in ("classical", "difference"))
+    ours, baseline = (find(some, name, methods()[name]) for name in ("auto", "difference"))
     assert (
         np.median([f.iou for f in ours]) > np.median([f.iou for f in baseline]) and max(f.centre for f in ours) < 0.03
     )

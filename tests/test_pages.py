@@ -62,7 +62,9 @@ def contacts(content):
     for key, name in {"fots": "FOTS", "objectfolder": "ObjectFolder", "gelslam": "GelSight Mini"}.items():
         for way, f in content["parts"][key]["figures"].items():
             factors = ", ".join(f"{factor:.2f}" for factor in f["factors"])
-            yield cells(row + "{centre_median:.3f}", f"{name} ({f['n']})" * (way == "classical"), way, factors, **f)
+            first = f"{name} ({f['n']})" * (way == "auto")
+            told = "auto, the default" if way == "auto" else way
+            yield cells(row + "{centre_median:.3f}", first, told, factors, **f)
 
 
 def balls(content):

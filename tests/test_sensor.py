@@ -59,7 +59,10 @@ def test_a_sensor_is_read_from_a_file_and_passed_through(tmp_path):
         ("membrane_radius_mm = 5.0", "must be 0 (flat) or exceed the window's half diagonal, 11.32 mm"),
         ("housing_depth_mm = -1", "housing_depth_mm must be >= 0"),
         ("note = 3", "note must be a str, got 3"),
-        ("contact_method = 'clasical'", "contact_method must be one of classical, pressure, learned, got 'clasical'"),
+        (
+            "contact_method = 'clasical'",
+            "contact_method must be one of auto, classical, pressure, learned, got 'clasical'",
+        ),
         ("a = = 3", "not valid TOML"),
     ],
 )

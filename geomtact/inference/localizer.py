@@ -249,7 +249,7 @@ class Localizer:
             "settings": settings
             | {
                 "kind": observation.kind,
-                "contact_method": self.sensor.contact_method if observation.kind == "reading" else None,
+                "contact_method": observation.method,
                 "heights": contact.height is not None,
                 "images": [digest(observation.image) if touched else None],
             },

@@ -94,7 +94,7 @@ def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummar
         kind = one.observation.kind
         how = f"read as {kind}"
         if kind == "reading":
-            how = f"reading, {one.sensor.contact_method} way" + " with heights" * (contact.height is not None)
+            how = f"reading, {one.observation.method} way" + " with heights" * (contact.height is not None)
         title = f"The contact{of} ({_area_mm2(contact, one.sensor):.1f} mm², {how})"
         _in_window(axes, one.sensor, np.where(contact.mask, 0.75, 0.97), title)
     words = band.add_subplot(grid[:, 2])

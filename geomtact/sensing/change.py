@@ -16,6 +16,7 @@ from geomtact.sensing.pixels import Mask, blurred, closed, filled, opened, pixel
 from geomtact.sensing.sensor import Sensor
 
 GRID = 120  # smoothing lengths along an image's shorter side
+BLOWN_OUT = 0.98  # brightness from which on a camera tells no more
 _GREY = 1 / 255
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 

@@ -10,7 +10,7 @@ the pressure that bends an elastic gel so is worked out, and the contact is wher
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import UsageError, nearest_name
 from geomtact.se3 import Array
-from geomtact.sensing.change import GRID, as_unit_rgb, background_of, change_from, check_size
+from geomtact.sensing.change import BLOWN_OUT, GRID, as_unit_rgb, background_of, change_from, check_size
 from geomtact.sensing.pixels import Mask, blurred, filled, opened, size_of, transformed
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 from geomtact.sensing.slope import integrate, of_gradient, slope_field
@@ -30,6 +30,22 @@ _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in s
 _ONE_COLOUR = 0.03  # power of the second colour over that of the first, under which there is but one: a white gel's
 _EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse, from which on slopes are seen
 _SURELY = 0.501  # probability of what counts as contact, at least
+_UNTOLD = 0.01  # share of what is felt that is blown out, from which on colours are no linear image of slopes
+
+
+class FoundContact(NamedTuple):
+    """A contact as found in a reading.
+
+    Attributes
+    ----------
+    mask : (H, W) bool, where the object touches
+    probability : (H, W) float32 that each pixel is in contact; None where ``method`` does not tell it
+    method : by which it was found, one of ``CONTACT_METHODS`` but "auto"
+    """
+
+    mask: Mask
+    probability: NDArray[np.float32] | None
+    method: str
 
 
 def contact_mask(
@@ -44,8 +60,9 @@ def contact_mask(
         which serves for contacts much smaller than the window
     sensor : gives the pixel pitch where columns and rows differ, and the size to check; None: square pixels
     method : "classical": within the rim where the gel is steepest, by its slope, which colours tell up to a factor; "pressure":
-        where, by that slope, a thick elastic gel is pressed on; or "learned": by a network trained on simulated readings alone,
-        where colours tell the slope. None: as the sensor says, "classical" without one
+        where, by that slope, a thick elastic gel is pressed on; "learned": by a network trained on simulated readings alone,
+        where colours tell the slope; or "auto": learned where more than a hundredth of what changes is blown out, so that
+        colours tell the slope no more, else classical. None: as the sensor says, "auto" without one
 
     Returns
     -------
@@ -58,13 +75,13 @@ def contact_mask(
     UsageError
         There is no such ``method``.
     """
-    return find_contact(image, background, sensor, method)[0]
+    return find_contact(image, background, sensor, method).mask
 
 
 def find_contact(
     image: Any, background: Any = None, sensor: Sensor | str | None = None, method: str | None = None
-) -> tuple[Mask, NDArray[np.float32] | None]:
-    """As :func:`contact_mask`, and the probability (H, W) that each pixel is in contact, where the ``method`` tells that."""
+) -> FoundContact:
+    """As :func:`contact_mask`, with what else is known of how it was found."""
     if method is not None and method not in CONTACT_METHODS:
         raise UsageError(f"contact_mask: no method named {method!r}{nearest_name(str(method), CONTACT_METHODS)}")
     image = as_unit_rgb(image, "image")
@@ -75,12 +92,10 @@ def find_contact(
         pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
         check_size(image, sensor, "image")
     reference = None if background is None else background_of(background, image)
-    return contact_of(image, reference, method, pitch)
+    return contact_of(image, reference, method or CONTACT_METHODS[0], pitch)
 
 
-def contact_of(
-    image: Array, reference: Array | None, method: str | None, pitch: Array
-) -> tuple[Mask, NDArray[np.float32] | None]:
+def contact_of(image: Array, reference: Array | None, method: str, pitch: Array) -> FoundContact:
     """As :func:`find_contact`, of images (H, W, 3) of 0..1 whose columns and rows are as far apart as ``pitch`` (2,) says, in the
     smaller of both."""
     size = image.shape[1::-1]
@@ -93,24 +108,35 @@ def contact_of(
         if noise_share > _NOISE_SHARE:
             sigma *= min(noise_share / _NOISE_SHARE, 2.0)
             change, felt, strong, _ = change_from(image, reference, sigma)
+    if method == "auto":
+        method = "learned" if _blown_out(felt, image, reference) > _UNTOLD else "classical"
     if not felt.any():
-        return np.zeros(size[::-1], bool), None
-    if method == "learned" and not _colours(change, felt)[2]:
+        return FoundContact(np.zeros(size[::-1], bool), None, method)
+    if method == "learned" and _colours(change, felt)[2]:
+        method = "classical"
+    if method == "learned":
         probability = _by_network(change, image, felt)
         mask = _components(filled(probability > 0.5), probability, strong, sigma)
         # what is no contact by its size or for want of change is none by its probability either
         probability = np.where(mask, np.maximum(probability, _SURELY), np.where(probability > 0.5, 0, probability))
         full = np.asarray(cv2.resize(probability, size, interpolation=cv2.INTER_LINEAR), np.float32)
-        return full > 0.5, full
+        return FoundContact(full > 0.5, full, method)
     pressed, mask = _by_colour(change, felt, strong, sigma, pitch, _by_pressure if method == "pressure" else _by_rim)
     mask = _components(mask, pressed, strong, sigma)
-    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5), None
+    full = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    return FoundContact(np.asarray(full > 0.5), None, method)
 
 
 def _on_grid(image: Array) -> Array:
     """``image`` (H, W, 3) on ``GRID`` pixels along its shorter side: finer ones tell nothing that smoothing leaves."""
     share = min(1.0, GRID / min(image.shape[:2]))
     return np.asarray(cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
+
+
+def _blown_out(felt: Mask, *images: Array | None) -> float:
+    """Share of what is ``felt`` (H, W) where a channel of one of the ``images`` (H, W, 3) is as bright as it can be."""
+    whole = [(image >= BLOWN_OUT).any(-1) for image in images if image is not None]
+    return float(np.logical_or.reduce(whole)[felt].mean()) if felt.any() else 0.0
 
 
 def _colours(change: Array, felt: Mask) -> tuple[Array, Array, bool]:

@@ -33,12 +33,14 @@ class Observation:
     ----------
     contact : Contact on the sensor's image grid; an all-False mask means that nothing touches
     kind : "mask", "height" or "reading", as given or as decided
+    method : by which the contact was found in a reading, one of ``CONTACT_METHODS`` but "auto"; None for other kinds
     warnings : what was assumed on the way, one line each
     image : the array as read: (H, W) or (H, W, 3), alpha dropped
     """
 
     contact: Contact
     kind: str
+    method: str | None = None
     warnings: list[str] = field(default_factory=list)
     image: NDArray[Any] = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
@@ -70,6 +72,7 @@ def read_observation(
     if kind not in KINDS:
         raise UsageError(f"unknown kind {kind!r}{nearest_name(str(kind), KINDS)}")
     warnings: list[str] = []
+    method = None
     name, array = _load(image, "image", warnings)
     check_size(array, sensor, name)
     if kind == "auto":
@@ -88,7 +91,7 @@ def read_observation(
                 f"{name}: the heights fade away, as beside a contact; what is over half as deep counts as contact"
             )
     else:
-        contact = _reading(array, name, sensor, background, warnings)
+        contact, method = _reading(array, name, sensor, background, warnings)
     share, area = float(contact.mask.mean()), float(contact.mask.sum() * sensor.pixel_area(contact.mask.shape))
     if share == 1:
         warnings.append(f"{name}: every pixel is in contact: the contact fills the image, so its outline is not seen")
@@ -98,7 +101,7 @@ def read_observation(
         )
     elif 0 < area < _DUST:
         warnings.append(f"{name}: the contact covers {1e6 * area:.2g} mm2, as dust does: it tells next to nothing")
-    return Observation(contact, kind, warnings, array)
+    return Observation(contact, kind, method, warnings, array)
 
 
 def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any]]:
@@ -218,7 +221,10 @@ def _height(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str])
     return np.maximum(height, 0).astype(np.float32)
 
 
-def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, warnings: list[str]) -> Contact:
+def _reading(
+    array: NDArray[Any], name: str, sensor: Sensor, background: Any, warnings: list[str]
+) -> tuple[Contact, str]:
+    """The contact in a reading, and the method by which it was found."""
     reference = None
     if background is None:
         untold = "" if sensor.colour is None else ", and heights are not told without one"
@@ -235,14 +241,14 @@ def _reading(array: NDArray[Any], name: str, sensor: Sensor, background: Any, wa
         )
     found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))
     warnings.extend(f"{name}: {fault}" for fault in found)
-    mask, probability = find_contact(seen, reference, sensor)
+    touch = find_contact(seen, reference, sensor)
     height = None
     if sensor.colour is not None and reference is not None:
         if grey:
             warnings.append(f"{name}: the image is grey, so the sensor's colours tell no heights: give it in colour")
         else:
             height = contact_height(seen, reference, sensor)
-    return Contact(mask, height, probability=probability)
+    return Contact(touch.mask, height, probability=touch.probability), touch.method
 
 
 def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:

@@ -40,7 +40,7 @@ _REQUIRED = ("name", "image_size_px", "pixel_pitch_mm", "camera_distance_mm", "m
 _YAML = (".yaml", ".yml")
 
 HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
-CONTACT_METHODS = ("classical", "pressure", "learned")  # of finding the contact in a reading, the default first
+CONTACT_METHODS = ("auto", "classical", "pressure", "learned")  # of finding the contact in a reading, the default first
 
 
 @dataclass(frozen=True)
