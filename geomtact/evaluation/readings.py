@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import InputError
 from geomtact.evaluation.study import mean_with_interval
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
+from geomtact.se3 import Array
 from geomtact.sensing.calibrate import Calibrated, calibrated, measured_diameter
 from geomtact.sensing.image_file import read_image
 from geomtact.sensing.local_shape import contact_mask
@@ -168,7 +169,7 @@ def find(imprints: Sequence[Imprint], name: str, method: Method) -> list[Found]:
         began = time.perf_counter()
         masks.append(method(imprint.image, imprint.background))
         times.append(1e3 * (time.perf_counter() - began))
-    ious = np.array([[overlap(mask, i.circle, f) for f in _FACTORS] for mask, i in zip(masks, imprints, strict=True)])
+    ious = np.array([overlap(mask, i.circle, _FACTORS) for mask, i in zip(masks, imprints, strict=True)])
     suits = [int(np.median(ious[1 - half :: 2], 0).argmax()) for half in (0, 1)]
     out = []
     for k, (mask, imprint) in enumerate(zip(masks, imprints, strict=True)):
@@ -178,11 +179,12 @@ def find(imprints: Sequence[Imprint], name: str, method: Method) -> list[Found]:
     return out
 
 
-def overlap(mask: Mask, circle: Sequence[float], factor: float) -> float:
-    """Intersection over union of ``mask`` (H, W) with a ``circle`` made smaller by ``factor``."""
+def overlap(mask: Mask, circle: Sequence[float], factors: ArrayLike) -> Array:
+    """Intersection over union (...,) of ``mask`` (H, W) with a ``circle`` made smaller by each of the ``factors`` (...,)."""
     v, u = np.indices(mask.shape)
-    disk = np.hypot(u - circle[0], v - circle[1]) <= circle[2] / factor
-    return float((mask & disk).sum() / max((mask | disk).sum(), 1))
+    far, radii = np.hypot(u - circle[0], v - circle[1]), circle[2] / np.asarray(factors, float)
+    within, both = (np.searchsorted(np.sort(some.ravel()), radii, side="right") for some in (far, far[mask]))
+    return np.asarray(both / np.maximum(mask.sum() + within - both, 1))
 
 
 def off_centre(mask: Mask, circle: Sequence[float]) -> float:

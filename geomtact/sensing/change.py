@@ -31,7 +31,7 @@ def change_from(image: Any, background: Any, sigma: float) -> tuple[Array, Mask,
     """The smoothed change (H, W, 3) from the background, where it is felt and where strongly so, and its noise."""
     smooth = blurred(image, sigma)
     reference = smooth_background(smooth) if background is None else blurred(background, sigma)
-    change = _without_light_drift(smooth, reference, max(1, round(sigma)))
+    change = _without_light_drift(smooth, reference, max(2, round(sigma)))
     # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
     floor = 0.0 if background is not None else float(np.median(size_of(change)))
     return change, *_felt(change, sigma, floor)
