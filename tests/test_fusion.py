@@ -387,6 +387,9 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
     for text, words in [
         ("{}", "expected {"),
         (json.dumps({"T_world_sensor": sensors[:1].tolist()}), "for each of 2 images, got 1"),
+        (json.dumps({"T_world_sensor": sensors[0].tolist()}), "got one 4x4; put it into a list"),
+        (json.dumps({"T_world_sensor": sensors[:, :3].tolist()}), "got 2 of 3x4"),
+        (json.dumps({"T_world_sensor": [sensors[0].tolist(), [1, 2]]}), "got 2, not all 4x4"),
         (json.dumps({"T_world_sensor": (2 * sensors).tolist()}), "no rotation"),
         (json.dumps({"T_world_sensor": sensors.tolist(), "std": 1}), "unknown key 'std'"),
         (json.dumps({"T_world_sensor": sensors.tolist(), "std_mm": -1}), "std_mm must be a number >= 0"),

@@ -328,6 +328,12 @@ def test_an_image_without_contact_says_so(plug, uniform_poses, rng):
         posterior.sample(3, rng)
 
 
+def test_a_seed_draws_what_its_generator_draws(plug, posteriors):
+    posterior = posteriors(plug)
+    for seed in (7, np.int64(7)):
+        assert np.array_equal(posterior.sample(20, seed), posterior.sample(20, np.random.default_rng(7)))
+
+
 # --- on disk
 
 
@@ -351,6 +357,8 @@ def test_a_posterior_survives_the_disk(name, request, a_touch, samples, cache_di
         assert np.abs(a.T - b.T).max() < 1e-9 and b.probability == pytest.approx(a.probability, abs=1e-5)
         assert np.array_equal(a.covariance, b.covariance) and np.array_equal(a.observable, b.observable)
     assert [p.name for p in tmp_path.iterdir()] == ["posterior.npz"]
+    folder = Posterior.load(tmp_path, cache_dir)
+    assert np.array_equal(folder.log_prob, again.log_prob) and np.array_equal(folder.cells, again.cells)
 
 
 def test_the_file_holds_what_is_promised_and_no_pickles(plug, posteriors, tmp_path):
@@ -377,8 +385,9 @@ def test_what_is_no_posterior_is_refused(tmp_path, content):
     with pytest.raises(InputError, match="not a posterior that geomtact saved") as error:
         Posterior.load(path)
     assert "\n" not in str(error.value)
-    with pytest.raises(InputError):
-        Posterior.load(tmp_path / "nowhere.npz")
+    for nowhere in (tmp_path / "nowhere.npz", tmp_path):
+        with pytest.raises(InputError, match="no such file; give a posterior.npz, or its folder"):
+            Posterior.load(nowhere)
 
 
 def test_a_truncated_posterior_is_refused(plug, posteriors, tmp_path):

@@ -267,6 +267,8 @@ def test_a_background_of_another_size_is_refused(background, tmp_path):
         contact_mask(background, background, "digit")
     with pytest.raises(ImageError, match=r"image: expected an RGB image \(H, W, 3\)"):
         contact_mask(background[..., 0])
+    with pytest.raises(ImageError, match=r"image: expected an RGB image \(H, W, 3\) or its path, got none; give it"):
+        contact_mask(None, background)
 
 
 @pytest.mark.parametrize(
@@ -350,13 +352,22 @@ def test_metadata_of_other_files_is_empty_and_a_broken_pose_is_named(tmp_path, b
         read_metadata(tmp_path / "wrong.png")
 
 
-def test_a_mask_that_hardly_is_a_touch_is_told_of():
-    dot = np.zeros(SHAPE, bool)
+def test_a_mask_that_hardly_is_a_touch_is_told_of(rng):
+    dot, knurled = np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
     dot[100, 100] = True
-    for mask, said in ((dot, "as dust does"), (~MASK, "if that is where nothing touches, invert it")):
+    knurled[20:200:20, 20:200:20] = True  # 81 patches of one pixel, as many as a part may press
+    noise, dirt = (rng.random(SHAPE) < share for share in (0.3, 0.003))
+    told = {
+        "as dust does": dot,
+        "if that is where nothing touches, invert it": ~MASK,
+        "pieces, as noise does": noise,
+        "pieces, as noise": MASK | dirt,
+    }
+    for said, mask in told.items():
         (warning,) = read_observation(mask, MINI).warnings
         assert said in warning
-    assert read_observation(MASK, MINI).warnings == []
+    for mask in (MASK, knurled):
+        assert read_observation(mask, MINI).warnings == []
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):

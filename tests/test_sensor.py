@@ -88,6 +88,7 @@ def test_what_is_added_wrongly_is_named(change, message):
             "[6e-5, 5e-5]",
             "pixel_pitch_mm [6e-05, 5e-05] is under a micrometre; give millimetres a pixel",
         ),
+        ("[0.06, 0.05]", "[60.0, 50.0]", "pixel_pitch_mm [60.0, 50.0] is over a centimetre; give millimetres a pixel"),
         ("[0.06, 0.05]", "['a', 'b']", "pixel_pitch_mm must be two numbers"),
     ],
 )

@@ -221,7 +221,7 @@ class Posterior:
         """
         if not self.contact:
             raise UsageError("sample: the image shows no contact, so there is no distribution of touching poses")
-        rng = np.random.default_rng(rng) if isinstance(rng, int) else rng
+        rng = np.random.default_rng(rng)
         cells = self._draw_cells(n, rng)
         return self.T_frame_sensor @ draw_within(self.index, self.space, cells, rng)[0]
 

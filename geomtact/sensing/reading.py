@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -22,6 +23,7 @@ __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observ
 
 KINDS = ("auto", "mask", "height", "reading")
 _DUST = 0.1e-6  # m^2 of contact, under which a touch tells nothing (docs/stability.md)
+_SHATTERED = 100  # pieces of a mask that no part presses at once
 _NEGATIVE = (0.5, 0.95)  # share in contact of a mask that may be a negative, if all of its border is
 
 
@@ -99,6 +101,8 @@ def read_observation(
         warnings.append(
             f"{name}: {100 * share:.0f} % of the mask is contact; if that is where nothing touches, invert it"
         )
+    elif kind == "mask" and (pieces := _pieces(contact.mask)) > _SHATTERED:
+        warnings.append(f"{name}: the mask falls into {pieces} pieces, as noise does; smooth it, or give the reading")
     elif 0 < area < _DUST:
         warnings.append(f"{name}: the contact covers {1e6 * area:.2g} mm2, as dust does: it tells next to nothing")
     return Observation(contact, kind, method, warnings, array)
@@ -142,6 +146,11 @@ def _grey(array: NDArray[Any]) -> NDArray[Any]:
 def _colourless(array: NDArray[Any]) -> bool:
     """Whether the channels of an image (H, W, C) are alike."""
     return bool((array == array[..., :1]).all())
+
+
+def _pieces(mask: NDArray[np.bool_]) -> int:
+    """Into how many a mask (H, W) falls; pixels that meet at a corner do not hang together."""
+    return cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[0] - 1
 
 
 def _framed(mask: NDArray[np.bool_]) -> bool:
