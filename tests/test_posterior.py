@@ -332,6 +332,8 @@ def test_a_seed_draws_what_its_generator_draws(plug, posteriors):
     posterior = posteriors(plug)
     for seed in (7, np.int64(7)):
         assert np.array_equal(posterior.sample(20, seed), posterior.sample(20, np.random.default_rng(7)))
+    with pytest.raises(UsageError, match="expected a generator or a seed, got None"):
+        posterior.sample(20, None)
 
 
 # --- on disk

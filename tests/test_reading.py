@@ -2,6 +2,7 @@
 
 import csv
 import re
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -353,20 +354,20 @@ def test_metadata_of_other_files_is_empty_and_a_broken_pose_is_named(tmp_path, b
 
 
 def test_a_mask_that_hardly_is_a_touch_is_told_of(rng):
-    dot, knurled = np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
+    dot = np.zeros(SHAPE, bool)
     dot[100, 100] = True
-    knurled[20:200:20, 20:200:20] = True  # 81 patches of one pixel, as many as a part may press
-    noise, dirt = (rng.random(SHAPE) < share for share in (0.3, 0.003))
+    rows, columns = np.indices(SHAPE)
+    knurl = (rows % 16 < 6) & (columns % 16 < 6)  # 300 tips of 0.38 mm, 1 mm apart
+    noise, mostly, dirt = (rng.random(SHAPE) < share for share in (0.3, 0.9, 0.003))
     told = {
         "as dust does": dot,
         "if that is where nothing touches, invert it": ~MASK,
-        "pieces, as noise does": noise,
-        "pieces, as noise": MASK | dirt,
     }
-    for said, mask in told.items():
+    told = [*told.items(), *(("specks and holes as small as dust", mask) for mask in (noise, mostly, MASK | dirt))]
+    for said, mask in told:
         (warning,) = read_observation(mask, MINI).warnings
         assert said in warning
-    for mask in (MASK, knurled):
+    for mask in (MASK, knurl):
         assert read_observation(mask, MINI).warnings == []
 
 
@@ -449,14 +450,20 @@ def test_real_gelsight_mini_presses_lie_on_the_circles_drawn_by_eye(data_folder)
 
 @pytest.mark.parametrize("name", ["fots", "objectfolder"])
 def test_other_real_gels_agree_with_their_makers_circles(data_folder, name):
-    """Of balls on a soft gel and a firm one, with one channel blown out: the imprint is up to a fifth wider than the contact."""
+    """Of balls on a soft gel and a firm one, with one channel blown out, so that the classical rim lies too far out on the soft
+    one: an imprint is a little wider than the contact."""
     drawn = imprints(data_folder)[name]
-    found = find(drawn, "auto", contact_mask)
-    iou, off = (np.array([getattr(each, value) for each in found]) for value in ("iou", "centre"))
-    assert all(0.95 < each.factor < 1.2 for each in found)
-    assert np.median(iou) > 0.82 and iou.min() > 0.66
-    assert np.median(off) < 0.02 and off.max() < 0.05
-    assert not contact_mask(drawn[0].background, drawn[0].background).any()
+    for method, overlap, least, off, farthest in (
+        ("auto", 0.82, 0.66, 0.02, 0.05),
+        ("pressure", 0.77, 0.65, 0.03, 0.08),
+        ("classical", 0.7, 0.4, 0.045, 0.08),
+    ):
+        found = find(drawn, method, partial(contact_mask, method=method))
+        iou, centre = (np.array([getattr(each, value) for each in found]) for value in ("iou", "centre"))
+        assert np.median(iou) > overlap and iou.min() > least, method
+        assert np.median(centre) < off and centre.max() < farthest, method
+        assert method != "auto" or all(0.95 < each.factor < 1.2 for each in found)
+        assert not contact_mask(drawn[0].background, drawn[0].background, method=method).any()
 
 
 def test_a_white_gel_is_touched_where_it_darkens(data_folder):

@@ -210,6 +210,7 @@ def _said(touches: Sequence[Posterior]) -> dict[str, Any]:
     return {
         "T_world_sensor": [t.T_frame_sensor.tolist() for t in touches],
         "touched": [t.contact for t in touches],
+        "contact_methods": [t.settings["contact_method"] for t in touches],
         "images": [image for t in touches for image in t.settings["images"]],
     }
 

@@ -217,8 +217,12 @@ class Posterior:
         Raises
         ------
         UsageError
-            There is no contact, so no distribution over touching poses.
+            There is no contact, so no distribution over touching poses; or neither generator nor seed.
         """
+        if rng is None:
+            raise UsageError(
+                "sample: expected a generator or a seed, got None; give one, so that it can be drawn again"
+            )
         if not self.contact:
             raise UsageError("sample: the image shows no contact, so there is no distribution of touching poses")
         rng = np.random.default_rng(rng)

@@ -16,7 +16,6 @@ from geomtact.sensing.pixels import Mask, blurred, closed, filled, opened, pixel
 from geomtact.sensing.sensor import Sensor
 
 GRID = 120  # smoothing lengths along an image's shorter side
-BLOWN_OUT = 0.98  # brightness from which on a camera tells no more
 _GREY = 1 / 255
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 
@@ -31,7 +30,7 @@ def change_from(image: Any, background: Any, sigma: float) -> tuple[Array, Mask,
     """The smoothed change (H, W, 3) from the background, where it is felt and where strongly so, and its noise."""
     smooth = blurred(image, sigma)
     reference = smooth_background(smooth) if background is None else blurred(background, sigma)
-    change = _without_light_drift(smooth, reference, max(2, round(sigma)))
+    change = _without_light_drift(smooth, reference, max(1, round(sigma)))
     # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
     floor = 0.0 if background is not None else float(np.median(size_of(change)))
     return change, *_felt(change, sigma, floor)

@@ -3,8 +3,8 @@
 The difference from the background is taken as a linear image of the gel's slope. Its two strongest colour directions
 span the slope; the 2x2 map that is left unknown is the one that makes the slope field a gradient (free of curl). Its
 integral is the gel's indentation up to a factor; the rim of the contact is where, on the way up, the gel is steepest
-(``registration/rim.py`` makes of a rim what a pose is held against). Or
-the pressure that bends an elastic gel so is worked out, and the contact is where there is any. A network does without.
+(``registration/rim.py`` makes of a rim what a pose is held against). Or the pressure that bends an elastic gel so is worked
+out, and the contact is where there is any. A network needs no linear image: it is asked where light is blown out.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import UsageError, nearest_name
 from geomtact.se3 import Array
-from geomtact.sensing.change import BLOWN_OUT, GRID, as_unit_rgb, background_of, change_from, check_size
+from geomtact.sensing.change import GRID, as_unit_rgb, background_of, change_from, check_size
 from geomtact.sensing.pixels import Mask, blurred, filled, opened, size_of, transformed
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 from geomtact.sensing.slope import integrate, of_gradient, slope_field
@@ -30,7 +30,9 @@ _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in s
 _ONE_COLOUR = 0.03  # power of the second colour over that of the first, under which there is but one: a white gel's
 _EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse, from which on slopes are seen
 _SURELY = 0.501  # probability of what counts as contact, at least
-_UNTOLD = 0.01  # share of what is felt that is blown out, from which on colours are no linear image of slopes
+# Brightness from which on a camera tells no more, or less than elsewhere; and the share of what is felt that is so bright, more
+# than a glint, from which on colours are no linear image of slopes
+_BLOWN_OUT, _UNTOLD = 0.95, 0.01
 
 
 class FoundContact(NamedTuple):
@@ -40,7 +42,7 @@ class FoundContact(NamedTuple):
     ----------
     mask : (H, W) bool, where the object touches
     probability : (H, W) float32 that each pixel is in contact; None where ``method`` does not tell it
-    method : by which it was found, one of ``CONTACT_METHODS`` but "auto"
+    method : by which it was found, one of ``CONTACT_METHODS`` but "auto"; "classical" where all change is along one colour
     """
 
     mask: Mask
@@ -60,9 +62,10 @@ def contact_mask(
         which serves for contacts much smaller than the window
     sensor : gives the pixel pitch where columns and rows differ, and the size to check; None: square pixels
     method : "classical": within the rim where the gel is steepest, by its slope, which colours tell up to a factor; "pressure":
-        where, by that slope, a thick elastic gel is pressed on; "learned": by a network trained on simulated readings alone,
-        where colours tell the slope; or "auto": learned where more than a hundredth of what changes is blown out, so that
-        colours tell the slope no more, else classical. None: as the sensor says, "auto" without one
+        where, by that slope, a thick elastic gel is pressed on; "learned": by a network trained on simulated readings alone;
+        or "auto": learned where more than a hundredth of what changes is blown out, else classical. On a white gel, all of
+        whose change is along one colour, each takes what changes more than half as much as anywhere. None: as the sensor
+        says, "auto" without one
 
     Returns
     -------
@@ -108,11 +111,11 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
         if noise_share > _NOISE_SHARE:
             sigma *= min(noise_share / _NOISE_SHARE, 2.0)
             change, felt, strong, _ = change_from(image, reference, sigma)
+    if not felt.any():
+        return FoundContact(np.zeros(size[::-1], bool), None, "classical" if method == "auto" else method)
     if method == "auto":
         method = "learned" if _blown_out(felt, image, reference) > _UNTOLD else "classical"
-    if not felt.any():
-        return FoundContact(np.zeros(size[::-1], bool), None, method)
-    if method == "learned" and _colours(change, felt)[2]:
+    if _colours(change, felt)[2]:
         method = "classical"
     if method == "learned":
         probability = _by_network(change, image, felt)
@@ -134,9 +137,9 @@ def _on_grid(image: Array) -> Array:
 
 
 def _blown_out(felt: Mask, *images: Array | None) -> float:
-    """Share of what is ``felt`` (H, W) where a channel of one of the ``images`` (H, W, 3) is as bright as it can be."""
-    whole = [(image >= BLOWN_OUT).any(-1) for image in images if image is not None]
-    return float(np.logical_or.reduce(whole)[felt].mean()) if felt.any() else 0.0
+    """Share of what is ``felt`` (H, W) where a channel of one of the ``images`` (H, W, 3) is about as bright as it can be."""
+    bright = [(image >= _BLOWN_OUT).any(-1) for image in images if image is not None]
+    return float(np.logical_or.reduce(bright)[felt].mean())
 
 
 def _colours(change: Array, felt: Mask) -> tuple[Array, Array, bool]:

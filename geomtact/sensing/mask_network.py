@@ -17,13 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors.torch import load_file
 from torch import nn
 
-from geomtact.sensing.change import BLOWN_OUT
-
 WEIGHTS = Path(__file__).with_name("mask_network.safetensors")
 WIDTHS = (12, 24, 48, 64)  # channels, at each halving
 _SIDE = 60  # px of the shorter side of what it sees
 _STEP = 8  # px that sides are multiples of: they are halved three times
 CHANNELS = 9  # three of change, three of what is blown out, three of how bright it is at rest
+_BLOWN_OUT = 0.98  # brightness from which on
 
 Image = NDArray[np.float32]
 
@@ -70,7 +69,7 @@ def seen(change: ArrayLike, image: ArrayLike) -> Image:
     image = np.asarray(image, np.float32)
     small = to_side(np.asarray(change, np.float32))
     strongest = float(np.quantile(np.linalg.norm(small, axis=-1), 0.98))
-    blown_out = to_side((image >= BLOWN_OUT).astype(np.float32))
+    blown_out = to_side((image >= _BLOWN_OUT).astype(np.float32))
     all_of_it = [small / max(strongest, 1e-6), blown_out, to_side(image) - small]
     return np.ascontiguousarray(np.concatenate(all_of_it, -1).transpose(2, 0, 1))
 

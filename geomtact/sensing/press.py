@@ -54,7 +54,7 @@ def find_presses(
             continue
         seen.append(image)
         change, felt = colour_change(image, reference)
-        mask = contact_of(image, reference, "classical", np.array([1.0, stretch]) / min(1.0, stretch)).mask
+        mask = contact_of(image, reference, "auto", np.array([1.0, stretch]) / min(1.0, stretch)).mask
         if not mask.any():
             left_out[name] = "no contact was found"
             continue

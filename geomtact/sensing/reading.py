@@ -23,7 +23,7 @@ __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observ
 
 KINDS = ("auto", "mask", "height", "reading")
 _DUST = 0.1e-6  # m^2 of contact, under which a touch tells nothing (docs/stability.md)
-_SHATTERED = 100  # pieces of a mask that no part presses at once
+_SPECKS = 100  # pieces and holes no larger than dust, that a mask of one touch has at most
 _NEGATIVE = (0.5, 0.95)  # share in contact of a mask that may be a negative, if all of its border is
 
 
@@ -35,16 +35,16 @@ class Observation:
     ----------
     contact : Contact on the sensor's image grid; an all-False mask means that nothing touches
     kind : "mask", "height" or "reading", as given or as decided
-    method : by which the contact was found in a reading, one of ``CONTACT_METHODS`` but "auto"; None for other kinds
     warnings : what was assumed on the way, one line each
     image : the array as read: (H, W) or (H, W, 3), alpha dropped
+    method : by which the contact was found in a reading, one of ``CONTACT_METHODS`` but "auto"; None for other kinds
     """
 
     contact: Contact
     kind: str
-    method: str | None = None
     warnings: list[str] = field(default_factory=list)
     image: NDArray[Any] = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    method: str | None = None
 
 
 def read_observation(
@@ -101,11 +101,13 @@ def read_observation(
         warnings.append(
             f"{name}: {100 * share:.0f} % of the mask is contact; if that is where nothing touches, invert it"
         )
-    elif kind == "mask" and (pieces := _pieces(contact.mask)) > _SHATTERED:
-        warnings.append(f"{name}: the mask falls into {pieces} pieces, as noise does; smooth it, or give the reading")
+    elif kind == "mask" and (specks := _specks(contact.mask, sensor)) > _SPECKS:
+        warnings.append(
+            f"{name}: the mask has {specks} specks and holes as small as dust, as noise has; smooth it, or give the reading"
+        )
     elif 0 < area < _DUST:
         warnings.append(f"{name}: the contact covers {1e6 * area:.2g} mm2, as dust does: it tells next to nothing")
-    return Observation(contact, kind, method, warnings, array)
+    return Observation(contact, kind, warnings, array, method)
 
 
 def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any]]:
@@ -148,9 +150,13 @@ def _colourless(array: NDArray[Any]) -> bool:
     return bool((array == array[..., :1]).all())
 
 
-def _pieces(mask: NDArray[np.bool_]) -> int:
-    """Into how many a mask (H, W) falls; pixels that meet at a corner do not hang together."""
-    return cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[0] - 1
+def _specks(mask: NDArray[np.bool_], sensor: Sensor) -> int:
+    """How many pieces and holes of a mask (H, W) are as small as dust."""
+    largest, found = _DUST / sensor.pixel_area(mask.shape), 0
+    for each in (mask, ~mask):
+        _, labels = cv2.connectedComponents(each.astype(np.uint8), connectivity=4)
+        found += int((np.bincount(labels[each])[1:] <= largest).sum())
+    return found
 
 
 def _framed(mask: NDArray[np.bool_]) -> bool:
@@ -251,6 +257,11 @@ def _reading(
     found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))
     warnings.extend(f"{name}: {fault}" for fault in found)
     touch = find_contact(seen, reference, sensor)
+    if touch.method != sensor.contact_method != "auto":
+        warnings.append(
+            f"{name}: all change is along one colour, which tells no slope, so the {sensor.contact_method} way cannot be taken; "
+            "what changes more than half as much as anywhere counts as contact"
+        )
     height = None
     if sensor.colour is not None and reference is not None:
         if grey:
