@@ -127,6 +127,15 @@ def log(T: ArrayLike) -> Array:
     return np.concatenate([w, (V_inv @ T[..., :3, 3, None])[..., 0]], -1)
 
 
+def adjoint(T: ArrayLike) -> Array:
+    """Matrices (..., 6, 6) that carry twists over ``T`` (..., 4, 4): T exp(xi) = exp(adjoint(T) xi) T (Barfoot, eq. 7.40)."""
+    T = np.asarray(T, float)
+    R, out = T[..., :3, :3], np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., 3:, :3] = hat(T[..., :3, 3]) @ R
+    return out
+
+
 def random_rotations(n: int, rng: np.random.Generator) -> Array:
     """``n`` rotations (n, 3, 3) uniform in the Haar measure (Shoemake 1992: normalised Gaussian quaternions)."""
     q = rng.normal(size=(n, 4))

@@ -15,6 +15,7 @@ from geomtact.errors import InputError, NoPoseAgreesError, UsageError
 from geomtact.evaluation.sensors_study import make_scenes
 from geomtact.evaluation.touches import random_touches
 from geomtact.inference.fusion import _badly_agreed, _shares, disagreement, fuse
+from geomtact.inference.rig import rig_covariance
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
 
@@ -422,6 +423,19 @@ def test_a_jaw_on_a_plain_rod_says_that_it_may_be_shifted(make_localizer):
     assert np.linalg.norm(mode.observable @ across) > 0.9
 
 
+def test_what_a_rig_leaves_open_of_a_pose_is_what_its_errors_make_of_it(rng):
+    T, sensors = se3.exp(rng.normal(size=6)), se3.exp(0.3 * rng.normal(size=(2, 6)))
+    rig = RigStd(2e-3, 0.5e-3)
+    eta = rng.normal(size=(40_000, 6)) * np.r_[[rig.rotation] * 3, [rig.translation] * 3]
+    sampled = []
+    for sensor in sensors:
+        xi = se3.log(se3.inverse(T) @ sensor @ se3.exp(eta) @ se3.inverse(sensor) @ T)
+        sampled.append(xi.T @ xi / len(xi))
+    told = rig_covariance(T, sensors, rig)
+    whiten = np.linalg.inv(np.linalg.cholesky(told))
+    assert whiten @ np.mean(sampled, 0) @ whiten.T == pytest.approx(np.eye(6), abs=0.05)
+
+
 def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
     """Each of the sensors but the first off by 5 mm, in a direction of its own: unless the rig is said to be known no better."""
     rng = np.random.default_rng(5)
@@ -445,4 +459,7 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
     assert told["right"] <= 1 and told["off"] >= 4 and told["known to be"] == 0, told
     exact = plug.localize(masks, "mask", T_world_sensor=off, rig=RigStd())
     assert np.array_equal(exact.log_prob, last["off"].log_prob)
+    # a mode is told no better than the rig
+    for mode in last["known to be"].modes(3):
+        assert np.linalg.eigvalsh(mode.covariance[3:, 3:]).min() >= 0.99 * 5e-3**2
     assert _badly_agreed({"unexplained_nats": None}) and not _badly_agreed({})

@@ -225,9 +225,10 @@ def test_a_gaussian_prior_is_where_it_says(localizer, uniform_poses):
     assert again == pytest.approx(mass, abs=0.06)  # four deviations of a share of a thousand draws
 
 
-@pytest.mark.parametrize("std", [0.02, 0.1, 0.5])
-def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_poses, std):
-    """Of what touches, by the exact caster; from narrower than a cell, where heights within it differ by more, to far wider."""
+@pytest.mark.parametrize(("std", "apart"), [(0.02, 0.1), (0.1, 0.2), (0.5, 1.0)])
+def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_poses, std, apart):
+    """Of what touches, by the exact caster; from narrower than a cell, where heights within it differ by more, to far wider.
+    ``apart`` bounds the total variation, draws included."""
     index, T = plug.index, uniform_poses(plug)[0][:2]
     spread = np.r_[[std] * 3, [std * 20 * MM] * 3]
     for true in T:
@@ -239,6 +240,27 @@ def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_po
         assert mass.sum() == pytest.approx(1, abs=1e-4)
         among = np.argsort(-own, kind="stable")[: np.searchsorted(np.cumsum(np.sort(own)[::-1]), 0.8) + 1]
         assert mass[among].sum() > 0.4
+        assert 0.5 * np.abs(mass - own).sum() < apart
+
+
+@pytest.mark.parametrize("name", ["curved", "flat_nut"])
+def test_a_prior_outlives_a_sensor_that_feels_nothing_whichever_image_it_names(name, request, uniform_poses):
+    """A sensor far away feels nothing: what it tells is the prior, the same of every image of a pose, and as a prior for another
+    sensor it says what the prior itself says there."""
+    localizer = request.getfixturevalue(name)
+    T, symmetry = T_WORLD @ uniform_poses(localizer)[0][0], localizer.mesh.symmetry
+    far = T_WORLD.copy()
+    far[:3, 3] += 3.0
+    covariance = np.diag([0.1**2] * 3 + [(2 * MM) ** 2] * 3)
+    nothing = np.zeros(localizer.sensor.image_size_px[::-1], bool)
+    images = symmetry.elements[localizer.space.approaches(np.linalg.inv(T_WORLD) @ T @ symmetry.elements)]
+    for S in images[[1, -1]]:
+        prior = GaussianPrior(T @ S, covariance)
+        told = localizer.localize(nothing, prior=prior, T_world_sensor=far)
+        assert not told.contact
+        assert np.ptp(told.log_density(T @ symmetry.elements)) < 1e-6
+        here = prior_log_mass(localizer.index, told, T_WORLD, "world")
+        assert here == pytest.approx(prior_log_mass(localizer.index, prior, T_WORLD, "world"), abs=1e-4)
 
 
 def test_a_prior_that_cannot_be_is_refused_and_one_that_the_image_contradicts_is_often_told(plug, uniform_poses):

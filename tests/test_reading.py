@@ -353,6 +353,17 @@ def test_metadata_of_other_files_is_empty_and_a_broken_pose_is_named(tmp_path, b
         read_metadata(tmp_path / "wrong.png")
 
 
+@pytest.mark.parametrize("value", [0, 255])
+def test_a_camera_without_light_shows_no_mask(background, value):
+    """Beside a background an image of one value is a camera's; without one it may be a mask of nothing, or of all."""
+    for frame in (np.full_like(background, value), np.full(SHAPE, value, np.uint8)):
+        with pytest.raises(ImageError, match=f"image: every pixel is {value}, as of a camera without light"):
+            read_observation(frame, MINI, background=background)
+        with pytest.raises(ImageError, match=f"background: every pixel is {value}, as of a camera without light"):
+            read_observation(background, MINI, background=frame)
+    assert read_observation(np.full(SHAPE, value, np.uint8), MINI).kind == "mask"
+
+
 def test_a_mask_that_hardly_is_a_touch_is_told_of(rng):
     dot = np.zeros(SHAPE, bool)
     dot[100, 100] = True

@@ -8,6 +8,7 @@ from scipy.stats import kstest
 
 from geomtact.errors import PoseError
 from geomtact.se3 import (
+    adjoint,
     apply,
     check_transforms,
     exp,
@@ -72,6 +73,12 @@ def test_transforms_compose_and_invert(rng):
     assert np.abs(inverse(T @ S) - inverse(S) @ inverse(T)).max() < 1e-14
     homogeneous = np.concatenate([points, np.ones((7, 1))], 1)
     assert np.abs(apply(T[0], points) - (homogeneous @ T[0].T)[:, :3]).max() < 1e-15
+
+
+def test_the_adjoint_carries_twists_over_a_pose(rng):
+    T, xi = exp(rng.normal(size=(5, 6))), 0.3 * rng.normal(size=(5, 6))
+    carried = (adjoint(T) @ xi[..., None])[..., 0]
+    assert np.abs(T @ exp(xi) - exp(carried) @ T).max() < 1e-12
 
 
 def test_the_twist_acts_in_the_objects_own_frame(rng):

@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.carry import Carry, RigStd
 from geomtact.errors import NoPoseAgreesError
+from geomtact.inference.modes import Refined
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import NothingFelt, prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.inference.refine_together import refine_together
+from geomtact.inference.rig import rig_covariance
 from geomtact.inference.search import View
 from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, inverse
@@ -176,12 +178,25 @@ def fused_posterior(
         began = time.perf_counter()
         posterior = refine_together(posterior, views, modes, first.seed, log_prior)
         timing["refine"] = 1e3 * (time.perf_counter() - began)
-        if against is None and rig in (None, RigStd()) and sum(touch.contact for touch in touches) > 1:
-            posterior = replace(posterior, warnings=posterior.warnings + _badly_agreed(posterior.settings))
+        others = [touch.T_frame_sensor for touch in touches if touch.contact and touch is not first]
+        if others and rig not in (None, RigStd()):
+            posterior = replace(posterior, refined=_on_rig(posterior, np.stack(others), rig))
+        elif others and against is None:
+            agreed = _badly_agreed(posterior.settings, prior is not None)
+            posterior = replace(posterior, warnings=posterior.warnings + agreed)
     return posterior
 
 
-def _badly_agreed(settings: Mapping[str, Any]) -> list[str]:
+def _on_rig(posterior: Posterior, T_frame_sensor: Array, rig: RigStd) -> dict[int, Refined]:
+    """What was refined, less sure by how well is known where the other sensors (n, 4, 4) are."""
+    seen = inverse(posterior.T_frame_sensor) @ T_frame_sensor
+    return {
+        cell: replace(each, covariance=each.covariance + rig_covariance(each.T, seen, rig))
+        for cell, each in posterior.refined.items()
+    }
+
+
+def _badly_agreed(settings: Mapping[str, Any], with_prior: bool = False) -> list[str]:
     """What is said where no pose explains all sensors' readings nearly as well as others explain each of them."""
     nats = settings.get("unexplained_nats", 0.0)  # None: no pose that was looked into suits them all
     if nats is not None and nats <= _UNEXPLAINED:
@@ -189,7 +204,8 @@ def _badly_agreed(settings: Mapping[str, Any]) -> list[str]:
     left = "does not suit all of them" if nats is None else f"leaves {nats:.1f} nats a contact unexplained"
     return [
         f"the sensors agree badly: the likeliest pose {left}, rarely more than {_UNEXPLAINED} where the rig is right; check "
-        "T_world_sensor, or whether one of them touches something else, or say how well the rig is known (std_mm, std_deg)"
+        f"{'the prior, ' * with_prior}T_world_sensor, or whether one of them touches something else, or say how well the rig is "
+        "known (std_mm, std_deg)"
     ]
 
 

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.carry import Carry
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError, UsageError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, check_pose, check_transforms, exp, hat, inverse, log
@@ -29,7 +30,7 @@ _EXPECTED = (
 _DRAWN = 1024  # poses of a Gaussian at a time
 _BATCHES, _TOUCHING = 8, 1000  # how often at most, and until how many touch
 _FARTHEST = 8.0  # standard deviations from a Gaussian, widened by a cell, that touching poses may be
-_LOOK = (24, 32)  # rays that tell whether they do
+_LOOK = (24, 32)  # rays that tell which may
 _TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
 
 
@@ -79,15 +80,39 @@ class GaussianPrior:
 
     def over_cells(self, index: Index, T_frame_sensor: Array) -> GaussianPrior:
         """As it is told by the cells of ``index`` and by the images under a symmetry that stand for all."""
-        symmetry = index.mesh.symmetry
-        assert symmetry is not None
+        assert index.mesh.symmetry is not None
         spread = index.cell_covariance(inverse(T_frame_sensor) @ self.T)
+        return GaussianPrior(self.T, self.over_images(index.mesh.symmetry).covariance + spread)
+
+    def over_images(self, symmetry: Symmetry) -> GaussianPrior:
+        """As it is told by the images under a ``symmetry`` that stand for all: wider by what lies between them."""
         free = np.zeros((3, 3)) if symmetry.axis is None else np.outer(symmetry.axis, symmetry.axis) / _TURNS**2
         if symmetry.kind == "sphere":
             free = np.eye(3) / _ROTATIONS**2
         about_centre = np.vstack([np.eye(3), hat(symmetry.centre)])
-        spread = spread + about_centre @ free @ about_centre.T * (2 * np.pi) ** 2 / 12
-        return GaussianPrior(self.T, self.covariance + spread)
+        return GaussianPrior(self.T, self.covariance + about_centre @ free @ about_centre.T * (2 * np.pi) ** 2 / 12)
+
+
+@dataclass(frozen=True, eq=False)
+class OfAllImages:
+    """Log density, not normalised, of a prior that is a function, at poses touching or not: the same for every image of a pose.
+
+    Attributes
+    ----------
+    prior : a :class:`GaussianPrior` or a function, as in :func:`prior_log_mass`
+    symmetry : of the object
+    """
+
+    prior: LogDensity
+    symmetry: Symmetry
+
+    def __call__(self, T: Array) -> Array:
+        """At poses (n, 4, 4)."""
+        images = _images(self.symmetry)
+        told = self.prior
+        if len(images) > 1 and isinstance(told, GaussianPrior):
+            told = told.over_images(self.symmetry)
+        return _mean_density([_checked(told(T @ S), len(T)) for S in images])
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,9 +198,12 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     for _ in range(_BATCHES):
         xi = rng.multivariate_normal(np.zeros(6), prior.covariance, _DRAWN)
         T = inverse(T_frame_sensor) @ prior.T @ exp(xi)
-        depth = index.space.caster.depths(index.sensor, T, index.sensor.along(_LOOK)).max((1, 2))
-        touches = (depth >= 0) & (depth <= index.sensor.max_penetration)
-        touches[touches] = index.space.admits(T[touches])
+        # a few rays leave out those that cannot touch: what lies between them is hidden, by about their distance at most
+        seen = index.space.caster.depths(index.sensor, T, index.sensor.along(_LOOK)).max((1, 2))
+        hidden = 2 * float(max(index.sensor.half_window)) / max(_LOOK)
+        T = T[(seen >= -hidden) & (seen <= index.sensor.max_penetration)]
+        depth = index.space.penetration(T)
+        touches = np.isfinite(depth)
         cells = np.append(cells, index.lookup(T[touches], depth[touches]))
         if len(cells) >= _TOUCHING:
             break
@@ -187,7 +215,8 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
 def prior_log_density(prior: Any, mesh: Mesh, frame: str) -> LogDensity | None:
     """Log density, not normalised, of ``prior`` at poses (n, 4, 4) in ``frame``, touching or not; None without one.
 
-    Of a pair, each pose's mass counts for all poses within the radius of a mode.
+    It is the same for every image of a pose under the object's symmetry. Of a pair, each pose's mass counts for all poses within
+    the radius of a mode.
     """
     if prior is None:
         return None
@@ -195,7 +224,8 @@ def prior_log_density(prior: Any, mesh: Mesh, frame: str) -> LogDensity | None:
         check_same(_heading(prior), mesh, frame)
         return prior.log_density
     if callable(prior):
-        return lambda T: _checked(prior(T), len(T))
+        assert mesh.symmetry is not None
+        return OfAllImages(prior, mesh.symmetry)
     if not (isinstance(prior, tuple | list) and len(prior) == 2):
         raise UsageError(_EXPECTED.format(type(prior).__name__))
     poses, mass = _pair(*prior)
@@ -268,7 +298,10 @@ def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
         density *= carry.mean(told.densities)[0] if told.contact else carry.nothing_felt()
     with np.errstate(divide="ignore"):
         out = np.tile(np.log(density), len(index.height))
-    if before is not None:
+    if isinstance(before, OfAllImages):
+        known = prior_log_mass(index, before.prior, T_frame_sensor, prior.frame)
+        out[index.possible] += known[index.possible] - index.log_possible_weight
+    elif before is not None:
         out += _by_chunks(index, lambda T: before(T_frame_sensor @ T))
     return out
 
@@ -304,22 +337,33 @@ def _over_images(index: Index, density: LogDensity) -> Array:
     A cell stands for all of them: what the function says of any is said of it. Images that the approach rules out do
     not count.
     """
-    symmetry = index.mesh.symmetry
-    assert symmetry is not None
-    images = symmetry.sampled(_TURNS if symmetry.axis is not None else _ROTATIONS)
-    space = index.space
+    assert index.mesh.symmetry is not None
+    images = _images(index.mesh.symmetry)
 
     def mean(T: Array) -> Array:
-        total, count = np.full(len(T), -np.inf), np.zeros(len(T))
-        for S in images:
+        each = np.full((len(images), len(T)), np.nan)
+        allowed = np.zeros((len(images), len(T)), bool)
+        for i, S in enumerate(images):
             image = T @ S
-            ok = space.approaches(image)
-            with np.errstate(invalid="ignore"):  # NaN is told of later
-                total[ok] = np.logaddexp(total[ok], density(image[ok]))
-            count += ok
-        return total - np.log(np.maximum(count, 1))
+            allowed[i] = ok = index.space.approaches(image)
+            each[i, ok] = density(image[ok])
+        return _mean_density(each, allowed)
 
     return _by_chunks(index, density if len(images) == 1 else mean)
+
+
+def _images(symmetry: Symmetry) -> Array:
+    """Elements (m, 4, 4) of ``symmetry`` at which a prior that is a function is asked."""
+    return symmetry.sampled(_TURNS if symmetry.axis is not None else _ROTATIONS)
+
+
+def _mean_density(each: ArrayLike, counts: NDArray[np.bool_] | None = None) -> Array:
+    """Log of the mean density (n,) over images, of the log density (m, n) of ``each``, or of those that count (m, n)."""
+    each = np.asarray(each, float)
+    counts = np.ones(each.shape, bool) if counts is None else counts
+    with np.errstate(invalid="ignore"):  # NaN is told of later
+        total = np.logaddexp.reduce(np.where(counts, each, -np.inf), 0)
+    return np.asarray(total - np.log(np.maximum(counts.sum(0), 1)))
 
 
 def _by_chunks(index: Index, density: LogDensity, settled: bool = False) -> Array:

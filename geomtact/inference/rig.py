@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from geomtact.contact_space.carry import RigStd
 from geomtact.errors import InputError, UsageError
-from geomtact.se3 import Array, check_transforms
+from geomtact.se3 import Array, adjoint, check_transforms, inverse
 
 _HALL = 100.0  # m from the origin from which a translation is taken to be in millimetres
 _ROOM = 10.0  # m between two sensors from which translations are taken to be in millimetres
@@ -30,6 +31,18 @@ def views_of(image: Any, T_world_sensor: Any) -> tuple[list[Any], str, Array]:
     T = T.reshape(n, 4, 4)
     check_rig(T)
     return images, "world", T
+
+
+def rig_covariance(T: Array, T_frame_sensor: Array, rig: RigStd) -> Array:
+    """What a ``rig`` known so well adds to the covariance (6, 6) of an object's pose ``T`` (4, 4) that several sensors tell.
+
+    An error eta of the pose of a sensor at ``T_frame_sensor`` (n, 4, 4) turns and shifts the object that it tells by
+    xi = adjoint(T^-1 T_sensor) eta, with xi = (rx, ry, rz, tx, ty, tz) in T exp(xi^). The mean over the sensors, in full: what
+    all of them tell is nearer than that, what one alone tells is not.
+    """
+    eta = np.diag([rig.rotation**2] * 3 + [rig.translation**2] * 3)
+    carried = adjoint(inverse(T) @ T_frame_sensor)
+    return np.asarray((carried @ eta @ carried.swapaxes(-1, -2)).mean(0))
 
 
 def check_rig(T_world_sensor: Array, name: str = "T_world_sensor") -> None:

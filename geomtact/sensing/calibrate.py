@@ -141,7 +141,8 @@ def _check_rest(presses: Sequence[Press]) -> None:
         v, u = (int(np.median(each)) for each in np.nonzero(everywhere))
         raise InputError(
             f"calibrate: nearly all presses differ from the background around column {u}, row {v}: it was taken with something "
-            "pressed in there, or all presses lie there; take it without contact, and press all over the window"
+            "pressed in there, under other light, or all presses lie there; take it without contact just before the presses, and "
+            "press all over the window"
         )
 
 

@@ -100,14 +100,19 @@ def as_unit_rgb(image: Any, name: str) -> Array:
         raise ImageError(f"{name}: expected an RGB image (H, W, 3) or its path, got none; give it")
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
-        raise ImageError(f"{name}: expected an RGB image (H, W, 3), got an array of shape {image.shape}")
+        raise ImageError(
+            f"{name}: expected an RGB image (H, W, 3) of 8 pixels or more a side, got an array of shape {image.shape}"
+        )
     if image.dtype == np.uint8:
         return np.asarray(cv2.LUT(image, (np.arange(256) / 255).astype(np.float32)))
     if image.dtype.kind != "f":
         raise ImageError(f"{name}: expected uint8 or float 0..1, got {image.dtype}; convert it")
     image = image.astype(np.float32)
-    if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
-        raise ImageError(f"{name}: expected finite values from 0 to 1, got NaN or others; divide by the white value")
+    if not np.isfinite(image).all():
+        raise ImageError(f"{name}: expected finite values from 0 to 1, got NaN or infinite ones; fill them")
+    if image.min() < 0 or image.max() > 1:
+        given = f"{image.min():g} to {image.max():g}"
+        raise ImageError(f"{name}: expected values from 0 to 1, got {given}; divide by the white value")
     return image
 
 
@@ -121,7 +126,7 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
         turned = "array.T" if array.ndim == 2 else "array.swapaxes(0, 1)"
         hint = (
             f"the image is transposed: transpose it ({turned}) or rotate it by 90 degrees, as it was taken; or name the sensor "
-            "that took it"
+            "that took it, whose image_size_px is the width, then the height"
         )
     elif do is not None:
         hint = do

@@ -126,8 +126,8 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
         return FoundContact(full > 0.5, full, method)
     pressed, mask = _by_colour(change, felt, strong, sigma, pitch, _by_pressure if method == "pressure" else _by_rim)
     mask = _components(mask, pressed, strong, sigma)
-    full = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    return FoundContact(np.asarray(full > 0.5), None, method)
+    mask = np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5)
+    return FoundContact(mask, None, method)
 
 
 def _on_grid(image: Array) -> Array:

@@ -78,7 +78,9 @@ def read_observation(
     name, array = _load(image, "image", warnings)
     check_size(array, sensor, name)
     if kind == "auto":
-        kind = _decide(array, name, warnings)
+        # an image of one value beside a background is what a camera shows without light, not a mask of nothing
+        dark = background is not None and array.size > 0 and array.min() == array.max()
+        kind = "reading" if dark else _decide(array, name, warnings)
     if kind != "reading":
         array = _grey(array)
     if background is not None and kind != "reading":
@@ -229,7 +231,7 @@ def _height(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str])
     if highest > 10 * sensor.max_penetration:
         raise ImageError(
             f"{name}: expected heights in metres up to about {sensor.max_penetration:g}, the largest is {highest:.4g}; "
-            "these look like millimetres: divide by 1000 (16-bit grey counts micrometres)"
+            "these look like millimetres: divide by 1000 (16-bit grey counts micrometres); or a camera's image: --kind reading"
         )
     if highest > 1.5 * sensor.max_penetration:
         warnings.append(f"{name}: heights up to {1e3 * highest:.2f} mm exceed the sensor's max_penetration_mm")
@@ -241,12 +243,14 @@ def _reading(
 ) -> tuple[Contact, str]:
     """The contact in a reading, and the method by which it was found."""
     reference = None
+    _check_light(array, name)
     if background is None:
         untold = "" if sensor.colour is None else ", and heights are not told without one"
         warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself{untold}")
     else:
         label, reference = _load(background, "background", warnings)
         check_size(reference, sensor, label, "take it with the camera settings of the reading")
+        _check_light(reference, label)
         reference = _rgb(reference, label)
     seen = _rgb(array, name)
     grey = _colourless(seen)
@@ -269,6 +273,14 @@ def _reading(
         else:
             height = contact_height(seen, reference, sensor)
     return Contact(touch.mask, height, probability=touch.probability), touch.method
+
+
+def _check_light(array: NDArray[Any], name: str) -> None:
+    """Refuse a camera's image that shows one value everywhere."""
+    if array.min() == array.max():
+        raise ImageError(
+            f"{name}: every pixel is {array.min():g}, as of a camera without light or wholly blown out; check lamps and exposure"
+        )
 
 
 def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:
