@@ -75,6 +75,12 @@ def test_what_is_added_wrongly_is_named(change, message):
     ("old", "new", "message"),
     [
         ('name = "plain"', "", "the key 'name' is missing"),
+        (
+            PLAIN,
+            "",
+            "the keys 'name', 'image_size_px', 'pixel_pitch_mm', 'camera_distance_mm', 'max_penetration_mm' are missing",
+        ),
+        ('name = "plain"', 'name = " "', "name must not be empty"),
         ("camera_distance_mm = 20", "", "the key 'camera_distance_mm' is missing"),
         ("camera_distance_mm = 20", "camera_distance_mm = -1", "camera_distance_mm must be >= 0"),
         ("camera_distance_mm = 20", "camera_distance_mm = 3", "camera_distance_mm must exceed twice"),
@@ -96,6 +102,11 @@ def test_what_is_impossible_is_refused(old, new, message):
     assert old in PLAIN
     with pytest.raises(SensorError, match=re.escape(message)):
         Sensor.from_toml(PLAIN.replace(old, new))
+
+
+def test_a_file_may_begin_with_a_byte_order_mark(tmp_path):
+    (tmp_path / "mine.toml").write_bytes(b"\xef\xbb\xbf" + PLAIN.encode())
+    assert Sensor.load(tmp_path / "mine.toml") == Sensor.from_toml(PLAIN)
 
 
 def test_an_unknown_name_and_a_missing_file_say_what_to_do():

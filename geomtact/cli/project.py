@@ -97,7 +97,7 @@ def read(path: Path) -> dict[str, str]:
         Not valid TOML, an unknown key (the nearest is named), or an entry that is no text.
     """
     try:
-        entries = tomllib.loads(path.read_text("utf-8"))
+        entries = tomllib.loads(path.read_text("utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: cannot be read as TOML ({error}); mend it or remove it") from None
     for key, value in entries.items():

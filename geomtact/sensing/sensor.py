@@ -90,6 +90,7 @@ class Sensor:
             not np.isinf([*lengths, self.housing_depth or 0]).any(),
             "a length is infinite; a file gives millimetres, Python metres",
         )
+        need(bool(self.name.strip()), "name must not be empty")
         need(all(n >= 8 for n in self.image_size_px), f"image_size_px must be at least 8, got {self.image_size_px}")
         pitch_mm = [round(1e3 * p, 9) for p in self.pixel_pitch]
         need(all(p > 0 for p in self.pixel_pitch), f"pixel_pitch_mm must be positive, got {pitch_mm}")
@@ -137,7 +138,7 @@ class Sensor:
         path = Path(text)
         if path.suffix in (".toml", *_YAML) or path.is_file():
             try:
-                said = path.read_text("utf-8")
+                said = path.read_text("utf-8-sig")
             except FileNotFoundError:
                 raise SensorError(f"sensor file {path}: no such file; give a TOML file or a bundled sensor") from None
             except (OSError, UnicodeDecodeError) as error:
@@ -165,9 +166,10 @@ class Sensor:
         for key in data:
             if key not in _KEYS:
                 raise SensorError(f"{origin}: unknown key {key!r}{nearest_name(key, _KEYS)}")
-        for key in _REQUIRED:
-            if key not in data:
-                raise SensorError(f"{origin}: the key {key!r} is missing; add it, see 'geomtact sensors'")
+        missing = [repr(key) for key in _REQUIRED if key not in data]
+        if missing:
+            which = f"the key {missing[0]} is" if len(missing) == 1 else f"the keys {', '.join(missing)} are"
+            raise SensorError(f"{origin}: {which} missing; add what docs/formats.md says of a sensor's file")
         for key, value in data.items():
             wanted = _KEYS[key]
             number = _number(value)
