@@ -82,9 +82,9 @@ class GaussianPrior:
         """As it is told by the cells of ``index`` and by the images under a symmetry that stand for all."""
         assert index.mesh.symmetry is not None
         spread = index.cell_covariance(inverse(T_frame_sensor) @ self.T)
-        return GaussianPrior(self.T, self.over_images(index.mesh.symmetry).covariance + spread)
+        return GaussianPrior(self.T, self._between_images(index.mesh.symmetry).covariance + spread)
 
-    def over_images(self, symmetry: Symmetry) -> GaussianPrior:
+    def _between_images(self, symmetry: Symmetry) -> GaussianPrior:
         """As it is told by the images under a ``symmetry`` that stand for all: wider by what lies between them."""
         free = np.zeros((3, 3)) if symmetry.axis is None else np.outer(symmetry.axis, symmetry.axis) / _TURNS**2
         if symmetry.kind == "sphere":
@@ -111,7 +111,7 @@ class OfAllImages:
         images = _images(self.symmetry)
         told = self.prior
         if len(images) > 1 and isinstance(told, GaussianPrior):
-            told = told.over_images(self.symmetry)
+            told = told._between_images(self.symmetry)
         return _mean_density([_checked(told(T @ S), len(T)) for S in images])
 
 
