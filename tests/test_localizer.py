@@ -275,15 +275,15 @@ def test_a_prior_that_cannot_be_is_refused_and_one_that_the_image_contradicts_is
         warnings = plug.localize(masks[some[j]], "mask", prior=prior, effort="fast").warnings
         told[i, j] = any("contradict each other" in warning for warning in warnings)
     assert not told.diagonal().any() and told.sum() >= 2
-    # so many standard deviations away from the sensor, of 10 mm, beside which a cell is narrow
-    covariance = np.diag([0.02**2] * 3 + [(10 * MM) ** 2] * 3)
-    for far, refused in ((6, False), (12, True)):
-        away = GaussianPrior(transform(T[0, :3, :3], T[0, :3, 3] + [0, 0, far * 10 * MM]), covariance)
-        if refused:
-            with pytest.raises(InputError, match="no pose that touches the sensor lies within about 8 of its standard"):
-                plug.localize(masks[0], "mask", prior=away)
-        else:
-            assert plug.localize(masks[0], "mask", prior=away, effort="fast").contact
+    # at a metre, and so many standard deviations of 10 mm away from the sensor, beside which a cell is narrow
+    wide = np.diag([0.02**2] * 3 + [(10 * MM) ** 2] * 3)
+    near, far = (GaussianPrior(transform(T[0, :3, :3], T[0, :3, 3] + [0, 0, k * 10 * MM]), wide) for k in (6, 12))
+    for away in (GaussianPrior(transform(T[0, :3, :3], [0, 0, 1]), covariance), far):
+        with pytest.raises(
+            InputError, match="no pose that touches the sensor lies within about 8 of its standard deviations"
+        ):
+            plug.localize(masks[0], "mask", prior=away)
+    assert plug.localize(masks[0], "mask", prior=near, effort="fast").contact
 
 
 def test_a_gaussian_prior_is_the_density_of_what_it_draws(rng):

@@ -328,8 +328,7 @@ def test_another_part_of_which_nothing_is_known_is_printed(command, tmp_path, mo
     monkeypatch.setitem(SWEEPS, "other_part", replace(SWEEPS["other_part"], levels=(1,), inside=()))
     words = ["--touches", 4, "--effort", "fast", "--sweep", "other_part"]
     done = command(*words, "--out", tmp_path / "told.json")
-    (at,) = json.loads((tmp_path / "told.json").read_text("utf-8"))["parts"]["connector_plug"]["sweeps"]["other_part"][
-        "levels"
-    ]
+    sweeps = json.loads((tmp_path / "told.json").read_text("utf-8"))["parts"]["connector_plug"]["sweeps"]
+    (at,) = sweeps["other_part"]["levels"]
     assert at["figures"]["gain_mean"] is None and at["figures"]["wrong"] == 1
     assert "another part" in done.output

@@ -160,7 +160,7 @@ def _print(name: str, part: Mapping[str, Any]) -> None:
             gain = "-" if f["gain_mean"] is None else f"{f['gain_mean']:.2f} ± {f['gain_standard_error'] or 0:.2f}"
             ms = f"{f['ms_quantiles'][1]:.1f} ({f['ms_quantiles'][0]:.1f}-{f['ms_quantiles'][2]:.1f})"
             ready = part["ways"][way]["prepare_s"]
-            numbers = [f"{part['ways'][way]['poses']:,}", "-" if ready is None else f"{ready:.0f}"]
+            numbers = [f"{part['ways'][way]['poses']:,}", study_file.figure(ready, 0)]
             on_front = "*" if way in scene["front"]["gain_mean"] else ""
             rows.append([way + on_front, part["ways"][way]["choice"], gain, f"{f['mssd_mm_median']:.1f}", ms, *numbers])
         typer.echo(f"{name}, {kind}; * no other way is as fast and tells as much")

@@ -119,12 +119,7 @@ def _mesh(part: str, unit: str | None, sensor: Sensor) -> Mesh:
 
 
 def _print(figures: Mapping[str, Any]) -> None:
-    def share(x: float | None) -> str:
-        return "-" if x is None else f"{100 * x:.0f} %"
-
-    def length(x: float | None) -> str:
-        return "-" if x is None else f"{x:.2f}"
-
+    share, length = study_file.percent, study_file.figure
     headings = ("method", "success", "converged", "error [mm]", "drift [mm]", "ms")
     rows = []
     for name, f in figures["methods"].items():

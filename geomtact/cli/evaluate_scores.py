@@ -251,7 +251,7 @@ def _print_classes(classes: Mapping[str, Mapping[str, Any]]) -> None:
     rows = []
     for name, kinds in classes.items():
         for kind, f in kinds.items():
-            rows.append([name, kind, str(f["n"]), _number(f["gain_mean"], 2), *study_file.inside(f)])
+            rows.append([name, kind, str(f["n"]), study_file.figure(f["gain_mean"], 2), *study_file.inside(f)])
     masses = study_file.masses()
     typer.echo("By kind of contact: percentage of truths inside the region of each mass, with 99 % intervals")
     print_table(["score", "contact", "n", "gain [nats]", *masses], rows, ["n", "gain [nats]", *masses])
@@ -267,16 +267,16 @@ def _print(title: str, entries: Mapping[str, Any]) -> None:
         seconds = entry["prepare_s"].values()
         row = [
             _with_error(f["gain_mean"], f["gain_standard_error"]),
-            _number(f["claimed_mean"], 2),
+            study_file.figure(f["claimed_mean"], 2),
             _with_error(f["over_iou_mean"], f["over_iou_standard_error"], "+"),
-            _number(f["mssd_mm_median"], 1),
-            _number(f["mssd10_mm_median"], 1),
+            study_file.figure(f["mssd_mm_median"], 1),
+            study_file.figure(f["mssd10_mm_median"], 1),
             "/".join(f"{100 * c['share']:.0f}" for c in f["coverage"]),
             f"{100 * f['coverage_error']:.0f}",
-            _number(f["score_ms_median"], 1),
-            _number(f["ms_median"], 1),
-            _number(entry["bytes_per_pose"], 0),
-            _number(None if None in seconds else sum(seconds), 1),
+            study_file.figure(f["score_ms_median"], 1),
+            study_file.figure(f["ms_median"], 1),
+            study_file.figure(entry["bytes_per_pose"], 0),
+            study_file.figure(None if None in seconds else sum(seconds), 1),
         ]
         rows.append([name, *row])
     typer.echo(title)
@@ -305,9 +305,4 @@ def _groups(entries: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any], Ma
 
 
 def _with_error(value: float | None, error: float | None, sign: str = "-") -> str:
-    return _number(value, 2, sign) + ("" if None in (value, error) else f" ± {error:.2f}")
-
-
-def _number(value: float | None, digits: int, sign: str = "-") -> str:
-    """``value``, or a dash where there is none, such as the time of what was in the cache already."""
-    return "-" if value is None else f"{value:{sign}.{digits}f}"
+    return study_file.figure(value, 2, sign) + ("" if None in (value, error) else f" ± {error:.2f}")

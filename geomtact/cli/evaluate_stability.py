@@ -121,11 +121,9 @@ def _print(part: str, sweeps: Mapping[str, Any]) -> None:
         for at in sweep["levels"]:
             f = at["figures"]
             mark = "" if at["level"] in sweep["inside"] else "*"
-            shares = ["-" if f[k] is None else f"{100 * f[k]:.0f} %" for k in ("wrong", "warned", "silent", "alarmed")]
-            nats = [
-                "-" if f[k] is None else f"{f[k]:.2f}" for k in ("gain_mean", "claimed_mean")
-            ]  # none, of another part
-            told = [*nats, f"{100 * f['ruled_out']:.0f} %"]
+            shares = [study_file.percent(f[k]) for k in ("wrong", "warned", "silent", "alarmed")]
+            nats = [study_file.figure(f[k]) for k in ("gain_mean", "claimed_mean")]
+            told = [*nats, study_file.percent(f["ruled_out"])]
             rows.append([sweep["title"], f"{at['level']:g}{mark}", str(f["n"]), *told, *study_file.inside(f), *shares])
     numbers = ["level", "n", "gain [nats]", "claimed", "ruled out", "in 50 %", "in 90 %"]
     shares = ["wrong", "warned", "silent", "right but warned"]

@@ -127,6 +127,16 @@ def plot(content: Mapping[str, Any], path: Path | None, which: str | None = None
         write_bytes(path, picture)
 
 
+def figure(value: float | None, digits: int = 2, sign: str = "-") -> str:
+    """``value`` as text, or a dash where there is none: what is known of another part, the time of what lay in the cache."""
+    return "-" if value is None else f"{value:{sign}.{digits}f}"
+
+
+def percent(share: float | None) -> str:
+    """A share as text, or a dash where there is none."""
+    return "-" if share is None else f"{100 * share:.0f} %"
+
+
 def length(mm: float | None) -> str:
     """A length of a study's figures as text; null stands for infinity."""
     return "inf" if mm is None else f"{mm:.1f}"

@@ -108,11 +108,10 @@ class OfAllImages:
 
     def __call__(self, T: Array) -> Array:
         """At poses (n, 4, 4)."""
-        images = _images(self.symmetry)
         told = self.prior
-        if len(images) > 1 and isinstance(told, GaussianPrior):
+        if isinstance(told, GaussianPrior):
             told = told._between_images(self.symmetry)
-        return _mean_density([_checked(told(T @ S), len(T)) for S in images])
+        return _mean_density([_checked(told(T @ S), len(T)) for S in _images(self.symmetry)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,12 +194,12 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     mass = np.exp(log_mass.astype(float))
     spread = np.exp(-float(mass @ np.maximum(log_mass, -700)))
     rng, cells = np.random.default_rng(0), np.zeros(0, np.int64)
+    # a few rays leave out those that cannot touch: what lies between them is hidden, by about their distance at most
+    hidden = 2 * float(max(index.sensor.half_window)) / max(_LOOK)
     for _ in range(_BATCHES):
         xi = rng.multivariate_normal(np.zeros(6), prior.covariance, _DRAWN)
         T = inverse(T_frame_sensor) @ prior.T @ exp(xi)
-        # a few rays leave out those that cannot touch: what lies between them is hidden, by about their distance at most
         seen = index.space.caster.depths(index.sensor, T, index.sensor.along(_LOOK)).max((1, 2))
-        hidden = 2 * float(max(index.sensor.half_window)) / max(_LOOK)
         T = T[(seen >= -hidden) & (seen <= index.sensor.max_penetration)]
         depth = index.space.penetration(T)
         touches = np.isfinite(depth)

@@ -32,7 +32,16 @@ _EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse
 _SURELY = 0.501  # probability of what counts as contact, at least
 # Brightness from which on a camera tells no more, or less than elsewhere; and the share of what is felt that is so bright, more
 # than a glint, from which on colours are no linear image of slopes
-_BLOWN_OUT, _UNTOLD = 0.95, 0.01
+_NEARLY_WHITE, _UNTOLD = 0.95, 0.01
+
+
+class _Colours(NamedTuple):
+    """Powers (3,), ascending, and directions (3, 3) in columns of the colours along which an image changes; and whether it is but
+    one, as of a white gel, which tells no slope."""
+
+    power: Array
+    directions: Array
+    one: bool
 
 
 class FoundContact(NamedTuple):
@@ -115,7 +124,8 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
         return FoundContact(np.zeros(size[::-1], bool), None, "classical" if method == "auto" else method)
     if method == "auto":
         method = "learned" if _blown_out(felt, image, reference) > _UNTOLD else "classical"
-    if _colours(change, felt)[2]:
+    colours = _colours(change, felt)
+    if colours.one:
         method = "classical"
     if method == "learned":
         probability = _by_network(change, image, felt)
@@ -124,7 +134,8 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
         probability = np.where(mask, np.maximum(probability, _SURELY), np.where(probability > 0.5, 0, probability))
         full = np.asarray(cv2.resize(probability, size, interpolation=cv2.INTER_LINEAR), np.float32)
         return FoundContact(full > 0.5, full, method)
-    pressed, mask = _by_colour(change, felt, strong, sigma, pitch, _by_pressure if method == "pressure" else _by_rim)
+    by_slope = _by_pressure if method == "pressure" else _by_rim
+    pressed, mask = _by_colour(change, colours, felt, strong, sigma, pitch, by_slope)
     mask = _components(mask, pressed, strong, sigma)
     mask = np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5)
     return FoundContact(mask, None, method)
@@ -138,26 +149,25 @@ def _on_grid(image: Array) -> Array:
 
 def _blown_out(felt: Mask, *images: Array | None) -> float:
     """Share of what is ``felt`` (H, W) where a channel of one of the ``images`` (H, W, 3) is about as bright as it can be."""
-    bright = [(image >= _BLOWN_OUT).any(-1) for image in images if image is not None]
+    bright = [(image >= _NEARLY_WHITE).any(-1) for image in images if image is not None]
     return float(np.logical_or.reduce(bright)[felt].mean())
 
 
-def _colours(change: Array, felt: Mask) -> tuple[Array, Array, bool]:
-    """Powers (3,), ascending, and directions (3, 3) in columns of the colours along which all that is felt changes; and whether
-    it is but one, as of a white gel, which tells no slope."""
+def _colours(change: Array, felt: Mask) -> _Colours:
+    """Those along which all that is felt changes."""
     values = change[felt]
-    power, colours = np.linalg.eigh(values.T @ values / len(values))
-    return power, colours, bool(power[1] <= _ONE_COLOUR * power[2])
+    power, directions = np.linalg.eigh(values.T @ values / len(values))
+    return _Colours(power, directions, bool(power[1] <= _ONE_COLOUR * power[2]))
 
 
 def _by_colour(
-    change: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array, by_slope: BySlope
+    change: Array, colours: _Colours, felt: Mask, strong: Mask, sigma: float, pitch: Array, by_slope: BySlope
 ) -> tuple[Array, Mask]:
     """How much the gel is pressed in (H, W), up to a factor, and the contact: by its slope, where colours tell that."""
-    power, colours, one = _colours(change, felt)
-    if one:
-        return _half_as_large(_one_way(change @ colours[:, 2], felt), felt)
-    slope = slope_field(transformed(change, (colours[:, 1:] / np.sqrt(power[1:])).T), felt, sigma, pitch)
+    if colours.one:
+        return _half_as_large(_one_way(change @ colours.directions[:, 2], felt), felt)
+    plane = transformed(change, (colours.directions[:, 1:] / np.sqrt(colours.power[1:])).T)
+    slope = slope_field(plane, felt, sigma, pitch)
     if slope is None:
         return _half_as_large(size_of(change), felt)
     return by_slope(slope, felt, strong, sigma, pitch)
