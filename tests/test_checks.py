@@ -16,6 +16,7 @@ FAULTS = {
     "the background is black": lambda image, background: (image, 0.01 * background),
     "the image is overexposed": lambda image, background: (np.minimum(3.5 * image, 1), background),
     "darker than the background": lambda image, background: (0.7 * image, background),
+    "are the same, pixel for pixel": lambda image, background: (image, image),
 }
 
 

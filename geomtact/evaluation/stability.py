@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,9 @@ class World:
     kind: str | None = None
 
 
+Ask = Callable[[Localizer, float, int, int, str], Iterator[Answer]]  # level, how many, seed, effort
+
+
 @dataclass(frozen=True)
 class Sweep:
     """One condition that gets worse.
@@ -70,19 +74,15 @@ class Sweep:
     title : what it is, with its unit
     levels : from easy to broken
     inside : those of them that the documentation promises to hold
-    world : of one touch at a level; None for sweeps of a rig or a sequence
-    rig : (6,) standard deviation by which each sensor of a rig is off at a level [rad, m]
-    slips : whether a level is how often the part slips in a sequence of ``_FRAMES`` frames
-    jaw : whether a level is the angle [deg] between the lines along which two sensors come from opposite sides
+    world : of one touch at a level; None for sweeps of several sensors or a sequence
+    ask : for those, answers at a level
     """
 
     title: str
     levels: tuple[float, ...]
     inside: tuple[float, ...]
     world: Callable[[World, float], World] | None = None
-    rig: Callable[[float], Array] | None = None
-    slips: bool = False
-    jaw: bool = False
+    ask: Ask | None = None
 
 
 def larger(mesh: Mesh, percent: float) -> Mesh:
@@ -131,6 +131,154 @@ def _other(mesh: Mesh, number: float) -> Mesh:
 
 def _both(factor: float, pitch: tuple[float, float]) -> tuple[float, float]:
     return factor * pitch[0], factor * pitch[1]
+
+
+def swept(
+    localizer: Localizer,
+    sweep: Sweep,
+    level: float,
+    n: int,
+    seed: int,
+    effort: str,
+    as_prepared: list[Answer] | None = None,
+) -> Iterator[Answer]:
+    """Answers to ``n`` touches, or scenes of several sensors, at a level of a sweep.
+
+    Most sweeps begin where all is as the localizer was prepared for: ``as_prepared`` holds those answers, once they are told.
+    """
+    if sweep.ask is not None:
+        yield from sweep.ask(localizer, level, n, seed, effort)
+        return
+    assert sweep.world is not None
+    here = World(localizer.mesh, localizer.sensor, MODERATE, penetrations(localizer.space))
+    there = sweep.world(here, level)
+    if there != here or as_prepared is None:
+        yield from _alone(localizer, there, n, seed, effort)
+    elif len(as_prepared) >= n:
+        yield from as_prepared[:n]
+    else:
+        as_prepared.clear()
+        for answer in _alone(localizer, there, n, seed, effort):
+            as_prepared.append(answer)
+            yield answer
+
+
+def _alone(localizer: Localizer, there: World, n: int, seed: int, effort: str) -> Iterator[Answer]:
+    """Answers to single touches of another world than the localizer was prepared for."""
+    for T, mask in touches(there, n, seed):
+        posterior = localizer.localize(mask, "mask", effort=effort, seed=seed)
+        answer = judged(localizer.mesh, T, posterior, _knowable(localizer.space, T))
+        if there.mesh.name != localizer.mesh.name:  # wherever it is said to be, it is not
+            answer = replace(answer, gain=-np.inf, level=1.0, mssd_mm=np.inf)
+        yield answer
+
+
+def _knowable(space: ContactSpace, T: Array) -> Array:
+    """``T`` (4, 4), moved along z into the contact pose space where another world's contact lies outside."""
+    if np.isfinite(space.penetration(T[None])[0]):
+        return T
+    depth = space.caster.penetration(space.sensor, T[None])[0]
+    settled, ok = space.settle(T[None], np.clip(depth, 1e-6, space.sensor.max_penetration - 1e-6))
+    return settled[0] if ok[0] else T
+
+
+def touches(world: World, n: int, seed: int) -> Iterator[tuple[Array, NDArray[np.bool_]]]:
+    """Up to ``n`` touches of a world, uniform over its contact pose space: the true pose (4, 4), and what is felt (H, W).
+
+    Fewer where hardly any touch is as the world wants it.
+    """
+    rng, space = np.random.default_rng(seed), ContactSpace(world.mesh, world.sensor)
+    pixel = float(np.prod(world.sensor.pixel_pitch))
+    found = 0
+    for _ in range(_TRIED * n // 32):
+        for T in space.sample(32, rng, world.pressed)[0]:
+            if world.kind and contact_class(space, T) != world.kind:
+                continue
+            mask = _felt(space, T, world.threshold, found % 2 == 1)
+            if not (world.area[0] <= mask.sum() * pixel <= world.area[1]):
+                continue
+            if not (world.border[0] <= cut_off(mask) <= world.border[1]):
+                continue
+            yield T, spoilt(mask, space, world.noise, rng)
+            found += 1
+            if found == n:
+                return
+
+
+def _felt(space: ContactSpace, T: Array, threshold: float | None, elastic: bool) -> NDArray[np.bool_]:
+    if threshold is None:
+        return felt_mask(space, T, elastic)
+    return np.asarray(space.caster.depths(space.sensor, T[None])[0] > threshold)
+
+
+def cut_off(mask: NDArray[np.bool_]) -> float:
+    """Share of the outline of ``mask`` (H, W) that lies on the image's border, by pixel edges."""
+    inner = np.count_nonzero(mask[1:] != mask[:-1]) + np.count_nonzero(mask[:, 1:] != mask[:, :-1])
+    outer = mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum()
+    return float(outer / max(1, inner + outer))
+
+
+def _rigs(off: Array, localizer: Localizer, level: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
+    """Scenes of three sensors whose poses are told wrongly, each off at random by ``level`` times ``off`` (6,) [rad, m], but the
+    first."""
+    rng = np.random.default_rng([seed, 7])
+    for scene in make_scenes(localizer, n, seed, MODERATE, None, _SENSORS):
+        T = scene.T_world_sensor.copy()
+        T[1:] = T[1:] @ np.array([exp(level * off * rng.normal(size=6)) for _ in T[1:]])
+        yield _together(localizer, scene.T_world_object, T, [touch.mask for touch in scene.touches], effort, seed)
+
+
+def _jaws(localizer: Localizer, level: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
+    """Two sensors that close on the part from opposite sides, on lines through the first one's window that are ``level`` degrees
+    apart: what moves the part along both lines, or about them, either tells alike."""
+    rng, space = np.random.default_rng([seed, 9]), localizer.space
+    least, most = penetrations(space)
+    made = 0
+    for _ in range(_TRIED * n):
+        if made == n:
+            return
+        T, elastic = space.sample(1, rng, (least, most))[0][0], made % 2 == 1
+        second = opposed(T, np.radians(level), rng.uniform(0, 2 * np.pi), space, rng.uniform(least, most))
+        if second is None:
+            continue
+        poses = [T, inverse(second) @ T]
+        masks = [felt_mask(space, pose, elastic) for pose in poses]
+        if all(counts(space, mask) for mask in masks):
+            noisy = [spoilt(mask, space, MODERATE, rng) for mask in masks]
+            yield _together(localizer, T, np.stack([np.eye(4), second]), noisy, effort, seed)
+            made += 1
+
+
+def opposed(T: Array, angle: float, way: float, space: ContactSpace, depth: float) -> Array | None:
+    """Where (4, 4), in the first sensor's frame, a second one stops that comes from the other side of an object at ``T`` (4, 4),
+    along a line that leans by ``angle`` [rad] towards the direction ``way`` [rad]; ``depth`` [m] deep. None if it misses."""
+    lean = np.array([-np.sin(way), np.cos(way), 0.0]) * angle
+    facing = exp(np.pad(lean, (0, 3))) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    stops, touches = closed_on(space, T, facing[None], depth)
+    return stops[0] if touches[0] else None
+
+
+def _together(localizer: Localizer, T: Array, T_world_sensor: Array, masks: list, effort: str, seed: int) -> Answer:
+    """What several sensors tell of an object at ``T`` (4, 4)."""
+    try:
+        posterior = localizer.localize(masks, "mask", T_world_sensor=T_world_sensor, effort=effort, seed=seed)
+    except NoPoseAgreesError:
+        return REFUSED
+    return judged(localizer.mesh, T, posterior)
+
+
+def _sequences(localizer: Localizer, level: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
+    """What is told at the last frame of sequences in which the part slips ``level`` times, at even distances; warned, if of any
+    slip."""
+    slips = int(level)
+    at = tuple(_FRAMES * (i + 1) // (slips + 1) for i in range(slips))
+    for number in range(n):
+        made = random_trajectory(
+            localizer.space, _FRAMES, seed * 1000 + number, _STEP, slips=at, elastic=number % 2 == 1
+        )
+        told = list(localizer.track(made.masks, effort=effort, kind="mask", seed=seed))
+        slipped = any(has_slipped(posterior.settings["surprise_nats"]) for posterior in told)
+        yield replace(judged(localizer.mesh, made.T_sensor_object[-1], told[-1]), warned=slipped)
 
 
 SWEEPS = {
@@ -208,169 +356,22 @@ SWEEPS = {
         "each of three sensors off by [mm rms]",
         (0, 0.5, 1, 2, 5, 10),
         (0, 0.5),
-        rig=lambda x: np.array([0, 0, 0, 1, 1, 1]) * 1e-3 * x / np.sqrt(3),
+        ask=partial(_rigs, np.array([0, 0, 0, 1, 1, 1]) * 1e-3 / np.sqrt(3)),
     ),
     "rig_turn": Sweep(
         "each of three sensors turned by [deg rms]",
         (0, 0.5, 1, 2, 5, 10),
         (0, 0.5),
-        rig=lambda x: np.array([1, 1, 1, 0, 0, 0]) * np.radians(x) / np.sqrt(3),
+        ask=partial(_rigs, np.array([1, 1, 1, 0, 0, 0]) * np.radians(1) / np.sqrt(3)),
     ),
-    "jaw": Sweep("two opposed sensors, apart from one line by [deg]", (90, 30, 10, 3, 0), (90, 30, 10, 3, 0), jaw=True),
-    "slips": Sweep("slips in twelve frames", (0, 1, 2, 3), (0, 1), slips=True),
+    "jaw": Sweep(
+        "two opposed sensors, apart from one line by [deg]", (90, 30, 10, 3, 0), (90, 30, 10, 3, 0), ask=_jaws
+    ),
+    "slips": Sweep("slips in twelve frames", (0, 1, 2, 3), (0, 1), ask=_sequences),
     "other_part": Sweep(
         "another part (1 gear, 2 plug, 3 bracket)", (0, 1, 2, 3), (0,), lambda w, x: replace(w, mesh=_other(w.mesh, x))
     ),
 }
-
-
-def swept(
-    localizer: Localizer,
-    sweep: Sweep,
-    level: float,
-    n: int,
-    seed: int,
-    effort: str,
-    as_prepared: list[Answer] | None = None,
-) -> Iterator[Answer]:
-    """Answers to ``n`` touches, or scenes of several sensors, at a level of a sweep.
-
-    Most sweeps begin where all is as the localizer was prepared for: ``as_prepared`` holds those answers, once they are told.
-    """
-    if sweep.rig is not None:
-        yield from _rigs(localizer, sweep.rig(level), n, seed, effort)
-    elif sweep.jaw:
-        yield from _jaws(localizer, np.radians(level), n, seed, effort)
-    elif sweep.slips:
-        yield from _sequences(localizer, int(level), n, seed, effort)
-    else:
-        assert sweep.world is not None
-        here = World(localizer.mesh, localizer.sensor, MODERATE, penetrations(localizer.space))
-        there = sweep.world(here, level)
-        if there != here or as_prepared is None:
-            yield from _alone(localizer, there, n, seed, effort)
-        elif len(as_prepared) >= n:
-            yield from as_prepared[:n]
-        else:
-            as_prepared.clear()
-            for answer in _alone(localizer, there, n, seed, effort):
-                as_prepared.append(answer)
-                yield answer
-
-
-def _alone(localizer: Localizer, there: World, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """Answers to single touches of another world than the localizer was prepared for."""
-    for T, mask in touches(there, n, seed):
-        posterior = localizer.localize(mask, "mask", effort=effort, seed=seed)
-        answer = judged(localizer.mesh, T, posterior, _knowable(localizer.space, T))
-        if there.mesh.name != localizer.mesh.name:  # wherever it is said to be, it is not
-            answer = replace(answer, gain=-np.inf, level=1.0, mssd_mm=np.inf)
-        yield answer
-
-
-def _knowable(space: ContactSpace, T: Array) -> Array:
-    """``T`` (4, 4), moved along z into the contact pose space where another world's contact lies outside."""
-    if np.isfinite(space.penetration(T[None])[0]):
-        return T
-    depth = space.caster.penetration(space.sensor, T[None])[0]
-    settled, ok = space.settle(T[None], np.clip(depth, 1e-6, space.sensor.max_penetration - 1e-6))
-    return settled[0] if ok[0] else T
-
-
-def touches(world: World, n: int, seed: int) -> Iterator[tuple[Array, NDArray[np.bool_]]]:
-    """Up to ``n`` touches of a world, uniform over its contact pose space: the true pose (4, 4), and what is felt (H, W).
-
-    Fewer where hardly any touch is as the world wants it.
-    """
-    rng, space = np.random.default_rng(seed), ContactSpace(world.mesh, world.sensor)
-    pixel = float(np.prod(world.sensor.pixel_pitch))
-    found = 0
-    for _ in range(_TRIED * n // 32):
-        for T in space.sample(32, rng, world.pressed)[0]:
-            if world.kind and contact_class(space, T) != world.kind:
-                continue
-            mask = _felt(space, T, world.threshold, found % 2 == 1)
-            if not (world.area[0] <= mask.sum() * pixel <= world.area[1]):
-                continue
-            if not (world.border[0] <= cut_off(mask) <= world.border[1]):
-                continue
-            yield T, spoilt(mask, space, world.noise, rng)
-            found += 1
-            if found == n:
-                return
-
-
-def _felt(space: ContactSpace, T: Array, threshold: float | None, elastic: bool) -> NDArray[np.bool_]:
-    if threshold is None:
-        return felt_mask(space, T, elastic)
-    return np.asarray(space.caster.depths(space.sensor, T[None])[0] > threshold)
-
-
-def cut_off(mask: NDArray[np.bool_]) -> float:
-    """Share of the outline of ``mask`` (H, W) that lies on the image's border, by pixel edges."""
-    inner = np.count_nonzero(mask[1:] != mask[:-1]) + np.count_nonzero(mask[:, 1:] != mask[:, :-1])
-    outer = mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum()
-    return float(outer / max(1, inner + outer))
-
-
-def _rigs(localizer: Localizer, off: Array, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """Scenes of three sensors whose poses are told wrongly, each off at random by ``off`` (6,), but the first."""
-    rng = np.random.default_rng([seed, 7])
-    for scene in make_scenes(localizer, n, seed, MODERATE, None, _SENSORS):
-        T = scene.T_world_sensor.copy()
-        T[1:] = T[1:] @ np.array([exp(off * rng.normal(size=6)) for _ in T[1:]])
-        yield _together(localizer, scene.T_world_object, T, [touch.mask for touch in scene.touches], effort, seed)
-
-
-def _jaws(localizer: Localizer, angle: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """Two sensors that close on the part from opposite sides, on lines through the first one's window that are ``angle`` [rad]
-    apart: what moves the part along both lines, or about them, either tells alike."""
-    rng, space = np.random.default_rng([seed, 9]), localizer.space
-    least, most = penetrations(space)
-    made = 0
-    for _ in range(_TRIED * n):
-        if made == n:
-            return
-        T, elastic = space.sample(1, rng, (least, most))[0][0], made % 2 == 1
-        second = opposed(T, angle, rng.uniform(0, 2 * np.pi), space, rng.uniform(least, most))
-        if second is None:
-            continue
-        poses = [T, inverse(second) @ T]
-        masks = [felt_mask(space, pose, elastic) for pose in poses]
-        if all(counts(space, mask) for mask in masks):
-            noisy = [spoilt(mask, space, MODERATE, rng) for mask in masks]
-            yield _together(localizer, T, np.stack([np.eye(4), second]), noisy, effort, seed)
-            made += 1
-
-
-def opposed(T: Array, angle: float, way: float, space: ContactSpace, depth: float) -> Array | None:
-    """Where (4, 4), in the first sensor's frame, a second one stops that comes from the other side of an object at ``T`` (4, 4),
-    along a line that leans by ``angle`` [rad] towards the direction ``way`` [rad]; ``depth`` [m] deep. None if it misses."""
-    lean = np.array([-np.sin(way), np.cos(way), 0.0]) * angle
-    facing = exp(np.pad(lean, (0, 3))) @ np.diag([1.0, -1.0, -1.0, 1.0])
-    stops, touches = closed_on(space, T, facing[None], depth)
-    return stops[0] if touches[0] else None
-
-
-def _together(localizer: Localizer, T: Array, T_world_sensor: Array, masks: list, effort: str, seed: int) -> Answer:
-    """What several sensors tell of an object at ``T`` (4, 4)."""
-    try:
-        posterior = localizer.localize(masks, "mask", T_world_sensor=T_world_sensor, effort=effort, seed=seed)
-    except NoPoseAgreesError:
-        return REFUSED
-    return judged(localizer.mesh, T, posterior)
-
-
-def _sequences(localizer: Localizer, slips: int, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """What is told at the last frame of sequences in which the part slips so often, at even distances; warned, if of any slip."""
-    at = tuple(_FRAMES * (i + 1) // (slips + 1) for i in range(slips))
-    for number in range(n):
-        made = random_trajectory(
-            localizer.space, _FRAMES, seed * 1000 + number, _STEP, slips=at, elastic=number % 2 == 1
-        )
-        told = list(localizer.track(made.masks, effort=effort, kind="mask", seed=seed))
-        slipped = any(has_slipped(posterior.settings["surprise_nats"]) for posterior in told)
-        yield replace(judged(localizer.mesh, made.T_sensor_object[-1], told[-1]), warned=slipped)
 
 
 def summarise(answers: Sequence[Answer]) -> dict[str, Any]:

@@ -41,6 +41,8 @@ def faults(image: Array, background: Array | None) -> list[str]:
     out = out or _torn(image)
     if out or background is None:
         return out
+    if np.array_equal(image, background):
+        return ["the image and its background are the same, pixel for pixel; give one of the untouched gel beside it"]
     seen, rest = _coarse(image), _coarse(background)
     gain = float(np.median(seen.mean(-1)) / max(float(np.median(rest.mean(-1))), 1e-6))
     seen /= max(gain, 1e-6)

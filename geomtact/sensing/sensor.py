@@ -7,13 +7,10 @@ image columns, +y along rows, +z out towards the object. The camera sits at (0, 
 from __future__ import annotations
 
 import hashlib
-import json
-import tomllib
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,21 +19,6 @@ from geomtact.errors import SensorError, nearest_name
 from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable
 
-_KEYS = {
-    "name": str,
-    "image_size_px": list,
-    "pixel_pitch_mm": list,
-    "camera_distance_mm": float,
-    "max_penetration_mm": float,
-    "membrane_radius_mm": float,
-    "housing_depth_mm": float,
-    "height_noise_mm": float,
-    "contact_method": str,
-    "note": str,
-    "colour": dict,
-}
-_COLOUR_KEYS = ("weights", "slope_rms", "height_rms_mm", "contact_depth_mm")
-_REQUIRED = ("name", "image_size_px", "pixel_pitch_mm", "camera_distance_mm", "max_penetration_mm")
 _YAML = (".yaml", ".yml")
 
 HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
@@ -153,89 +135,15 @@ class Sensor:
     @classmethod
     def from_toml(cls, text: str, origin: str = "sensor") -> Sensor:
         """Parse the TOML text of one sensor; ``origin`` names it in errors."""
-        try:
-            data = tomllib.loads(text)
-        except RecursionError:
-            raise SensorError(
-                f"{origin}: lists within lists within lists; write plain ones, see 'geomtact sensors'"
-            ) from None
-        except tomllib.TOMLDecodeError as error:
-            raise SensorError(
-                f"{origin}: not valid TOML ({error}); write lines such as name = \"mine\", see 'geomtact sensors'"
-            ) from None
-        for key in data:
-            if key not in _KEYS:
-                raise SensorError(f"{origin}: unknown key {key!r}{nearest_name(key, _KEYS)}")
-        missing = [repr(key) for key in _REQUIRED if key not in data]
-        if missing:
-            which = f"the key {missing[0]} is" if len(missing) == 1 else f"the keys {', '.join(missing)} are"
-            raise SensorError(f"{origin}: {which} missing; add what docs/formats.md says of a sensor's file")
-        for key, value in data.items():
-            wanted = _KEYS[key]
-            number = _number(value)
-            if (wanted is float and not number) or (wanted is str and not isinstance(value, str)):
-                raise SensorError(f"{origin}: {key} must be a {wanted.__name__}, got {value!r}")
-            if wanted is dict and not isinstance(value, dict):
-                raise SensorError(f"{origin}: {key} must be a table, got {value!r}; write [{key}]")
-            if wanted is list and not (isinstance(value, list) and len(value) == 2 and all(_number(v) for v in value)):
-                raise SensorError(f"{origin}: {key} must be two numbers (along x, along y), got {value!r}")
-        if any(v != int(v) for v in data["image_size_px"]):
-            raise SensorError(f"{origin}: image_size_px must be whole numbers, got {data['image_size_px']}")
-        if max(data["pixel_pitch_mm"]) > 10:
-            raise SensorError(
-                f"{origin}: pixel_pitch_mm {data['pixel_pitch_mm']} is over a centimetre; give millimetres a pixel"
-            )
-        housing = data.get("housing_depth_mm")
-        width, height = data["image_size_px"]
-        pitch_x, pitch_y = data["pixel_pitch_mm"]
-        try:
-            return cls(
-                name=data["name"],
-                image_size_px=(int(width), int(height)),
-                pixel_pitch=(pitch_x / 1e3, pitch_y / 1e3),
-                camera_distance=data["camera_distance_mm"] / 1e3,
-                max_penetration=data["max_penetration_mm"] / 1e3,
-                membrane_radius=data.get("membrane_radius_mm", 0.0) / 1e3,
-                housing_depth=None if housing is None else housing / 1e3,
-                height_noise=data.get("height_noise_mm", 1e3 * HEIGHT_NOISE) / 1e3,
-                contact_method=data.get("contact_method", CONTACT_METHODS[0]),
-                note=data.get("note", ""),
-                colour=_colour(data["colour"]) if "colour" in data else None,
-            )
-        except SensorError as error:
-            raise SensorError(f"{origin}: {error}") from None
+        from geomtact.sensing.sensor_file import sensor_of_toml
+
+        return sensor_of_toml(text, origin)
 
     def to_toml(self) -> str:
         """The TOML text that :meth:`from_toml` reads back to the same sensor."""
+        from geomtact.sensing.sensor_file import toml_of_sensor
 
-        def mm(metres: float) -> str:
-            return repr(float(f"{metres * 1e3:.12g}"))
-
-        lines = [
-            f"name = {_toml_string(self.name)}",
-            f"image_size_px = [{self.image_size_px[0]}, {self.image_size_px[1]}]",
-            f"pixel_pitch_mm = [{mm(self.pixel_pitch[0])}, {mm(self.pixel_pitch[1])}]",
-            f"camera_distance_mm = {mm(self.camera_distance)}",
-            f"max_penetration_mm = {mm(self.max_penetration)}",
-            f"membrane_radius_mm = {mm(self.membrane_radius)}",
-        ]
-        if self.housing_depth is not None:
-            lines.append(f"housing_depth_mm = {mm(self.housing_depth)}")
-        if self.height_noise != HEIGHT_NOISE:
-            lines.append(f"height_noise_mm = {mm(self.height_noise)}")
-        if self.contact_method != CONTACT_METHODS[0]:
-            lines.append(f"contact_method = {_toml_string(self.contact_method)}")
-        if self.note:
-            lines.append(f"note = {_toml_string(self.note)}")
-        if self.colour is not None:
-            lines += ["", "[colour]", f"slope_rms = {self.colour.slope_rms:.6g}"]
-            lines += [
-                f"height_rms_mm = {mm(self.colour.height_rms)}",
-                f"contact_depth_mm = {mm(self.colour.contact_depth)}",
-            ]
-            rows = ("  [" + ", ".join(f"{w:.9g}" for w in row) + "]," for row in self.colour.weights)
-            lines += ["weights = [", *rows, "]"]
-        return "\n".join(lines) + "\n"
+        return toml_of_sensor(self)
 
     @cached_property
     def sha256(self) -> str:
@@ -317,33 +225,3 @@ def bundled_sensors() -> list[str]:
 
 def _folder():
     return resources.files("geomtact") / "sensing" / "sensors"
-
-
-def _number(value: Any) -> bool:
-    """Whether it is a number that a float can hold."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return bool(abs(value) < 1e300)
-
-
-def _colour(data: dict[str, Any]) -> ColourTable:
-    """The table of a sensor file's [colour]."""
-    for key in data:
-        if key not in _COLOUR_KEYS:
-            raise SensorError(f"unknown key {key!r} in [colour]{nearest_name(key, _COLOUR_KEYS)}")
-    for key in _COLOUR_KEYS:
-        if key not in data:
-            raise SensorError(f"the key {key!r} is missing in [colour]; calibrate the sensor again")
-    numbers = [data[key] for key in _COLOUR_KEYS[1:]]
-    rows = data["weights"] if isinstance(data["weights"], list) else []
-    lists = len(rows) == 2 and all(isinstance(row, list) for row in rows)
-    if not lists or not all(_number(v) for v in (*numbers, *rows[0], *rows[1])):
-        raise SensorError("[colour] must hold numbers, and weights two lists of them; calibrate the sensor again")
-    x, y = (tuple(map(float, row)) for row in rows)
-    slope, height, depth = map(float, numbers)
-    return ColourTable((x, y), slope, 1e-3 * height, 1e-3 * depth)
-
-
-def _toml_string(text: str) -> str:
-    # a string of JSON is one of TOML, but that TOML wants DEL escaped too
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

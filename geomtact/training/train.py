@@ -11,7 +11,6 @@ that a posterior needs, for contacts that differ by as much as a grid cell lets 
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -21,14 +20,15 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import unpack
-from geomtact.errors import GeomtactError, InputError
+from geomtact.errors import InputError
 from geomtact.progress import Progress
 from geomtact.scoring.encoder import SHAPE
 from geomtact.scoring.network import Encoder
 from geomtact.sensing.moments import without_specks
 from geomtact.training.augment import augmented
+from geomtact.training.loop import descend, steps
 from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, Scene
-from geomtact.training.state import begin_with, not_a_number, resume, save_state
+from geomtact.training.state import begin_with, resume, save_state
 
 
 @dataclass(frozen=True)
@@ -90,22 +90,14 @@ def train(
     if earlier is not None:
         curve = Curve(**earlier)  # type: ignore[arg-type]
     gains: list[float] = []
-    for step in range(first, settings.steps):
-        # every step has a seed of its own, so that a resumed run draws what an uninterrupted one does
-        rng = np.random.default_rng([settings.seed, step])
-        for group in optimizer.param_groups:
-            group["lr"] = settings.rate * schedule(step, settings.steps)
+    for step, rng in steps(optimizer, first, settings.steps, settings.rate, settings.seed):
         network.train()
-        optimizer.zero_grad()
         for i in rng.integers(len(learned), size=settings.scenes_a_step):
             gain = scene_gain(network, learned[i], settings, rng)
             # one hopeless touch shall not steer the step
             (-gain.clamp(min=-8).mean() / settings.scenes_a_step).backward()
             gains.append(float(gain.detach().mean()))
-        norm = float(torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0))
-        if not math.isfinite(norm) or not np.isfinite(gains[-settings.scenes_a_step :]).all():
-            raise GeomtactError(not_a_number(folder, step))
-        optimizer.step()
+        descend(network, optimizer, sum(gains[-settings.scenes_a_step :]), folder, step)
         if (step + 1) % check_every == 0 or step + 1 == settings.steps:
             curve.step.append(step + 1)
             curve.training.append(float(np.mean(gains)))
@@ -164,8 +156,3 @@ def _batch(
 
 def _unpacked(words: NDArray[np.uint64], shape: tuple[int, int]) -> torch.Tensor:
     return torch.from_numpy(unpack(words, shape)).float()
-
-
-def schedule(step: int, steps: int) -> float:
-    """Share of the learning rate at a step: a short rise, then half a cosine."""
-    return min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / steps))

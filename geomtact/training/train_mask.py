@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,14 +10,14 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from geomtact.errors import GeomtactError, InputError
+from geomtact.errors import InputError
 from geomtact.progress import Progress
 from geomtact.sensing.mask_network import CHANNELS, MaskNetwork
 from geomtact.training import presses, readings
 from geomtact.training.card import write_network
+from geomtact.training.loop import descend, steps
 from geomtact.training.presses import Presses
-from geomtact.training.state import begin_with, not_a_number, resume, save_state
-from geomtact.training.train import schedule
+from geomtact.training.state import begin_with, resume, save_state
 
 SCHEMA = "geomtact/mask-network/1"
 _FIRST = "down.0.0.weight"  # of what the network sees
@@ -70,22 +69,15 @@ def train_mask(
     first, curve = resume(folder, network, optimizer, asdict(settings))
     curve = curve or {"step": [], "training": [], "validation": []}
     losses: list[float] = []
-    for step in range(first, settings.steps):
-        # every step has a seed of its own, so that a resumed run draws what an uninterrupted one does
-        rng = np.random.default_rng([settings.seed, step])
-        for group in optimizer.param_groups:
-            group["lr"] = settings.rate * schedule(step, settings.steps)
+    for step, rng in steps(optimizer, first, settings.steps, settings.rate, settings.seed):
         some = rng.integers(len(seen), size=settings.batch)
         which = rng.integers(seen.shape[1], size=settings.batch)
         x, y = _varied(seen[some, which].float(), contact[some].float(), rng)
         network.train()
-        optimizer.zero_grad()
         loss = F.binary_cross_entropy_with_logits(network(x), y)
         loss.backward()
         losses.append(float(loss.detach()))
-        if not math.isfinite(float(torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0))):
-            raise GeomtactError(not_a_number(folder, step))
-        optimizer.step()
+        descend(network, optimizer, losses[-1], folder, step)
         if (step + 1) % check_every == 0 or step + 1 == settings.steps:
             curve["step"].append(step + 1)
             curve["training"].append(float(np.mean(losses)))

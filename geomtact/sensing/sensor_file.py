@@ -1,0 +1,135 @@
+"""The TOML file of a sensor: a key for each field, lengths in millimetres."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import MISSING, fields
+from typing import Any
+
+from geomtact.errors import SensorError, nearest_name
+from geomtact.sensing.colour import ColourTable
+from geomtact.sensing.sensor import Sensor
+
+_LENGTHS = (
+    "pixel_pitch",
+    "camera_distance",
+    "max_penetration",
+    "membrane_radius",
+    "housing_depth",
+    "height_noise",
+)
+_PAIRS, _TEXTS = ("image_size_px", "pixel_pitch"), ("name", "contact_method", "note")
+_KEYS = {f"{f.name}_mm" if f.name in _LENGTHS else f.name: f for f in fields(Sensor)}
+_REQUIRED = [key for key, f in _KEYS.items() if f.default is MISSING]
+_ALWAYS = (*_REQUIRED, "membrane_radius_mm")  # others are written where they are not the default
+_COLOUR_KEYS = ("weights", "slope_rms", "height_rms_mm", "contact_depth_mm")
+
+
+def sensor_of_toml(text: str, origin: str) -> Sensor:
+    """As :meth:`Sensor.from_toml`."""
+    try:
+        data = tomllib.loads(text)
+    except RecursionError:
+        raise SensorError(
+            f"{origin}: lists within lists within lists; write plain ones, see 'geomtact sensors'"
+        ) from None
+    except tomllib.TOMLDecodeError as error:
+        raise SensorError(
+            f"{origin}: not valid TOML ({error}); write lines such as name = \"mine\", see 'geomtact sensors'"
+        ) from None
+    for key in data:
+        if key not in _KEYS:
+            raise SensorError(f"{origin}: unknown key {key!r}{nearest_name(key, _KEYS)}")
+    missing = [repr(key) for key in _REQUIRED if key not in data]
+    if missing:
+        which = f"the key {missing[0]} is" if len(missing) == 1 else f"the keys {', '.join(missing)} are"
+        raise SensorError(f"{origin}: {which} missing; add what docs/formats.md says of a sensor's file")
+    try:
+        return Sensor(**{_KEYS[key].name: _value(key, value) for key, value in data.items()})
+    except SensorError as error:
+        raise SensorError(f"{origin}: {error}") from None
+
+
+def toml_of_sensor(sensor: Sensor) -> str:
+    """As :meth:`Sensor.to_toml`."""
+    lines = []
+    for key, f in _KEYS.items():
+        value = getattr(sensor, f.name)
+        if f.name == "colour" or (key not in _ALWAYS and value == f.default):
+            continue
+        if f.name in _LENGTHS:
+            value = [_mm(v) for v in value] if f.name in _PAIRS else _mm(value)
+        text = _toml_string(value) if f.name in _TEXTS else str(list(value) if f.name in _PAIRS else value)
+        lines.append(f"{key} = {text}")
+    if sensor.colour is not None:
+        lines += [
+            "",
+            "[colour]",
+            f"slope_rms = {sensor.colour.slope_rms:.6g}",
+            f"height_rms_mm = {_mm(sensor.colour.height_rms)}",
+            f"contact_depth_mm = {_mm(sensor.colour.contact_depth)}",
+        ]
+        rows = ("  [" + ", ".join(f"{w:.9g}" for w in row) + "]," for row in sensor.colour.weights)
+        lines += ["weights = [", *rows, "]"]
+    return "\n".join(lines) + "\n"
+
+
+def _value(key: str, value: Any) -> Any:
+    """What the field of a ``key`` is to be, in metres."""
+    name = _KEYS[key].name
+    if name == "colour":
+        if not isinstance(value, dict):
+            raise SensorError(f"{key} must be a table, got {value!r}; write [{key}]")
+        return _colour(value)
+    if name in _TEXTS:
+        if not isinstance(value, str):
+            raise SensorError(f"{key} must be a str, got {value!r}")
+        return value
+    if name in _PAIRS:
+        if not (isinstance(value, list) and len(value) == 2 and all(_number(v) for v in value)):
+            raise SensorError(f"{key} must be two numbers (along x, along y), got {value!r}")
+        if name == "pixel_pitch" and max(value) > 10:
+            raise SensorError(f"{key} {value} is over a centimetre; give millimetres a pixel")
+        if name == "image_size_px":
+            if any(v != int(v) for v in value):
+                raise SensorError(f"{key} must be whole numbers, got {value}")
+            return int(value[0]), int(value[1])
+        return value[0] / 1e3, value[1] / 1e3
+    if not _number(value):
+        raise SensorError(f"{key} must be a float, got {value!r}")
+    return value / 1e3
+
+
+def _colour(data: dict[str, Any]) -> ColourTable:
+    """The table of a sensor file's [colour]."""
+    for key in data:
+        if key not in _COLOUR_KEYS:
+            raise SensorError(f"unknown key {key!r} in [colour]{nearest_name(key, _COLOUR_KEYS)}")
+    for key in _COLOUR_KEYS:
+        if key not in data:
+            raise SensorError(f"the key {key!r} is missing in [colour]; calibrate the sensor again")
+    numbers = [data[key] for key in _COLOUR_KEYS[1:]]
+    rows = data["weights"] if isinstance(data["weights"], list) else []
+    lists = len(rows) == 2 and all(isinstance(row, list) for row in rows)
+    if not lists or not all(_number(v) for v in (*numbers, *rows[0], *rows[1])):
+        raise SensorError("[colour] must hold numbers, and weights two lists of them; calibrate the sensor again")
+    x, y = (tuple(map(float, row)) for row in rows)
+    slope, height, depth = map(float, numbers)
+    return ColourTable((x, y), slope, 1e-3 * height, 1e-3 * depth)
+
+
+def _number(value: Any) -> bool:
+    """Whether it is a number that a float can hold."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return bool(abs(value) < 1e300)
+
+
+def _mm(metres: float) -> float:
+    return float(f"{metres * 1e3:.12g}")
+
+
+def _toml_string(text: str) -> str:
+    # a string of JSON is one of TOML, but that TOML wants DEL escaped too
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
