@@ -27,7 +27,7 @@ from geomtact.cli.evaluate_thesis import judge_thesis_table
 from geomtact.cli.evaluate_touches import judge_touches
 from geomtact.cli.evaluate_track import judge_track
 from geomtact.cli.evaluate_triplets import judge_triplets
-from geomtact.cli.options import CacheDir, Effort, Unit
+from geomtact.cli.options import CacheDir, Effort, Seed, Unit
 from geomtact.cli.shell import one_line_errors, print_table, tell
 from geomtact.cli.simulate import NoiseName
 
@@ -44,7 +44,7 @@ def judge_samples(
     sensor: study_options.SensorName = "gelslim",
     touches: Touches = 200,
     noise: study_options.NoiseLevel = NoiseName.moderate,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
 ) -> None:
     """Describe the touches that posteriors are judged on: how deep, how large, how many run over the window's border.
 
@@ -81,7 +81,7 @@ def judge_localize(
     touches: Touches = 200,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     effort: study_options.EffortLevel = Effort.balanced,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.options import Unit
+from geomtact.cli.options import Seed, Unit
 from geomtact.cli.shell import print_table, progress_bar, tell
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def judge_choices(
     touches: Annotated[
         int, typer.Option("--touches", min=2, help="How many scenes of each kind, for each part.")
     ] = 100,
-    seed: study_options.Seed = 3,
+    seed: Seed = 3,
     weights: Annotated[
         list[Path] | None,
         typer.Option(

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.options import CacheDir, Unit
+from geomtact.cli.options import CacheDir, Seed, Unit
 from geomtact.cli.shell import print_table, tell
 from geomtact.cli.simulate import NoiseName
 
@@ -22,7 +22,7 @@ def judge_kitting(
     sensor: study_options.SensorName = "gelslim",
     runs: Annotated[int, typer.Option("--touches", min=1, help="How many of each part to place.")] = 200,
     noise: study_options.NoiseLevel = NoiseName.moderate,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.options import CacheDir, Unit
+from geomtact.cli.options import CacheDir, Seed, Unit
 from geomtact.cli.shell import print_table, tell
 from geomtact.cli.simulate import NoiseName
 
@@ -29,7 +29,7 @@ def judge_next_touch(
         int, typer.Option("--touches", min=1, help="How many times each part is touched until sure, by each policy.")
     ] = 100,
     noise: study_options.NoiseLevel = NoiseName.moderate,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.options import Unit
+from geomtact.cli.options import Seed, Unit
 from geomtact.cli.shell import print_table, tell
 from geomtact.cli.simulate import NoiseName
 from geomtact.errors import InputError
@@ -36,7 +36,7 @@ def judge_registration(
     touches: Annotated[int, typer.Option("--touches", min=1, help="How many touches of each part.")] = 200,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     felt: study_options.Felt = study_options.FeltName.both,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
 ) -> None:

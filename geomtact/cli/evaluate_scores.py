@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.options import CacheDir, Effort, MaxPoses, Unit
+from geomtact.cli.options import CacheDir, Effort, MaxPoses, Seed, Unit
 from geomtact.cli.shell import print_table, progress_bar, tell
 from geomtact.cli.simulate import NoiseName
 
@@ -96,7 +96,7 @@ def judge_scores(
     noise: study_options.NoiseLevel = NoiseName.moderate,
     felt: study_options.Felt = study_options.FeltName.elastic,
     effort: study_options.EffortLevel = Effort.balanced,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
     max_poses: MaxPoses = None,
     only: study_options.Only = None,
     out: study_options.Out = None,

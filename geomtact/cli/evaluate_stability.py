@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.options import CacheDir, Effort, MaxPoses, Unit
+from geomtact.cli.options import CacheDir, Effort, MaxPoses, Seed, Unit
 from geomtact.cli.shell import print_table, tell
 
 SCHEMA = "geomtact/stability/2"
@@ -37,7 +37,7 @@ def judge_stability(
         ),
     ] = 200,
     effort: study_options.EffortLevel = Effort.balanced,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
     max_poses: MaxPoses = None,
     out: study_options.Out = None,
     plot: study_options.Plot = None,

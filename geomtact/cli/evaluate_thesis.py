@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.options import CacheDir, Effort, Unit
+from geomtact.cli.options import CacheDir, Effort, Seed, Unit
 from geomtact.cli.shell import print_table, progress_bar, tell
 from geomtact.cli.simulate import NoiseName
 
@@ -35,7 +35,7 @@ def judge_thesis_table(
     ambiguity: Annotated[
         int, typer.Option("--ambiguity", min=0, help="For how many of them to seek all poses that feel the same.")
     ] = 0,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.options import CacheDir, Effort, Unit
+from geomtact.cli.options import CacheDir, Effort, Seed, Unit
 from geomtact.cli.shell import print_table, tell
 from geomtact.cli.simulate import NoiseName
 
@@ -26,7 +26,7 @@ def judge_touches(
     noise: study_options.NoiseLevel = NoiseName.moderate,
     felt: study_options.Felt = study_options.FeltName.both,
     effort: study_options.EffortLevel = Effort.balanced,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,

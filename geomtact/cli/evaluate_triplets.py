@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli import study_file, study_options
-from geomtact.cli.options import CacheDir, Effort, MaxPoses
+from geomtact.cli.options import CacheDir, Effort, MaxPoses, Seed
 from geomtact.cli.shell import print_table, progress_bar, tell
 
 SCHEMA = "geomtact/triplets/1"
@@ -19,7 +19,7 @@ SCHEMA = "geomtact/triplets/1"
 def judge_triplets(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="That of the data, hsp_digit_sim_ycb.")],
     effort: study_options.EffortLevel = Effort.balanced,
-    seed: study_options.Seed = 1,
+    seed: Seed = 1,
     max_poses: MaxPoses = None,
     out: study_options.Out = None,
     cache_dir: CacheDir = None,

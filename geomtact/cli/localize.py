@@ -10,7 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
+from geomtact.cli.options import (
+    Background,
+    CacheDir,
+    Effort,
+    EffortName,
+    Kind,
+    KindName,
+    MaxPoses,
+    ScorerName,
+    Seed,
+    SensorName,
+    Unit,
+    check_name,
+)
 from geomtact.cli.prepare import open_localizer
 from geomtact.cli.project import given_of, resolve
 from geomtact.cli.shell import NO_CONTACT, check_folder, posterior_file, print_table, tell
@@ -48,8 +61,8 @@ def localize(
     ] = None,
     unit: Unit = None,
     sensor: SensorName = None,
-    kind: Annotated[str, typer.Option(metavar="|".join(Kind), help="What the image is.")] = Kind.auto.value,
-    background: Annotated[Path | None, typer.Option(help="Image of the untouched sensor, for readings.")] = None,
+    kind: KindName = Kind.auto.value,
+    background: Background = None,
     sensor_poses: Annotated[
         Path | None,
         typer.Option(
@@ -57,12 +70,9 @@ def localize(
         ),
     ] = None,
     prior: Annotated[Path | None, typer.Option(help="posterior.npz of what is known before, or its folder.")] = None,
-    effort: Annotated[
-        str | None,
-        typer.Option(metavar="|".join(Effort), help="How much to compute; balanced by default.", show_default=False),
-    ] = None,
+    effort: EffortName = None,
     scorer: ScorerName = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    seed: Seed = 0,
     camera: Annotated[
         str | None,
         typer.Option(

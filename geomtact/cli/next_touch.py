@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.options import CacheDir
+from geomtact.cli.options import CacheDir, Seed
 from geomtact.cli.shell import check_folder, posterior_file, print_table
 from geomtact.errors import GeomtactError, InputError, nearest_name
 
@@ -29,7 +29,7 @@ def next_touch(
     actions: Annotated[
         Path | None, typer.Option(help="JSON with the touches and probes to choose from; else some all round.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for next_touch.json and next_touch.png.")] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print next_touch.json, and nothing else, to standard output.")

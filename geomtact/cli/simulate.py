@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.options import SensorName, Unit
+from geomtact.cli.options import Seed, SensorName, Unit
 from geomtact.cli.shell import check_folder, tell
 from geomtact.errors import InputError, UsageError
 
@@ -37,7 +37,7 @@ def simulate(
         int | None,
         typer.Option("--n", min=1, help="How many touches at random poses; one by default.", show_default=False),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    seed: Seed = 0,
     elastic: Annotated[
         bool, typer.Option("--elastic/--geometric", help="Pressure of an elastic gel, or a threshold on the depth.")
     ] = False,

@@ -47,7 +47,6 @@ Only = Annotated[
     ClassName | None, typer.Option("--only", help="Touches of one kind of contact; all by default.", show_default=False)
 ]
 EffortLevel = Annotated[Effort, typer.Option("--effort", help="How much to compute.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
 Out = Annotated[
     Path | None, typer.Option("--out", help="JSON file for all figures; a study that it holds in part is resumed.")
 ]

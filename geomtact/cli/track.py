@@ -11,7 +11,20 @@ import typer
 
 from geomtact.cli.frames import Frame, all_frames, listed
 from geomtact.cli.lines import line_of, to_line
-from geomtact.cli.options import CacheDir, Effort, Kind, MaxPoses, ScorerName, SensorName, Unit, check_name
+from geomtact.cli.options import (
+    Background,
+    CacheDir,
+    Effort,
+    EffortName,
+    Kind,
+    KindName,
+    MaxPoses,
+    ScorerName,
+    Seed,
+    SensorName,
+    Unit,
+    check_name,
+)
 from geomtact.cli.prepare import open_localizer
 from geomtact.cli.project import given_of, resolve
 from geomtact.cli.shell import NO_CONTACT, posterior_file, tell
@@ -31,18 +44,11 @@ Source = Annotated[
     ),
 ]
 ObjectName = Annotated[str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")]
-KindName = Annotated[str, typer.Option(metavar="|".join(Kind), help="What the images are.")]
-Background = Annotated[Path | None, typer.Option(help="Image of the untouched sensor, for readings.")]
-EffortName = Annotated[
-    str | None,
-    typer.Option(metavar="|".join(Effort), help="How much to compute; balanced by default.", show_default=False),
-]
 MotionMm = Annotated[
     float, typer.Option(min=0.001, help="How far the part moves between frames at most, mean over its points.")
 ]
 Follow = Annotated[bool, typer.Option("--follow", help="Wait for more images in the folder, until Ctrl-C.")]
 SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Go on after an image that cannot be read.")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
 MOTION_MM = 8.0  # the thesis's
 UNTOUCHED = "no contact found in any image; give a --background, or say what they are with --kind"
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, part_of_task, quietly
-from geomtact.cli.options import Unit
+from geomtact.cli.options import Seed, Unit
 from geomtact.cli.parts import parts_of
 from geomtact.cli.shell import progress_bar, tell
 from geomtact.errors import InputError, UsageError
@@ -61,7 +61,7 @@ def train(
         int | None, typer.Option(min=2, help="Numbers that an encoder makes of a contact; 16 by default.")
     ] = None,
     rate: Annotated[float | None, typer.Option(min=1e-9, help="Learning rate, where the usual one diverges.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    seed: Seed = 0,
     work: Annotated[
         Path | None, typer.Option(help="Folder for scenes and state; by default one named after --out.")
     ] = None,

@@ -7,19 +7,26 @@ from typing import Annotated
 
 import typer
 
-from geomtact.cli.options import CacheDir, Kind, MaxPoses, ScorerName, SensorName, Unit
+from geomtact.cli.options import (
+    Background,
+    CacheDir,
+    EffortName,
+    Kind,
+    KindName,
+    MaxPoses,
+    ScorerName,
+    Seed,
+    SensorName,
+    Unit,
+)
 from geomtact.cli.project import given_of
 from geomtact.cli.shell import NO_CONTACT, tell
 from geomtact.cli.track import (
     MOTION_MM,
     UNTOUCHED,
-    Background,
-    EffortName,
     Follow,
-    KindName,
     MotionMm,
     ObjectName,
-    Seed,
     SkipBroken,
     Source,
     open_track,
