@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import open3d as o3d
 import pytest
@@ -139,6 +140,16 @@ def test_contacts_are_of_the_kind_that_the_sweep_wants(here, level):
     space = ContactSpace(world.mesh, world.sensor)
     found = list(stability.touches(world, 3, 1))
     assert [contact_class(space, T) for T, _ in found] == [CLASSES[level - 1]] * 3
+
+
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_masks_show_as_many_patches_as_the_sweep_wants(here, level):
+    found = list(stability.touches(SWEEPS["shown"].world(here, level), 3, 1))
+    for _, mask in found:
+        _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+        large = np.bincount(labels.ravel())[1:] * np.prod(here.sensor.pixel_pitch) >= 0.3 * MM**2
+        assert min(large.sum(), 3) == level
+    assert len(found) == 3
 
 
 def test_knobs_stand_out_of_the_surface_and_leave_the_rest_as_it_was(here):

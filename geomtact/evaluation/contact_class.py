@@ -24,20 +24,24 @@ _PATCH = 0.3e-6  # m^2 that a patch has to have to count
 
 def contact_class(space: ContactSpace, T: ArrayLike) -> str:
     """One of ``CLASSES`` for the rigid contact at ``T`` (4, 4)."""
-    import cv2
-
     sensor = space.sensor
     wide, high = sensor.half_window
     scale = _SHAPE / max(wide, high)
     shape = (max(8, round(high * scale)), max(8, round(wide * scale)))
     depth = space.caster.depths(sensor, np.asarray(T, float)[None], shape)[0]
     felt = depth > 0
-    pixel = sensor.pixel_area(shape)
-    _, _, stats, _ = cv2.connectedComponentsWithStats(felt.astype(np.uint8), connectivity=8)
-    if (stats[1:, cv2.CC_STAT_AREA] * pixel >= _PATCH).sum() >= 3:
+    if patches(felt, sensor.pixel_area(shape)) >= 3:
         return "texture"
     normal, count = _directions(space, np.asarray(T, float), shape, felt)
     return _of_directions(normal, count)
+
+
+def patches(mask: NDArray[np.bool_], pixel_area: float) -> int:
+    """How many patches of 0.3 mm^2 or more a mask (h, w) has, whose pixels have ``pixel_area`` [m^2]."""
+    import cv2
+
+    stats = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)[2]
+    return int((stats[1:, cv2.CC_STAT_AREA] * pixel_area >= _PATCH).sum())
 
 
 def _of_directions(normal: Array, count: NDArray[np.int64]) -> str:

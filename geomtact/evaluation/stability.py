@@ -18,7 +18,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation.answer import REFUSED, Answer, judged
-from geomtact.evaluation.contact_class import CLASSES, contact_class
+from geomtact.evaluation.contact_class import CLASSES, contact_class, patches
 from geomtact.evaluation.pose_error import coverage
 from geomtact.evaluation.sensors_study import make_scenes
 from geomtact.evaluation.study import CERTAIN
@@ -50,6 +50,7 @@ class World:
     area : (least, largest) area of contact [m^2], without noise
     border : (least, largest) share of the contact's outline that the window's border cuts off
     kind : one of ``contact_class.CLASSES`` that contacts are of; any, if None
+    shows : (least, most) patches that masks show, with their noise
     """
 
     mesh: Mesh
@@ -60,6 +61,7 @@ class World:
     area: tuple[float, float] = (LEAST_CONTACT, np.inf)
     border: tuple[float, float] = (0.0, 1.0)
     kind: str | None = None
+    shows: tuple[float, float] = (0, np.inf)
 
 
 Ask = Callable[[Localizer, float, int, int, str], Iterator[Answer]]  # level, how many, seed, effort
@@ -199,7 +201,10 @@ def touches(world: World, n: int, seed: int) -> Iterator[tuple[Array, NDArray[np
                 continue
             if not (world.border[0] <= cut_off(mask) <= world.border[1]):
                 continue
-            yield T, spoilt(mask, space, world.noise, rng)
+            noisy = spoilt(mask, space, world.noise, rng)
+            if not (world.shows[0] <= patches(noisy, pixel) <= world.shows[1]):
+                continue
+            yield T, noisy
             found += 1
             if found == n:
                 return
@@ -345,6 +350,12 @@ SWEEPS = {
         tuple(range(len(CLASSES) + 1)),
         tuple(range(len(CLASSES) + 1)),
         lambda w, x: replace(w, kind=CLASSES[int(x) - 1] if x else None),
+    ),
+    "shown": Sweep(
+        "patches that the mask shows (3 or more)",
+        (1, 2, 3),
+        (1, 2, 3),
+        lambda w, x: replace(w, shows=(x, x if x < 3 else np.inf)),
     ),
     "detail": Sweep(
         "twelve knobs that the mesh lacks, radius [mm]",
