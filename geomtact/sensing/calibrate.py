@@ -131,7 +131,7 @@ def calibrated(
             f"calibrate: {len(found)} presses contradict each other: colours fitted to all but one measure the ball "
             f"{100 * abs(off):.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
         )
-    return Calibrated(sensor, found, left_out, diameters, _doubts(found, diameters, off))
+    return Calibrated(sensor, found, left_out, diameters, _doubts(found, len(left_out), diameters, off))
 
 
 def _check_rest(presses: Sequence[Press]) -> None:
@@ -157,10 +157,15 @@ def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor
     return replace(sensor, colour=colour, height_noise=height_noise), diameters
 
 
-def _doubts(presses: Sequence[Press], diameters: Array, off: float) -> list[str]:
-    """What speaks against a calibration by these presses, on each of which the others measure the ball's ``diameters`` (n,) [m],
-    NaN where they see no ball, wrongly by a share ``off`` in the median."""
+def _doubts(presses: Sequence[Press], left_out: int, diameters: Array, off: float) -> list[str]:
+    """What speaks against a calibration by these presses, ``left_out`` being how many more were given. On each of them the others
+    measure the ball's ``diameters`` (n,) [m], NaN where they see no ball, wrongly by a share ``off`` in the median."""
     out = []
+    if left_out > len(presses):
+        out.append(
+            f"more presses were left out, {left_out}, than serve, {len(presses)}: contacts are not found well on this gel, and "
+            "heights may be worthless; look at --plot, and press a ball in that lies wholly in the window, not too deep"
+        )
     window = np.array(presses[0].mask.shape[::-1])
     spans = np.ptp([press.centre for press in presses], axis=0) / window
     if spans.min() < _SPAN:
