@@ -377,9 +377,8 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
         paths.append(str(tmp_path / f"{i}.png"))
         write_image(paths[-1], touch.mask, {"object": "gear"} if i == 0 else None)
     poses = tmp_path / "poses.json"
-    poses.write_text(
-        json.dumps({"T_world_sensor": sensors.tolist(), "std_mm": 0.5}), "utf-8-sig"
-    )  # as some editors write it
+    # with a byte order mark, as some editors write it
+    poses.write_text(json.dumps({"T_world_sensor": sensors.tolist(), "std_mm": 0.5}), "utf-8-sig")
     monkeypatch.setattr(Localizer, "prepare", classmethod(lambda cls, *args, **options: plug))
     args = ["localize", *paths, "--object", "connector_plug", "--sensor", "gelslim"]
     done = CliRunner().invoke(app, [*args, "--sensor-poses", str(poses), "--json", "--out", str(tmp_path / "out")])

@@ -109,6 +109,13 @@ def test_a_file_may_begin_with_a_byte_order_mark(tmp_path):
     assert Sensor.load(tmp_path / "mine.toml") == Sensor.from_toml(PLAIN)
 
 
+def test_numbers_of_numpy_are_written_as_any():
+    size, pitch = np.array([320, 240]), np.array([5e-5, 5e-5])
+    made = Sensor("mine", tuple(size), tuple(pitch), np.float64(0.02), 2e-3, housing_depth=np.float64(1e-3))
+    assert made.to_toml() == Sensor("mine", (320, 240), (5e-5, 5e-5), 0.02, 2e-3, housing_depth=1e-3).to_toml()
+    assert Sensor.from_toml(made.to_toml()) == made
+
+
 def test_an_unknown_name_and_a_missing_file_say_what_to_do():
     with pytest.raises(SensorError, match="did you mean 'gelsight-mini'"):
         Sensor.load("gelsigt-mini")

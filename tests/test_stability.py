@@ -7,19 +7,21 @@ import cv2
 import numpy as np
 import open3d as o3d
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from geomtact import Sensor, load_mesh
 from geomtact.cli import app, evaluate_stability, study_options
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import NoPoseAgreesError
-from geomtact.evaluation import stability
+from geomtact.evaluation import stability, worlds
 from geomtact.evaluation.answer import REFUSED, Answer, judged
 from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.stability import SWEEPS, World, cut_off, knobbed, larger, opposed, scanned
+from geomtact.evaluation.stability import SWEEPS, opposed
 from geomtact.evaluation.touches import penetrations
 from geomtact.evaluation.trajectories import random_trajectory
+from geomtact.evaluation.worlds import World, cut_off, knobbed, larger, scanned
 from geomtact.report.result import plain
 from geomtact.report.stability_plot import draw_stability
 from geomtact.se3 import inverse
@@ -42,8 +44,6 @@ def test_the_first_level_of_what_may_be_wrong_is_the_localizers_own_world(here):
         assert np.array_equal(world.mesh.faces, here.mesh.faces)
         assert world.mesh.vertices == pytest.approx(here.mesh.vertices, abs=1e-12)
         assert replace(world, mesh=here.mesh) == here
-    for name in ("rig_shift", "rig_turn"):
-        assert SWEEPS[name].levels[0] == 0  # sensors are off in proportion
     for sweep in SWEEPS.values():
         assert set(sweep.inside) <= set(sweep.levels)
         assert (sweep.world is None) != (sweep.ask is None)
@@ -116,7 +116,7 @@ def test_a_coarser_part_keeps_so_many_faces():
 def test_pixels_that_are_larger_than_said_show_a_smaller_contact(here, plug):
     world = replace(SWEEPS["pitch"].world(here, 10), noise=CLEAN, threshold=0.0)
     whole = 0
-    for T, mask in stability.touches(world, 16, 3):
+    for T, mask in worlds.touches(world, 16, 3):
         if cut_off(mask) == 0:
             whole += 1
             assert plug.simulate(T).mask.sum() == pytest.approx(1.21 * mask.sum(), rel=0.03)
@@ -127,7 +127,7 @@ def test_pixels_that_are_larger_than_said_show_a_smaller_contact(here, plug):
 def test_touches_are_as_the_sweep_wants_them(here, name, level):
     world = replace(SWEEPS[name].world(here, level), noise=CLEAN)
     pixel = np.prod(world.sensor.pixel_pitch)
-    found = list(stability.touches(world, 4, 1))
+    found = list(worlds.touches(world, 4, 1))
     assert len(found) == 4
     for _, mask in found:
         assert world.area[0] <= mask.sum() * pixel <= world.area[1]
@@ -138,13 +138,13 @@ def test_touches_are_as_the_sweep_wants_them(here, name, level):
 def test_contacts_are_of_the_kind_that_the_sweep_wants(here, level):
     world = replace(SWEEPS["kind"].world(here, level), threshold=0.0)
     space = ContactSpace(world.mesh, world.sensor)
-    found = list(stability.touches(world, 3, 1))
+    found = list(worlds.touches(world, 3, 1))
     assert [contact_class(space, T) for T, _ in found] == [CLASSES[level - 1]] * 3
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
 def test_masks_show_as_many_patches_as_the_sweep_wants(here, level):
-    found = list(stability.touches(SWEEPS["shown"].world(here, level), 3, 1))
+    found = list(worlds.touches(SWEEPS["shown"].world(here, level), 3, 1))
     for _, mask in found:
         _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
         large = np.bincount(labels.ravel())[1:] * np.prod(here.sensor.pixel_pitch) >= 0.3 * MM**2
@@ -165,8 +165,8 @@ def test_knobs_stand_out_of_the_surface_and_leave_the_rest_as_it_was(here):
 
 
 def test_what_no_touch_fulfils_ends(here, monkeypatch):
-    monkeypatch.setattr(stability, "_TRIED", 40)
-    assert list(stability.touches(replace(here, area=(1.0, 2.0), threshold=0.0), 1, 0)) == []
+    monkeypatch.setattr(worlds, "TRIED", 40)
+    assert list(worlds.touches(replace(here, area=(1.0, 2.0), threshold=0.0), 1, 0)) == []
 
 
 def test_the_outline_cut_off_is_counted_in_pixel_edges():
@@ -185,13 +185,13 @@ def test_the_outline_cut_off_is_counted_in_pixel_edges():
 
 def test_a_world_as_it_is_said_to_be_gives_the_localizers_own_answers(plug, here):
     told = list(stability.swept(plug, SWEEPS["size"], 0, 2, 5, "fast"))
-    for answer, (T, mask) in zip(told, stability.touches(here, 2, 5), strict=True):
+    for answer, (T, mask) in zip(told, worlds.touches(here, 2, 5), strict=True):
         assert answer == judged(plug.mesh, T, plug.localize(mask, "mask", effort="fast", seed=5))
         assert np.isfinite(answer.gain)
 
 
 def test_a_pose_of_another_world_is_moved_along_the_sensors_axis_into_the_space(plug, here):
-    (T, _), *_ = stability.touches(replace(here, threshold=0.0), 1, 2)
+    (T, _), *_ = worlds.touches(replace(here, threshold=0.0), 1, 2)
     assert stability._knowable(plug.space, T) is T
     off = T.copy()
     off[2, 3] -= plug.sensor.max_penetration
@@ -200,22 +200,39 @@ def test_a_pose_of_another_world_is_moved_along_the_sensors_axis_into_the_space(
     assert (inverse(off) @ back)[:3, :3] == pytest.approx(np.eye(3)) and back[:2, 3] == pytest.approx(off[:2, 3])
 
 
-def test_a_rig_is_off_by_what_is_said_but_for_its_first_sensor(plug, monkeypatch):
-    told = []
+@pytest.fixture
+def told(plug, monkeypatch):
+    """The sensor poses of every scene that is localized, none of which is answered."""
+    poses = []
 
-    def localize(masks, kind, T_world_sensor, **options):
-        told.append(T_world_sensor)
+    def localize(self, masks, kind, T_world_sensor, **options):
+        poses.append(T_world_sensor)
         raise NoPoseAgreesError("none")
 
-    monkeypatch.setattr(plug.__class__, "localize", lambda self, *args, **options: localize(*args, **options))
-    answers = list(stability.swept(plug, SWEEPS["rig_shift"], 5, 8, 1, "fast"))
+    monkeypatch.setattr(plug.__class__, "localize", localize)
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("name", "level", "mm", "degrees"), [("rig_shift", 0, 0, 0), ("rig_shift", 5, 5, 0), ("rig_turn", 5, 0, 5)]
+)
+def test_a_rig_is_off_by_what_is_said_but_for_its_first_sensor(plug, told, name, level, mm, degrees):
+    answers = list(stability.swept(plug, SWEEPS[name], level, 8, 1, "fast"))
     assert answers == [REFUSED] * 8
     true = [scene.T_world_sensor for scene in make_scenes(plug, 8, 1, MODERATE, None, 3)]
     off = inverse(np.array(true)) @ np.array(told)
     assert off[:, 0] == pytest.approx(np.tile(np.eye(4), (8, 1, 1)))
-    assert off[..., :3, :3] == pytest.approx(np.tile(np.eye(3), (8, 3, 1, 1)))
-    # 16 distances, of which each has the mean square 25
-    assert np.sqrt((off[:, 1:, :3, 3] ** 2).sum(-1).mean()) == pytest.approx(5 * MM, rel=0.3)
+    turned = Rotation.from_matrix(off[:, 1:, :3, :3].reshape(-1, 3, 3)).magnitude()
+    # 16 of each, with these root mean squares
+    assert np.sqrt((off[:, 1:, :3, 3] ** 2).sum(-1).mean()) == pytest.approx(mm * MM, rel=0.3, abs=1e-9)
+    assert np.degrees(np.sqrt((turned**2).mean())) == pytest.approx(degrees, rel=0.3, abs=1e-5)
+
+
+def test_a_jaws_levels_are_degrees(plug, told):
+    list(stability.swept(plug, SWEEPS["jaw"], 30, 3, 1, "fast"))
+    assert len(told) == 3
+    for _, second in told:
+        assert second[2, 2] == pytest.approx(-np.cos(np.radians(30)), abs=1e-9)
 
 
 def test_figures_follow_from_the_answers():

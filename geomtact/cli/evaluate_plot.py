@@ -23,7 +23,7 @@ def plot_study(
     from geomtact.errors import InputError
 
     try:
-        content = json.loads(study.read_bytes())
+        content = json.loads(study.read_text("utf-8-sig"))
         if not isinstance(content, dict):
             raise ValueError("no object")
     except OSError as error:

@@ -80,7 +80,7 @@ def read_actions(path: Path) -> list[Touch | Probe]:
     import json
 
     try:
-        entries = json.loads(path.read_bytes())["actions"]
+        entries = json.loads(path.read_text("utf-8-sig"))["actions"]
         if not isinstance(entries, list):
             raise TypeError
     except OSError as error:

@@ -33,7 +33,7 @@ MaxPoses = Annotated[
     typer.Option("--max-poses", min=1, help="About how many poses; 1.2 million by default.", show_default=False),
 ]
 SensorName = Annotated[str | None, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
-KindName = Annotated[str, typer.Option("--kind", metavar="|".join(Kind), help="What the image is.")]
+KindName = Annotated[str, typer.Option("--kind", metavar="|".join(Kind), help="What the images are.")]
 Background = Annotated[Path | None, typer.Option("--background", help="Image of the untouched sensor, for readings.")]
 EffortName = Annotated[
     str | None,

@@ -42,7 +42,7 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
         It cannot be read, lacks a key or has an unknown one, or its poses are not rigid or of another number.
     """
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(path.read_text("utf-8-sig"))
     except FileNotFoundError:
         raise InputError(
             f'--sensor-poses {path}: no such file; write {{"T_world_sensor": [4x4 for each image]}}'

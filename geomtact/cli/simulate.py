@@ -130,7 +130,7 @@ def read_pose(path: Path) -> Array:
     from geomtact.se3 import check_transforms
 
     try:
-        content: Any = json.loads(path.read_bytes())
+        content: Any = json.loads(path.read_text("utf-8-sig"))
         T = content["T_sensor_object"] if isinstance(content, dict) else content
         return check_transforms(T, f"{path}: T_sensor_object").reshape(4, 4)
     except OSError as error:

@@ -21,7 +21,7 @@ def load(out: Path | None, schema: str) -> dict[str, Any]:
     if out is None or not out.exists():
         return {"schema": schema, "parts": {}}
     try:
-        content = json.loads(out.read_text("utf-8"))
+        content = json.loads(out.read_text("utf-8-sig"))
         held = content["schema"]
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{out}: is there, but is no study of geomtact; give another file with --out") from None

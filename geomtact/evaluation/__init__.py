@@ -6,7 +6,7 @@ command          module                        what is judged
 ``localize``     ``study``, ``proper``         one touch: information, calibration, error, time
 ``scores``       ``scores``                    one score after another, on the same touches
 ``choices``      ``choices``                   every default: speed, accuracy, what each thing adds
-``stability``    ``stability``                 what breaks an answer, and whether it knows
+``stability``    ``stability``, ``worlds``     what breaks an answer, and whether it knows
 ``thesis``       ``known_approach``,           the thesis's Table 1, and what a touch leaves open
                  ``ambiguity``, ``alike``
 ``touches``      ``sensors_study``             what each more sensor adds

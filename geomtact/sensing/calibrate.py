@@ -22,7 +22,7 @@ from geomtact.sensing.ball import OnBall, from_middle
 from geomtact.sensing.change import check_size
 from geomtact.sensing.colour import ColourTable, fit_weights, terms
 from geomtact.sensing.height import relief
-from geomtact.sensing.press import Press, find_presses, named_image
+from geomtact.sensing.press import SAME, Press, find_presses, named_image
 from geomtact.sensing.sensor import Sensor
 
 _FEWEST = 3  # presses
@@ -131,7 +131,8 @@ def calibrated(
             f"calibrate: {len(found)} presses contradict each other: colours fitted to all but one measure the ball "
             f"{100 * abs(off):.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
         )
-    return Calibrated(sensor, found, left_out, diameters, _doubts(found, len(left_out), diameters, off))
+    unlike = sum(why != SAME for why in left_out.values())
+    return Calibrated(sensor, found, left_out, diameters, _doubts(found, unlike, diameters, off))
 
 
 def _check_rest(presses: Sequence[Press]) -> None:
@@ -157,14 +158,14 @@ def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor
     return replace(sensor, colour=colour, height_noise=height_noise), diameters
 
 
-def _doubts(presses: Sequence[Press], left_out: int, diameters: Array, off: float) -> list[str]:
-    """What speaks against a calibration by these presses, ``left_out`` being how many more were given. On each of them the others
-    measure the ball's ``diameters`` (n,) [m], NaN where they see no ball, wrongly by a share ``off`` in the median."""
+def _doubts(presses: Sequence[Press], unlike: int, diameters: Array, off: float) -> list[str]:
+    """What speaks against a calibration by these presses, beside which ``unlike`` others show no ball of that size. On each the
+    others measure the ball's ``diameters`` (n,) [m], NaN where they see none, wrongly by a share ``off`` in the median."""
     out = []
-    if left_out > len(presses):
+    if unlike > len(presses):
         out.append(
-            f"more presses were left out, {left_out}, than serve, {len(presses)}: contacts are not found well on this gel, and "
-            "heights may be worthless; look at --plot, and press a ball in that lies wholly in the window, not too deep"
+            f"on {unlike} presses no ball of that size was found, on {len(presses)} it was: heights may be worthless; see why "
+            "each is left out, and press one ball in a dozen times, not deeper than to its middle, wholly within the window"
         )
     window = np.array(presses[0].mask.shape[::-1])
     spans = np.ptp([press.centre for press in presses], axis=0) / window

@@ -42,7 +42,10 @@ def faults(image: Array, background: Array | None) -> list[str]:
     if out or background is None:
         return out
     if np.array_equal(image, background):
-        return ["the image and its background are the same, pixel for pixel; give one of the untouched gel beside it"]
+        return [
+            "the image and its background are the same, pixel for pixel, so no contact can be seen: give a reading, and "
+            "beside it one of the untouched gel"
+        ]
     seen, rest = _coarse(image), _coarse(background)
     gain = float(np.median(seen.mean(-1)) / max(float(np.median(rest.mean(-1))), 1e-6))
     seen /= max(gain, 1e-6)

@@ -14,6 +14,7 @@ from geomtact.se3 import Array
 from geomtact.sensing.change import as_unit_rgb, colour_change, same_size
 from geomtact.sensing.local_shape import contact_of
 
+SAME = "it is the same image as one before"
 _ROUND = 0.05  # of the radius that half of an outline may stray from its circle
 _SEEN = 0.4  # share of the circle that has to be seen
 
@@ -50,7 +51,7 @@ def find_presses(
         name, image = named_image(source, f"press {number}")
         same_size(image, reference, name, "background")
         if any(np.array_equal(image, other) for other in seen):
-            left_out[name] = "it is the same image as one before"
+            left_out[name] = SAME
             continue
         seen.append(image)
         change, felt = colour_change(image, reference)

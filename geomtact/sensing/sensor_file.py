@@ -56,12 +56,13 @@ def toml_of_sensor(sensor: Sensor) -> str:
     lines = []
     for key, f in _KEYS.items():
         value = getattr(sensor, f.name)
-        if f.name == "colour" or (key not in _ALWAYS and value == f.default):
+        if f.name == "colour" or (key not in _ALWAYS and (value is None or value == f.default)):
             continue
+        values = value if f.name in _PAIRS else [value]
         if f.name in _LENGTHS:
-            value = [_mm(v) for v in value] if f.name in _PAIRS else _mm(value)
-        text = _toml_string(value) if f.name in _TEXTS else str(list(value) if f.name in _PAIRS else value)
-        lines.append(f"{key} = {text}")
+            values = [_mm(v) for v in values]
+        text = ", ".join(_toml_string(v) if f.name in _TEXTS else f"{v}" for v in values)
+        lines.append(f"{key} = [{text}]" if f.name in _PAIRS else f"{key} = {text}")
     if sensor.colour is not None:
         lines += [
             "",
@@ -98,7 +99,7 @@ def _value(key: str, value: Any) -> Any:
         return value[0] / 1e3, value[1] / 1e3
     if not _number(value):
         raise SensorError(f"{key} must be a float, got {value!r}")
-    return value / 1e3
+    return value / 1e3 if name in _LENGTHS else value
 
 
 def _colour(data: dict[str, Any]) -> ColourTable:

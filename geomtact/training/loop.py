@@ -1,4 +1,7 @@
-"""What trainings share from step to step: seeds, the learning rate, and a loss that has to stay a number."""
+"""What the trainings of the encoder and of the mask network share from step to step.
+
+Seeds, the learning rate, and a loss that has to stay a number.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +19,13 @@ from geomtact.training.state import not_a_number
 
 
 def steps(
-    optimizer: Optimizer, first: int, last: int, rate: float, seed: int
+    optimizer: Optimizer, first: int, n: int, rate: float, seed: int
 ) -> Iterator[tuple[int, np.random.Generator]]:
-    """The steps from ``first`` to before ``last``, gradients at zero and the ``rate`` as it is there. Each has a seed of its
+    """The steps from ``first`` on, of ``n`` in all, gradients at zero and the ``rate`` as it is there. Each has a seed of its
     own, so that a resumed run draws what an uninterrupted one does."""
-    for step in range(first, last):
+    for step in range(first, n):
         for group in optimizer.param_groups:
-            group["lr"] = rate * schedule(step, last)
+            group["lr"] = rate * schedule(step, n)
         optimizer.zero_grad()
         yield step, np.random.default_rng([seed, step])
 

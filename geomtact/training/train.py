@@ -97,7 +97,7 @@ def train(
             # one hopeless touch shall not steer the step
             (-gain.clamp(min=-8).mean() / settings.scenes_a_step).backward()
             gains.append(float(gain.detach().mean()))
-        descend(network, optimizer, sum(gains[-settings.scenes_a_step :]), folder, step)
+        descend(network, optimizer, -sum(gains[-settings.scenes_a_step :]), folder, step)
         if (step + 1) % check_every == 0 or step + 1 == settings.steps:
             curve.step.append(step + 1)
             curve.training.append(float(np.mean(gains)))
