@@ -330,15 +330,12 @@ def told_together(content):
             at.setdefault(name, {})[key] = level["figures"] | {"ninety": ninety, "held": held}
     held, beyond = ([f for sweep in at.values() for f in sweep.values() if f["held"] == well] for well in (True, False))
     within = [f["ninety"]["low"] <= 0.95 and f["ninety"]["high"] >= 0.85 for f in held]
-    missed, least, *_, most = sorted(100 * f["ninety"]["share"] for f in held)
-    yield f"at {sum(within)} of the {len(held)} levels; the share itself is {least:.0f} to {most:.0f} % at all but one"
-    patches = at["kind"][5]["ninety"]
-    assert within.count(False) == 1 and 100 * patches["share"] == missed
-    yield filled(
-        "several patches, misses: {share:.0%} ({:.0f} to {:.0f})",
-        *(100 * patches[k] for k in ("low", "high")),
-        **patches,
-    )
+    missed, too, least, *_, most = sorted(100 * f["ninety"]["share"] for f in held)
+    yield f"at {sum(within)} of the {len(held)} levels; the share itself is {least:.0f} to {most:.0f} % at all but two"
+    touched, masked = (at[name][level]["ninety"] for name, level in (("kind", 5), ("shown", 3)))
+    assert within.count(False) == 2 and [100 * each["share"] for each in (masked, touched)] == [missed, too]
+    for row, each in (("what is touched {share:.0%}", touched), ("what the mask shows {share:.0%}", masked)):
+        yield filled(row + " ({:.0f} to {:.0f})", *(100 * each[k] for k in ("low", "high")), **each)
     one_in = min(math.floor(f["wrong"] / f["silent"] + 1e-9) for f in beyond if f["silent"])
     yield f"at no level more than one in {({17: 'seventeen'}).get(one_in, one_in)}"
     for name, unit in {"rig_shift": " mm", "rig_turn": "°"}.items():
@@ -358,6 +355,9 @@ SENTENCES = [
     "of flat ones {kind[1][ninety][share]:.0%} of {kind[1][n]}, of cylinders {kind[4][ninety][share]:.0%} (",
     "of contacts of several patches {kind[5][ninety][share]:.0%} of {kind[5][n]} (",
     "({kind[5][claimed_mean]:.1f} nats claimed for {kind[5][gain_mean]:.1f})",
+    "show two patches {shown[2][ninety][share]:.0%} of the truths lie in the 90 % region, of those that show three or more",
+    "three or more {shown[3][ninety][share]:.0%} ({shown[3][claimed_mean]:.1f} nats claimed for {shown[3][gain_mean]:.1f}); of one",
+    "of one {shown[1][ninety][share]:.0%}",
     "({jaw[0][gain_mean]:.1f} nats told, {jaw[0][claimed_mean]:.1f} claimed)",
 ]
 COUNTS = [
