@@ -356,7 +356,7 @@ SENTENCES = [
     "of contacts of several patches {kind[5][ninety][share]:.0%} of {kind[5][n]} (",
     "({kind[5][claimed_mean]:.1f} nats claimed for {kind[5][gain_mean]:.1f})",
     "show two patches {shown[2][ninety][share]:.0%} of the truths lie in the 90 % region, of those that show three or more",
-    "three or more {shown[3][ninety][share]:.0%} ({shown[3][claimed_mean]:.1f} nats claimed for {shown[3][gain_mean]:.1f}); of one",
+    "three or more {shown[3][ninety][share]:.0%} ({shown[3][claimed_mean]:.1f} nats claimed for {shown[3][gain_mean]:.1f})",
     "of one {shown[1][ninety][share]:.0%}",
     "({jaw[0][gain_mean]:.1f} nats told, {jaw[0][claimed_mean]:.1f} claimed)",
 ]

@@ -59,14 +59,14 @@ def _without_light_drift(image: Array, reference: Array, step: int) -> Array:
         x, y = (each[::step, ::step, c].ravel() for each in (reference, image))
         calm_x, calm_y = x, y
         for _ in range(6):
-            mean_x, mean_y = calm_x.mean(), calm_y.mean()
+            mean_x, mean_y = calm_x.sum() / calm_x.size, calm_y.sum() / calm_y.size
             dx = calm_x - mean_x
             variance = dx @ dx / dx.size
             gain = np.clip(dx @ calm_y / dx.size / variance, 0.8, 1.25) if variance > _GREY**2 else dx.dtype.type(1)
             offset = mean_y - gain * mean_x
             error = np.abs(y - gain * x - offset)
             calm = np.flatnonzero(error <= np.median(error))
-            calm_x, calm_y = x[calm], y[calm]
+            calm_x, calm_y = x.take(calm), y.take(calm)
         gains[c], offsets[c] = gain, offset
     return image - gains * reference - offsets
 

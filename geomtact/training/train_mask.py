@@ -63,7 +63,7 @@ def train_mask(
     torch.manual_seed(settings.seed)
     network = MaskNetwork()
     if start is not None:
-        begin_with(network, _widened(start))
+        begin_with(network, _grown(start, network))
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay)
     first, curve = resume(folder, network, optimizer, asdict(settings))
@@ -131,9 +131,10 @@ def _tensors(parts: Sequence[Presses]) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(seen), torch.from_numpy(contact)
 
 
-def _widened(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """``weights``, those of a network that saw fewer channels too: what it did not see counts for nothing at first."""
-    out = dict(weights)
+def _grown(weights: Mapping[str, torch.Tensor], network: MaskNetwork) -> dict[str, torch.Tensor]:
+    """``weights``, those of a network that saw fewer channels or was less deep, too: what it lacks counts for nothing yet."""
+    fresh = {name: value for name, value in network.state_dict().items() if name.startswith("deeper.")}
+    out = fresh | dict(weights)
     first = out.get(_FIRST)
     if first is not None and first.ndim == 4 and first.shape[1] < CHANNELS:
         out[_FIRST] = F.pad(first, (0, 0, 0, 0, 0, CHANNELS - first.shape[1]))
