@@ -1,5 +1,6 @@
 """A sensor of one's own: presses of a ball of known diameter make colours tell slopes, heights and other balls."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -136,6 +137,17 @@ def test_presses_all_in_one_place_or_few_are_doubted():
     untouched = [np.clip(background.astype(int) + n, 0, 255).astype(np.uint8) for n in range(4)]
     doubted = calibrated([*images, *images, *untouched], 8 * MM, background, PITCH).warnings
     assert "on 4 presses no ball of that size was found, on 3 it was" in doubted[0]
+
+
+def test_a_pitch_with_which_imprints_are_wider_than_the_ball_is_doubted():
+    """Of a ball of 4 mm, with one press of a larger among them, whose imprint has a radius of 2.4 mm."""
+    rng = np.random.default_rng(0)
+    made = [lit(pressed(4 * MM, place, contact=1.2 * MM)[1], rng) for place in PLACES]
+    wide = lit(pressed(12 * MM, (80, 60), contact=2.4 * MM)[1], rng)[0]
+    found = calibrated([*(image for image, _ in made), wide], 4 * MM, made[0][1], PITCH)
+    assert "is wider than the ball" in found.left_out[f"press {len(PLACES) + 1}"]
+    allowed = float(re.search(r"allows a pitch of ([0-9.]+) mm at most", found.warnings[0])[1])
+    assert allowed * MM == pytest.approx(PITCH * 2.0 / 2.4, rel=0.1)
 
 
 def test_a_press_of_another_ball_is_named(found):

@@ -272,6 +272,14 @@ def test_a_background_of_another_size_is_refused(background, tmp_path):
         contact_mask(None, background)
 
 
+def test_a_grey_file_is_named_with_its_own_shape(tmp_path):
+    write_image(tmp_path / "grey.png", np.ones((24, 32), bool))
+    with pytest.raises(
+        ImageError, match=r"grey.png: expected an RGB image.* of shape \(24, 32\); give one image, in colour"
+    ):
+        contact_mask(tmp_path / "grey.png")
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [

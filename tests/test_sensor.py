@@ -53,12 +53,12 @@ def test_a_sensor_is_read_from_a_file_and_passed_through(tmp_path):
     ("change", "message"),
     [
         ("pixel_pich_mm = [1, 1]", "unknown key 'pixel_pich_mm'; did you mean 'pixel_pitch_mm'?"),
-        ("housing_depth_mm = true", "housing_depth_mm must be a float, got True"),
-        ("membrane_radius_mm = 'round'", "membrane_radius_mm must be a float, got 'round'"),
-        ("membrane_radius_mm = nan", "membrane_radius_mm must be a float, got nan"),
+        ("housing_depth_mm = true", "housing_depth_mm must be a number, such as 20.0, got True"),
+        ("membrane_radius_mm = 'round'", "membrane_radius_mm must be a number, such as 20.0, got 'round'"),
+        ("membrane_radius_mm = nan", "membrane_radius_mm must be a number, such as 20.0, got nan"),
         ("membrane_radius_mm = 5.0", "must be 0 (flat) or exceed the window's half diagonal, 11.32 mm"),
         ("housing_depth_mm = -1", "housing_depth_mm must be >= 0"),
-        ("note = 3", "note must be a str, got 3"),
+        ("note = 3", 'note must be text, such as note = "mine", got 3'),
         (
             "contact_method = 'clasical'",
             "contact_method must be one of auto, classical, pressure, learned, got 'clasical'",

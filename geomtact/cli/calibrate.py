@@ -88,11 +88,12 @@ def calibrate(
     if ball_mm is None:
         raise UsageError("--ball-mm: expected the ball's diameter in millimetres, got none; give it")
     found = calibrated(presses, 1e-3 * ball_mm, background, pitch, sensor, name or out.stem)
-    for left_out, why in found.left_out.items():
-        tell(f"warning: {left_out} is left out: {why}")
+    for why in dict.fromkeys(found.left_out.values()):
+        names = [name for name, reason in found.left_out.items() if reason == why]
+        tell(f"warning: left out ({why}): {', '.join(names)}")
+    _print(found, ball_mm)
     for warning in found.warnings:
         tell(f"warning: {warning}")
-    _print(found, ball_mm)
     if other_presses is not None and other_ball_mm is not None:
         _print_membrane(found, ball_mm, other_presses, other_ball_mm, background)
     _write(found.sensor, sensor, out)

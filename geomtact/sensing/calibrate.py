@@ -105,14 +105,16 @@ def calibrated(
     known = None if sensor is None else Sensor.load(sensor)
     pitch = known.pixel_pitch if pixel_pitch is None and known is not None else pixel_pitch
     found, left_out = find_presses(presses, reference, None if pitch is None else _pair(pitch))
+    radius = 0.5 * ball_diameter
+    # the pitch with which no imprint is wider than the ball
+    most = radius / max((press.radius for press in found), default=np.inf)
     if pitch is None:
-        most = 0.5 * ball_diameter / max((press.radius for press in found), default=np.inf)
         bound = f"; it is at most {1e3 * most:.4f} mm, the ball's radius over the largest imprint's" if found else ""
         raise UsageError(
             "pixel_pitch: none was given (--pitch-mm, --pins or --sensor), and presses of unknown depth do not tell it: measure "
             f"how many pixels a known length takes on the membrane{bound}"
         )
-    pitch, radius = _pair(pitch), 0.5 * ball_diameter
+    pitch = _pair(pitch)
     for press in [p for p in found if p.radius * pitch[0] >= radius]:
         left_out[press.name] = f"an imprint of {2e3 * press.radius * pitch[0]:.2f} mm is wider than the ball"
         found.remove(press)
@@ -132,7 +134,14 @@ def calibrated(
             f"{100 * abs(off):.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
         )
     unlike = sum(why != SAME for why in left_out.values())
-    return Calibrated(sensor, found, left_out, diameters, _doubts(found, unlike, diameters, off))
+    doubts = _doubts(found, unlike, diameters, off)
+    if pitch[0] > most:
+        doubts.insert(
+            0,
+            f"some imprints are wider than the ball, which allows a pitch of {1e3 * most:.4f} mm at most; {1e3 * pitch[0]:.4f} "
+            "was given: measure it, and the ball",
+        )
+    return Calibrated(sensor, found, left_out, diameters, doubts)
 
 
 def _check_rest(presses: Sequence[Press]) -> None:

@@ -95,13 +95,15 @@ def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]
 def as_unit_rgb(image: Any, name: str) -> Array:
     """An image (H, W, 3), uint8 or float 0..1, or its path, as float32 0..1; what is none is refused under its ``name``."""
     if isinstance(image, str | Path):
-        image = read_image(image)[..., :3]
+        name, image = str(image), read_image(image)
+        image = image[..., :3] if image.ndim == 3 else image
     if image is None:
         raise ImageError(f"{name}: expected an RGB image (H, W, 3) or its path, got none; give it")
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 8:
         raise ImageError(
-            f"{name}: expected an RGB image (H, W, 3) of 8 pixels or more a side, got an array of shape {image.shape}"
+            f"{name}: expected an RGB image (H, W, 3) of 8 pixels or more a side, got an array of shape {image.shape}; give one "
+            "image, in colour, as the camera made it"
         )
     if image.dtype == np.uint8:
         return np.asarray(cv2.LUT(image, (np.arange(256) / 255).astype(np.float32)))

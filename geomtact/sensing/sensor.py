@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomtact.errors import SensorError, nearest_name
+from geomtact.errors import SensorError, did_you_mean, nearest_name
 from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable
 
@@ -100,7 +100,8 @@ class Sensor:
         need(self.height_noise > 0, f"height_noise_mm must be positive, got {1e3 * self.height_noise:g}")
         need(
             self.contact_method in CONTACT_METHODS,
-            f"contact_method must be one of {', '.join(CONTACT_METHODS)}, got {self.contact_method!r}",
+            f"contact_method must be one of {', '.join(CONTACT_METHODS)}, got {self.contact_method!r}"
+            f"{did_you_mean(str(self.contact_method), CONTACT_METHODS)}",
         )
 
     @classmethod

@@ -85,7 +85,7 @@ def _value(key: str, value: Any) -> Any:
         return _colour(value)
     if name in _TEXTS:
         if not isinstance(value, str):
-            raise SensorError(f"{key} must be a str, got {value!r}")
+            raise SensorError(f'{key} must be text, such as {key} = "mine", got {value!r}')
         return value
     if name in _PAIRS:
         if not (isinstance(value, list) and len(value) == 2 and all(_number(v) for v in value)):
@@ -98,7 +98,7 @@ def _value(key: str, value: Any) -> Any:
             return int(value[0]), int(value[1])
         return value[0] / 1e3, value[1] / 1e3
     if not _number(value):
-        raise SensorError(f"{key} must be a float, got {value!r}")
+        raise SensorError(f"{key} must be a number, such as 20.0, got {value!r}")
     return value / 1e3 if name in _LENGTHS else value
 
 
