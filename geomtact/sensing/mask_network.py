@@ -20,12 +20,8 @@ from torch import nn
 
 WEIGHTS = Path(__file__).with_name("mask_network.safetensors")
 WIDTHS = (12, 24, 48, 64)  # channels, at each halving
-DEEPER = (
-    0,
-    0,
-    1,
-    2,
-)  # residual blocks more at each, on the way down: what is far apart is seen together where it is coarse
+# Residual blocks more at each, on the way down: where it is coarse, what is far apart is seen together
+DEEPER = (0, 0, 1, 2)
 _GROUPS = 4  # of channels that are normalised together
 _SIDE = 60  # px of the shorter side of what it sees
 _STEP = 8  # px that sides are multiples of: they are halved three times
