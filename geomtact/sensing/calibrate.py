@@ -134,14 +134,13 @@ def calibrated(
             f"{100 * abs(off):.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
         )
     unlike = sum(why != SAME for why in left_out.values())
-    doubts = _doubts(found, unlike, diameters, off)
+    doubts = []
     if pitch[0] > most:
-        doubts.insert(
-            0,
+        doubts = [
             f"some imprints are wider than the ball, which allows a pitch of {1e3 * most:.4f} mm at most; {1e3 * pitch[0]:.4f} "
-            "was given: measure it, and the ball",
-        )
-    return Calibrated(sensor, found, left_out, diameters, doubts)
+            "was given: measure it, and the ball"
+        ]
+    return Calibrated(sensor, found, left_out, diameters, [*doubts, *_doubts(found, unlike, diameters, off)])
 
 
 def _check_rest(presses: Sequence[Press]) -> None:
