@@ -13,13 +13,13 @@ from scipy.sparse.csgraph import connected_components
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.se3 import Array
+from geomtact.sensing.patches import patches
 
 CLASSES = ("flat", "edge", "corner", "cylinder", "texture")
 _SHAPE = 96  # rays along the window's longer side
 _FACET = np.radians(20)  # between neighbouring facets of one smooth surface, at most
 _FLAT = np.radians(6)  # by which the directions of a flat contact spread, rms
 _SHARE = 0.02  # of the contact that a direction has to hold to count
-_PATCH = 0.3e-6  # m^2 that a patch has to have to count
 
 
 def contact_class(space: ContactSpace, T: ArrayLike) -> str:
@@ -30,18 +30,10 @@ def contact_class(space: ContactSpace, T: ArrayLike) -> str:
     shape = (max(8, round(high * scale)), max(8, round(wide * scale)))
     depth = space.caster.depths(sensor, np.asarray(T, float)[None], shape)[0]
     felt = depth > 0
-    if patches(felt, sensor.pixel_area(shape)) >= 3:
+    if len(patches(felt, sensor.pixel_area(shape))) >= 3:
         return "texture"
     normal, count = _directions(space, np.asarray(T, float), shape, felt)
     return _of_directions(normal, count)
-
-
-def patches(mask: NDArray[np.bool_], pixel_area: float) -> int:
-    """How many patches of 0.3 mm^2 or more a mask (h, w) has, whose pixels have ``pixel_area`` [m^2]."""
-    import cv2
-
-    stats = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)[2]
-    return int((stats[1:, cv2.CC_STAT_AREA] * pixel_area >= _PATCH).sum())
 
 
 def _of_directions(normal: Array, count: NDArray[np.int64]) -> str:

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
-from geomtact.evaluation.contact_class import contact_class, patches
+from geomtact.evaluation.contact_class import contact_class
 from geomtact.geometry.mesh import Mesh
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
+from geomtact.sensing.patches import patches
 from geomtact.sensing.sensor import Sensor
 
 TRIED = 500  # touches, at most, for each one that is wanted
@@ -101,7 +102,7 @@ def touches(world: World, n: int, seed: int) -> Iterator[tuple[Array, NDArray[np
             if not (world.border[0] <= cut_off(mask) <= world.border[1]):
                 continue
             noisy = spoilt(mask, space, world.noise, rng)
-            if not (world.shows[0] <= patches(noisy, pixel) <= world.shows[1]):
+            if not (world.shows[0] <= len(patches(noisy, pixel)) <= world.shows[1]):
                 continue
             yield T, noisy
             found += 1

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index, spelled_out
+from geomtact.scoring.apart import mixed, ways
 from geomtact.scoring.calibration import Calibration, Touches, best_floor, calibrate, posterior_log_prob
 from geomtact.scoring.encoder import EncoderScorer
 from geomtact.sensing.contact import Shown
@@ -148,25 +149,32 @@ class Cascade:
     def whole(self, index: Index, mask: Shown) -> Rows:
         """The blocks alone."""
         first, runs = index.block_runs
-        score = self.blocks.score(index, mask)
+        shares, shown = ways(mask, index.sensor)
+        scores = [self.blocks.score(index, each) for each in shown]
+        score = mixed(shares, scores, index.log_block_weight, self.coarse.temperature)
         return _possible(Rows(first, runs, score, index.log_block_weight, self.coarse, self.blocks.name))
 
     def expanded(self, index: Index, mask: Shown) -> Rows:
         """Blocks, and cell by cell those of them that hold ``SHARE`` of the mass."""
         first, counts = index.block_runs
-        seen = self.blocks.cells.seen(index, mask)
-        score, trust = self.blocks.trusted(index, seen)
+        shares, shown = ways(mask, index.sensor)
+        seen = [self.blocks.cells.seen(index, each) for each in shown]
+        scores, trust = zip(*(self.blocks.trusted(index, each) for each in seen), strict=True)
         prior = index.log_block_weight
+        score = mixed(shares, scores, prior, self.coarse.temperature)
         log_prob = posterior_log_prob(score, prior, replace(self.coarse, floor=0.0))
         chosen = heaviest(np.exp(log_prob), SHARE)
         length = np.where(chosen, counts, 1)
         ids = spelled_out(first, length)
-        runs = np.ones(len(ids), np.int64)
-        cell_score, cell_prior = trust * self.blocks.cells.of(ids, seen), index.log_weight[ids]
-        # the blocks that stay whole were scored as the cells that they begin with
+        runs, cell_prior = np.ones(len(ids), np.int64), index.log_weight[ids]
+        # the blocks that stay whole are scored as the cells that they begin with, and then as what they are
         at, whole = (np.cumsum(length) - length)[~chosen], ~chosen
-        runs[at], cell_score[at], cell_prior[at] = counts[whole], score[whole], prior[whole]
+        runs[at], cell_prior[at] = counts[whole], prior[whole]
+        cell_scores = [by * self.blocks.cells.of(ids, each) for by, each in zip(trust, seen, strict=True)]
+        for cell_score, block_score in zip(cell_scores, scores, strict=True):
+            cell_score[at] = block_score[whole]
         assert self.partly is not None
+        cell_score = mixed(shares, cell_scores, cell_prior, self.partly.temperature)
         return _possible(Rows(ids, runs, cell_score, cell_prior, self.partly, self.blocks.cells.name))
 
 

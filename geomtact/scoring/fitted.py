@@ -16,6 +16,7 @@ from geomtact.contact_space.index import Index
 from geomtact.errors import MeshError
 from geomtact.files import write_text, write_whole
 from geomtact.progress import Progress
+from geomtact.scoring.apart import mixed, ways
 from geomtact.scoring.calibration import Calibration, Touches, calibrate, simulate_touches
 from geomtact.scoring.cascade import Cascade, Rows
 from geomtact.scoring.catalogue import (
@@ -35,7 +36,7 @@ from geomtact.scoring.vectors import describe_index
 from geomtact.scoring.witness import Witness
 from geomtact.sensing.contact import Shown
 
-FORMAT = 10
+FORMAT = 11
 _COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
 _LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than choosing which
 _USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual
@@ -98,7 +99,9 @@ class FittedScorer:
         if log_prior is not None:
             cells = np.flatnonzero(np.isfinite(log_prior))
             prior = log_prior[cells]
-        score = _deeper(scorer.score(index, mask), index, above).reshape(-1)[cells]
+        shares, shown = ways(mask, index.sensor)
+        scores = [_deeper(scorer.score(index, each), index, above).reshape(-1) for each in shown]
+        score = mixed(shares, scores, index.log_weight, calibration.temperature)[cells]
         return Rows(cells, None, score, prior, calibration, scorer.name)
 
 

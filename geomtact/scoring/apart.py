@@ -1,0 +1,59 @@
+"""Contacts of several patches, for which the score of a cell is too sure.
+
+Where two or three places of an object touch at once, a degree more or less of tilt decides which of them do. So the contact
+that was simulated for the touch's own cell often shows but one of them, while that of a cell elsewhere, whose own contact
+happens to look alike, wins. The likelihood is therefore a mixture: the contact is as simulated, or the cell's own contact
+is one of its patches alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.sensing.contact import Shown
+from geomtact.sensing.patches import patches
+from geomtact.sensing.sensor import Sensor
+
+# Share of the mixture that the patches alone have. Of 650 touches of several patches, drawn on purpose on four parts, 0.1 to 0.3
+# tell alike, 0.07 nats more than none; on a gear, whose contacts have several as simulated, 0.15 costs as much
+_ALONE = 0.15
+_MOST = 3  # patches, the largest, that are looked at alone
+
+
+def ways(mask: Shown, sensor: Sensor) -> tuple[list[float], list[Shown]]:
+    """What the object's own contact may be where a sensor shows ``mask`` (h, w): contacts (h, w), and before them the share of
+    the mixture that each has."""
+    alone = patches(mask, sensor.pixel_area(mask.shape))[:_MOST]
+    if len(alone) < 2:
+        return [1.0], [mask]
+    return [1 - _ALONE] + [_ALONE / len(alone)] * len(alone), [mask, *alone]
+
+
+def mixed(
+    shares: Sequence[float],
+    scores: Sequence[NDArray[np.float32]],
+    log_weight: NDArray[np.floating],
+    temperature: float,
+) -> NDArray[np.float32]:
+    """The scores (N,) of a mixture of likelihoods, that have ``shares`` (k,) and ``scores`` (k, N).
+
+    Each likelihood, exp(score / temperature), is taken to the mean of one over the rows, whose measure has the log ``log_weight``
+    (N,): so every part tells of the pose alone, however unlike the object it is.
+    """
+    if len(scores) == 1:
+        return scores[0]
+    inverse = np.float32(1 / temperature)
+    out: NDArray[np.float32] | None = None
+    for share, score in zip(shares, scores, strict=True):
+        likely = score * inverse
+        joint = likely + log_weight
+        top = joint.max()
+        joint -= top
+        likely += np.float32(np.log(share) - top - np.log(np.exp(joint, out=joint).sum(dtype=float)))
+        out = likely if out is None else np.logaddexp(out, likely, out=out)
+    assert out is not None
+    out *= np.float32(temperature)
+    return out

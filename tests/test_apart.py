@@ -1,0 +1,119 @@
+"""Laws of contacts of several patches: their likelihood is a mixture, and a single patch is scored as it always was."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import softmax
+
+from geomtact.scoring import fitted
+from geomtact.scoring.apart import mixed, ways
+from geomtact.scoring.calibration import Calibration, posterior_log_prob
+from geomtact.sensing.patches import patches
+
+MM = 1e-3
+
+
+@pytest.fixture(scope="module")
+def localizer(make_localizer):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitted, "_LARGE", 0)  # so that its cells are scored in some blocks only, too
+        return make_localizer("bracket", "gelslim", scorer="encoder")
+
+
+def two_patches(localizer):
+    """A contact of 4 by 4 mm and one of 2 by 3 mm beside it."""
+    mask = np.zeros(localizer.sensor.image_size_px[::-1], bool)
+    x, y = (c / MM for c in localizer.sensor.pixel_centres())
+    X, Y = np.meshgrid(x, y)
+    left, right = (abs(X + 5) < 2) & (abs(Y) < 2), (abs(X - 4) < 1) & (abs(Y - 1) < 1.5)
+    return mask | left | right, [left, right]
+
+
+def test_patches_are_the_mask_in_parts_the_largest_first(rng):
+    mask = rng.random((90, 120)) > 0.55
+    pixel_area = 0.3e-6 / 7.5  # eight pixels count, seven do not
+    found = patches(mask, pixel_area)
+    sizes = [part.sum() for part in found]
+    assert len(found) > 3 and sizes == sorted(sizes, reverse=True) and min(sizes) >= 8
+    together = np.sum(found, 0)
+    assert (together <= mask).all()
+    assert not patches(mask & (together == 0), pixel_area)
+    assert all(len(patches(part, pixel_area)) == 1 for part in found)
+
+
+def test_patches_keep_their_probabilities(localizer):
+    mask, parts = two_patches(localizer)
+    shown = np.where(mask, np.float32(0.8), np.float32(0.1))
+    found = patches(shown, localizer.sensor.pixel_area(mask.shape))
+    for each, part in zip(found, parts, strict=True):
+        assert np.array_equal(each, np.where(part, np.float32(0.8), np.float32(0)))
+        assert each.dtype == np.float32
+
+
+def test_one_patch_is_taken_as_it_is(localizer):
+    mask, (left, right) = two_patches(localizer)
+    dirt = left.copy()
+    dirt[:2, :2] = True
+    for alone in (left, right, dirt, np.zeros_like(mask), np.ones_like(mask)):
+        shares, shown = ways(alone, localizer.sensor)
+        assert shares == [1.0] and shown[0] is alone
+
+
+def test_the_shares_of_several_patches_add_up_to_one(localizer):
+    for number in (2, 3, 5):
+        mask = np.zeros(localizer.sensor.image_size_px[::-1], bool)
+        for i in range(number):
+            mask[20:60, 30 + 50 * i : 60 + 50 * i] = True
+        shares, shown = ways(mask, localizer.sensor)
+        assert sum(shares) == pytest.approx(1, rel=1e-12) and min(shares) > 0
+        assert shown[0] is mask and len(shown) == len(shares) == 1 + min(number, 3)
+
+
+def test_the_posterior_of_a_mixture_is_the_mixture_of_the_posteriors(rng):
+    """Under the measure that each likelihood was normalised by, however far the scores reach."""
+    shares, temperature = [0.7, 0.2, 0.1], 0.37
+    scores = [(rng.normal(size=500) * 40).astype(np.float32) for _ in shares]
+    log_weight = np.log(rng.dirichlet(np.ones(500)) + 1e-300).astype(np.float32)
+    log_weight[:20] = -np.inf
+    expected = sum(s * softmax(x / temperature + log_weight) for s, x in zip(shares, scores, strict=True))
+    score = mixed(shares, [x.copy() for x in scores], log_weight, temperature)
+    got = posterior_log_prob(score, log_weight, Calibration(temperature, 0.0, 1.0))
+    assert np.exp(got) == pytest.approx(expected, rel=1e-4, abs=1e-12)
+    assert (np.exp(got)[:20] == 0).all()
+
+
+@pytest.mark.parametrize("resolved", ["blocks", "cells", "all"])
+def test_several_patches_are_the_mixture_at_every_resolution(localizer, resolved):
+    """Of the posteriors of the whole contact and of each patch by itself, on the same cells."""
+    fit, index = localizer.scorer, localizer.index
+    mask, parts = two_patches(localizer)
+    rows = fit.rows(index, mask, resolved)
+    shares, _ = ways(mask, localizer.sensor)
+    density = posterior_log_prob(rows.score, rows.log_prior, replace(rows.calibration, floor=0.0)) - rows.log_prior
+    for share, part in zip(shares[1:], parts, strict=True):
+        alone = fit.rows(index, part, resolved)
+        log_prob = posterior_log_prob(alone.score, alone.log_prior, replace(alone.calibration, floor=0.0))
+        # its best row has at least its share of what the patch alone gives it, wherever the two divide the grid alike
+        same = {tuple(row): i for i, row in enumerate(zip(rows.first, _runs(rows), strict=True))}
+        best = np.argsort(-log_prob)[:50]
+        both = [(i, same[key]) for i in best if (key := (alone.first[i], _runs(alone)[i])) in same]
+        assert len(both) >= 20
+        for i, j in both:
+            assert density[j] >= np.log(share) + (log_prob[i] - alone.log_prior[i]) - 0.05
+
+
+def _runs(rows):
+    return np.ones(len(rows.first), int) if rows.runs is None else rows.runs
+
+
+def test_a_prior_weighs_the_mixture_and_does_not_change_it(localizer, rng):
+    """Scores of the cells are those without a prior: what was known before is no part of the likelihood."""
+    fit, index = localizer.scorer, localizer.index
+    mask, _ = two_patches(localizer)
+    prior = np.full(len(index), -np.inf)
+    known = np.sort(rng.choice(index.possible, 300, replace=False))
+    prior[known] = -np.log(300)
+    free, bound = (fit.cells(index, mask, each, exact=False) for each in (None, prior))
+    assert np.array_equal(bound.first, known)
+    assert np.array_equal(bound.score, free.score[np.searchsorted(free.first, known)])
