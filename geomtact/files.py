@@ -1,10 +1,28 @@
-"""Writing files whole or not at all."""
+"""Text files read with their faults named, and files written whole or not at all."""
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+
+def read_text(path: Path) -> str:
+    """The text of a UTF-8 file, with a byte order mark or without; OSError, or ValueError where it is saved otherwise."""
+    try:
+        return path.read_text("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError("not saved as UTF-8") from None
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds; OSError, or ValueError where it is none."""
+    try:
+        return json.loads(read_text(path))
+    except RecursionError:
+        raise ValueError("lists within lists, hundreds deep") from None
 
 
 def write_text(path: Path, text: str) -> None:

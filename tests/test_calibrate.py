@@ -15,6 +15,7 @@ from geomtact.sensing.calibrate import calibrate, calibrated, measured_diameter
 from geomtact.sensing.colour import TERMS, ColourTable, fit_weights, terms
 from geomtact.sensing.image_file import read_image, write_image
 from geomtact.sensing.membrane import membrane_curvature
+from geomtact.sensing.press import named_image
 
 MM = 1e-3
 SHAPE, PITCH = (120, 160), 0.1 * MM
@@ -66,6 +67,15 @@ def presses(diameter, places=PLACES, seed=0, bend=0.0):
 def found():
     images, background = presses(8 * MM)
     return calibrated(images, 8 * MM, background, PITCH, name="made")
+
+
+def test_an_opaque_alpha_channel_changes_nothing(tmp_path):
+    """Files are read as everywhere else."""
+    image, _ = presses(8 * MM, PLACES[:1])
+    opaque = np.concatenate([image[0], np.full((*SHAPE, 1), 255, np.uint8)], -1)
+    write_image(tmp_path / "rgba.png", opaque)
+    name, read = named_image(tmp_path / "rgba.png", "press 1")
+    assert name == str(tmp_path / "rgba.png") and np.array_equal(read, named_image(image[0], "press 1")[1])
 
 
 def test_slopes_are_those_of_the_ball(found):

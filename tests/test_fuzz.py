@@ -121,6 +121,27 @@ def test_a_broken_file_is_read_or_refused_in_one_line(kind, tmp_path):
             raise AssertionError(f"{kind} {number}: {type(error).__name__}: {error}: {broken[:300]!r}") from error
 
 
+@pytest.mark.parametrize("kind", ["toml", "yaml", "poses.json", "actions.json", "csv", "txt"])
+def test_text_saved_otherwise_than_as_utf_8_is_refused_as_that(kind, tmp_path):
+    """As some editors save it; for JSON that says less, by what was expected."""
+    made, read, _ = KINDS[kind]
+    path = tmp_path / f"file.{kind}"
+    path.write_bytes(made().decode().encode("utf-16"))
+    with pytest.raises(GeomtactError) as refused:
+        read(path)
+    assert "not saved as UTF-8" in str(refused.value) or kind == "actions.json"
+    path.write_bytes(b"\xef\xbb\xbf" + made())
+    read(path)
+
+
+@pytest.mark.parametrize("kind", ["poses.json", "actions.json"])
+def test_lists_within_lists_are_refused_however_deep(kind, tmp_path):
+    path = tmp_path / f"file.{kind}"
+    path.write_bytes(b"[" * 100_000 + b"]" * 100_000)
+    with pytest.raises(GeomtactError):
+        KINDS[kind][1](path)
+
+
 def test_a_broken_posterior_is_refused_in_one_line(ball, a_touch, tmp_path, monkeypatch):
     """Where its poses would have to be simulated anew, that is not done here."""
     path = tmp_path / "posterior.npz"

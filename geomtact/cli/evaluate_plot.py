@@ -18,12 +18,11 @@ def plot_study(
     ] = None,
 ) -> None:
     """Draw the picture of a study from its JSON alone."""
-    import json
-
     from geomtact.errors import InputError
+    from geomtact.files import read_json
 
     try:
-        content = json.loads(study.read_text("utf-8-sig"))
+        content = read_json(study)
         if not isinstance(content, dict):
             raise ValueError("no object")
     except OSError as error:

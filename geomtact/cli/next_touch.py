@@ -77,10 +77,10 @@ def read_actions(path: Path) -> list[Touch | Probe]:
     InputError
         It cannot be read, is no such JSON, or holds an impossible action, which is named by its number from 1.
     """
-    import json
+    from geomtact.files import read_json
 
     try:
-        entries = json.loads(path.read_text("utf-8-sig"))["actions"]
+        entries = read_json(path)["actions"]
         if not isinstance(entries, list):
             raise TypeError
     except OSError as error:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from geomtact.errors import InputError, UsageError, nearest_name
+from geomtact.files import read_text
 
 FILE = "geomtact.toml"
 KEYS = ("object", "unit", "sensor", "background", "effort")
@@ -97,8 +98,8 @@ def read(path: Path) -> dict[str, str]:
         Not valid TOML, an unknown key (the nearest is named), or an entry that is no text.
     """
     try:
-        entries = tomllib.loads(path.read_text("utf-8-sig"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        entries = tomllib.loads(read_text(path))
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as TOML ({error}); mend it or remove it") from None
     for key, value in entries.items():
         if key not in KEYS:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from geomtact.contact_space.carry import RigStd
 from geomtact.errors import InputError, nearest_name
+from geomtact.files import read_json
 from geomtact.inference.rig import check_rig
 from geomtact.se3 import Array, check_transforms
 
@@ -42,7 +42,7 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
         It cannot be read, lacks a key or has an unknown one, or its poses are not rigid or of another number.
     """
     try:
-        content = json.loads(path.read_text("utf-8-sig"))
+        content = read_json(path)
     except FileNotFoundError:
         raise InputError(
             f'--sensor-poses {path}: no such file; write {{"T_world_sensor": [4x4 for each image]}}'

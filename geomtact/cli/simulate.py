@@ -125,12 +125,11 @@ def read_pose(path: Path) -> Array:
     InputError
         No JSON, or no such entry; PoseError if the matrix is no rigid transform.
     """
-    import json
-
+    from geomtact.files import read_json
     from geomtact.se3 import check_transforms
 
     try:
-        content: Any = json.loads(path.read_text("utf-8-sig"))
+        content = read_json(path)
         T = content["T_sensor_object"] if isinstance(content, dict) else content
         return check_transforms(T, f"{path}: T_sensor_object").reshape(4, 4)
     except OSError as error:

@@ -14,14 +14,13 @@ _SAVE_EVERY = 10  # touches
 
 def load(out: Path | None, schema: str) -> dict[str, Any]:
     """What the file holds, or an empty study."""
-    import json
-
     from geomtact.errors import InputError
+    from geomtact.files import read_json
 
     if out is None or not out.exists():
         return {"schema": schema, "parts": {}}
     try:
-        content = json.loads(out.read_text("utf-8-sig"))
+        content = read_json(out)
         held = content["schema"]
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{out}: is there, but is no study of geomtact; give another file with --out") from None

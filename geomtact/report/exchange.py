@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomtact.errors import InputError
-from geomtact.files import write_text
+from geomtact.files import read_text, write_text
 from geomtact.se3 import Array, check_transforms, quat_xyzw, transform
 
 if TYPE_CHECKING:
@@ -124,8 +124,8 @@ def to_table(modes: Sequence[Mode], posterior: Posterior) -> dict[str, list[Any]
 
 def _text(path: str | Path) -> str:
     try:
-        return Path(path).read_text("utf-8")
+        return read_text(Path(path))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give one that exists") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as text ({error}); give a text file") from None

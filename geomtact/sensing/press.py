@@ -96,8 +96,4 @@ def _circle(mask: NDArray[np.bool_], stretch: float) -> tuple[Array, float] | st
 
 def named_image(source: Any, role: str) -> tuple[str, Array]:
     """The name of an image, and it (H, W, 3) as 0..1."""
-    if isinstance(source, str | Path):
-        from geomtact.sensing.image_file import read_image
-
-        return str(source), as_unit_rgb(read_image(source), str(source))
-    return role, as_unit_rgb(source, role)
+    return str(source) if isinstance(source, str | Path) else role, as_unit_rgb(source, role)

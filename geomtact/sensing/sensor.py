@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomtact.errors import SensorError, did_you_mean, nearest_name
+from geomtact.files import read_text
 from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable
 
@@ -121,10 +122,10 @@ class Sensor:
         path = Path(text)
         if path.suffix in (".toml", *_YAML) or path.is_file():
             try:
-                said = path.read_text("utf-8-sig")
+                said = read_text(path)
             except FileNotFoundError:
                 raise SensorError(f"sensor file {path}: no such file; give a TOML file or a bundled sensor") from None
-            except (OSError, UnicodeDecodeError) as error:
+            except (OSError, ValueError) as error:
                 raise SensorError(f"sensor file {path}: cannot be read ({error}); give a TOML file") from None
             if path.suffix not in _YAML:
                 return cls.from_toml(said, str(path))
