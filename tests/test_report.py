@@ -94,7 +94,7 @@ def touch():
     )
     contact = caster.contact(sensor, modes[0].T)
     image = np.where(contact.mask, 255, 0).astype(np.uint8)
-    posterior.observations = [SimpleNamespace(contact=contact, kind="mask", warnings=[], image=image)]
+    posterior.observations = [SimpleNamespace(contact=contact, kind="mask", method=None, warnings=[], image=image)]
     return posterior, modes, lambda T: caster.contact(sensor, T)
 
 
@@ -224,7 +224,7 @@ def test_no_contact_still_makes_a_report(touch, tmp_path):
     )
     seen = posterior.observations[0]
     nothing = SimpleNamespace(mask=np.zeros_like(seen.contact.mask), height=None)
-    empty.observations = [SimpleNamespace(contact=nothing, kind="mask", image=np.zeros_like(seen.image))]
+    empty.observations = [SimpleNamespace(contact=nothing, kind="mask", method=None, image=np.zeros_like(seen.image))]
     content = write_all(tmp_path, empty, [], alone(empty, simulate))
     assert content["modes"] == []
     assert content["contact"] is False
@@ -360,6 +360,16 @@ def test_facts_are_sentences(touch):
     lines = facts(posterior)
     assert lines[0].startswith("4.2 nats are known: one part in 67 ")
     assert re.match("1,23[45] of the grid's 4,000 poses", lines[1])
+    assert _said_of(posterior, None) == lines
+    assert _said_of(posterior, "learned") == ["The contact was found in the learned way.", *lines]
+    several = _said_of(posterior, "learned", None, "classical", "learned")
+    assert several == ["The contact was found in the classical and in the learned way.", *lines]
+
+
+def _said_of(posterior, *methods):
+    """Facts of a posterior of contacts that were found so."""
+    seen = [SimpleNamespace(**{**vars(posterior.observations[0]), "method": method}) for method in methods]
+    return facts(SimpleNamespace(**{**vars(posterior), "observations": seen}))
 
 
 def test_a_mode_that_holds_little_is_not_believed(touch, tmp_path):

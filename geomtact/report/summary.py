@@ -150,6 +150,9 @@ def facts(posterior: Posterior) -> list[str]:
         left = "less than one part in a million of all poses that touch is left"
     elif known < 0.7:
         left = f"{100 * np.exp(-known):.0f} % of all poses that touch are left"
+    found = sorted({o.method for o in posterior.observations if o.method})
+    if found:
+        said.append(f"The contact was found in the {' and in the '.join(found)} way.")
     return [
         *said,
         f"{known:.1f} nats are known: {left}.",
