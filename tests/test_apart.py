@@ -83,28 +83,84 @@ def test_the_posterior_of_a_mixture_is_the_mixture_of_the_posteriors(rng):
     assert (np.exp(got)[:20] == 0).all()
 
 
-@pytest.mark.parametrize("resolved", ["blocks", "cells", "all"])
-def test_several_patches_are_the_mixture_at_every_resolution(localizer, resolved):
-    """Of the posteriors of the whole contact and of each patch by itself, on the same cells."""
-    fit, index = localizer.scorer, localizer.index
+def mixture(shares, scores, weight, temperature):
+    """Density (N,) of the mixture over rows of measure ``weight`` (N,), whose scores are (k, N)."""
+    likely = [np.exp((x - x.max()) / temperature) for x in np.asarray(scores, float)]
+    return sum(share * each / (each @ weight) for share, each in zip(shares, likely, strict=True))
+
+
+def density(rows):
+    """What rows say before the floor (N,), and their measure (N,)."""
+    log_prob = posterior_log_prob(rows.score, rows.log_prior, replace(rows.calibration, floor=0.0))
+    return np.exp((log_prob - rows.log_prior).astype(float)), np.exp(rows.log_prior.astype(float))
+
+
+@pytest.fixture(params=[1.0, 0.3])
+def fit(request, localizer):
+    """The localizer's scorer; and one for which contacts so far off are unusual, so that it trusts its scores for less."""
+    fit = localizer.scorer
+    if request.param == 1:
+        return fit
     mask, parts = two_patches(localizer)
-    rows = fit.rows(index, mask, resolved)
+    nearest = [-fit.scorer.score(localizer.index, each).max() for each in (mask, *parts)]
+    encoder = replace(fit.scorer, usual=request.param * min(nearest))
+    assert len({encoder.trust(-each) for each in nearest}) == 3
+    return replace(fit, scorer=encoder, cascade=replace(fit.cascade, blocks=replace(fit.cascade.blocks, cells=encoder)))
+
+
+def test_blocks_are_told_by_the_mixture(localizer, fit):
+    index, cascade = localizer.index, fit.cascade
+    mask, parts = two_patches(localizer)
     shares, _ = ways(mask, localizer.sensor)
-    density = posterior_log_prob(rows.score, rows.log_prior, replace(rows.calibration, floor=0.0)) - rows.log_prior
-    for share, part in zip(shares[1:], parts, strict=True):
-        alone = fit.rows(index, part, resolved)
-        log_prob = posterior_log_prob(alone.score, alone.log_prior, replace(alone.calibration, floor=0.0))
-        # its best row has at least its share of what the patch alone gives it, wherever the two divide the grid alike
-        same = {tuple(row): i for i, row in enumerate(zip(rows.first, _runs(rows), strict=True))}
-        best = np.argsort(-log_prob)[:50]
-        both = [(i, same[key]) for i in best if (key := (alone.first[i], _runs(alone)[i])) in same]
-        assert len(both) >= 20
-        for i, j in both:
-            assert density[j] >= np.log(share) + (log_prob[i] - alone.log_prior[i]) - 0.05
+    rows = fit.rows(index, mask, "blocks")
+    said, weight = density(rows)
+    held = np.exp(index.log_block_weight) > 0
+    scores = [cascade.blocks.score(index, each)[held] for each in (mask, *parts)]
+    assert said == pytest.approx(mixture(shares, scores, weight, cascade.coarse.temperature), rel=1e-3)
 
 
-def _runs(rows):
-    return np.ones(len(rows.first), int) if rows.runs is None else rows.runs
+def test_blocks_are_opened_by_the_mixture_and_their_cells_told_by_it(localizer, fit):
+    """Those that stay whole count in it as blocks."""
+    index, cascade = localizer.index, fit.cascade
+    mask, parts = two_patches(localizer)
+    shares, _ = ways(mask, localizer.sensor)
+    rows = fit.rows(index, mask, "cells")
+    said, weight = density(rows)
+    first, counts = index.block_runs
+    blocks = [cascade.blocks.score(index, each) for each in (mask, *parts)]
+    by_block = mixture(shares, blocks, np.exp(index.log_block_weight.astype(float)), cascade.coarse.temperature)
+    whole = np.isin(first, rows.first[rows.runs == counts[np.searchsorted(first, rows.first, "right") - 1]])
+    whole &= counts > 1
+    opened = by_block[~whole & (index.log_block_weight > -np.inf)]
+    assert 0 < whole.sum() < len(first)
+    # the blocks that were opened are those with the most mass
+    mass = by_block * np.exp(index.log_block_weight)
+    assert len(opened) and mass[whole].max() <= mass[~whole & (counts > 1)].min() * 1.03
+    block = np.searchsorted(first, rows.first, "right") - 1
+    scores = [
+        np.where(whole[block], by, cells.ravel()[rows.first])
+        for by, cells in zip(
+            [each[block] for each in blocks], [fit.scorer.score(index, each) for each in (mask, *parts)], strict=True
+        )
+    ]
+    assert said == pytest.approx(mixture(shares, scores, weight, cascade.partly.temperature), rel=2e-3)
+
+
+@pytest.mark.parametrize("above", [0.0, 0.7 * MM])
+def test_cells_are_told_by_the_mixture(localizer, fit, above):
+    """Of contour lines too: each patch belongs to as much deeper poses."""
+    index = localizer.index
+    mask, parts = two_patches(localizer)
+    shares, _ = ways(mask, localizer.sensor)
+    said, weight = density(fit.cells(index, mask, None, exact=False, above=above))
+    deeper = round(above * len(index.height) / index.sensor.max_penetration)
+    scores = []
+    for each in (mask, *parts):
+        score = fit.scorer.score(index, each)
+        lowest = np.full_like(score[:deeper], score.min())
+        scores.append(np.concatenate([lowest, score[: len(score) - deeper]]).ravel()[index.possible])
+    assert (deeper > 0) == (above > 0)
+    assert said == pytest.approx(mixture(shares, scores, weight, fit.calibration.temperature), rel=1e-3)
 
 
 def test_a_prior_weighs_the_mixture_and_does_not_change_it(localizer, rng):
