@@ -201,7 +201,7 @@ def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touch
     assert content["settings"]["seed"] == 0
 
     # only JSON on standard output, and the index comes from the cache now
-    again = geomtact("localize", touched / "ball_1.png", "--json", "--seed", 0)
+    again = geomtact("localize", touched / "ball_1.png", "--json", "--seed", 0, "--report", "none")
     printed = json.loads(again.stdout)
     assert printed["modes"] == content["modes"]
 

@@ -112,7 +112,7 @@ def localize(
     check_folder(out)
     if report is not None:
         check_name("report", report, Report)
-        if out is None:
+        if out is None and report != Report.none:
             raise UsageError("--report needs --out, the folder that it is written into")
     prior = prior and posterior_file(prior, "--prior")
     images = images or []
