@@ -330,14 +330,11 @@ def told_together(content):
             at.setdefault(name, {})[key] = level["figures"] | {"ninety": ninety, "held": held}
     held, beyond = ([f for sweep in at.values() for f in sweep.values() if f["held"] == well] for well in (True, False))
     within = [f["ninety"]["low"] <= 0.95 and f["ninety"]["high"] >= 0.85 for f in held]
-    missed, too, least, *_, most = sorted(100 * f["ninety"]["share"] for f in held)
-    yield f"at {sum(within)} of the {len(held)} levels; the share itself is {least:.0f} to {most:.0f} % at all but two"
-    touched, masked = (at[name][level]["ninety"] for name, level in (("kind", 5), ("shown", 3)))
-    assert within.count(False) == 2 and [100 * each["share"] for each in (masked, touched)] == [missed, too]
-    for row, each in (("what is touched {share:.0%}", touched), ("what the mask shows {share:.0%}", masked)):
-        yield filled(row + " ({:.0f} to {:.0f})", *(100 * each[k] for k in ("low", "high")), **each)
+    shares = [100 * f["ninety"]["share"] for f in held]
+    assert all(within)
+    yield f"at all {len(held)} levels; the share itself is {min(shares):.0f} to {max(shares):.0f} %"
     one_in = min(math.floor(f["wrong"] / f["silent"] + 1e-9) for f in beyond if f["silent"])
-    yield f"at no level more than one in {({17: 'seventeen'}).get(one_in, one_in)}"
+    yield f"at no level more than one in {({9: 'nine'}).get(one_in, one_in)}"
     for name, unit in {"rig_shift": " mm", "rig_turn": "°"}.items():
         warned = listed([100 * at[name][level]["warned"] for level in (1, 2, 5, 10)])
         yield f"{warned} %{' of the answers' * (unit == ' mm')} at 1, 2, 5 and 10{unit}"
