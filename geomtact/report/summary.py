@@ -145,14 +145,14 @@ def facts(posterior: Posterior) -> list[str]:
         if empty
         else []
     )
+    found = sorted({o.method for o in posterior.observations if o.method})
+    if found:
+        said.append(f"The contact was found in the {' and in the '.join(found)} way.")
     left = f"one part in {np.exp(min(known, 700)):,.0f} of all poses that touch is left"
     if known >= 14:
         left = "less than one part in a million of all poses that touch is left"
     elif known < 0.7:
         left = f"{100 * np.exp(-known):.0f} % of all poses that touch are left"
-    found = sorted({o.method for o in posterior.observations if o.method})
-    if found:
-        said.append(f"The contact was found in the {' and in the '.join(found)} way.")
     return [
         *said,
         f"{known:.1f} nats are known: {left}.",

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index, spelled_out
-from geomtact.scoring.apart import mixed, ways
 from geomtact.scoring.calibration import Calibration, Touches, best_floor, calibrate, posterior_log_prob
 from geomtact.scoring.encoder import EncoderScorer
+from geomtact.scoring.mixture import mixed, ways
 from geomtact.sensing.contact import Shown
 
 SHARE = 0.98  # of the mass, that is scored cell by cell

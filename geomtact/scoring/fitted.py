@@ -16,7 +16,6 @@ from geomtact.contact_space.index import Index
 from geomtact.errors import MeshError
 from geomtact.files import write_text, write_whole
 from geomtact.progress import Progress
-from geomtact.scoring.apart import mixed, ways
 from geomtact.scoring.calibration import Calibration, Touches, calibrate, simulate_touches
 from geomtact.scoring.cascade import Cascade, Rows
 from geomtact.scoring.catalogue import (
@@ -29,6 +28,7 @@ from geomtact.scoring.catalogue import (
     vectors_name,
 )
 from geomtact.scoring.encoder import EncoderScorer
+from geomtact.scoring.mixture import mixed, ways
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.product import Comparison, Product, choose
 from geomtact.scoring.protocol import Scorer

@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.sensing.patches import labelled
 from geomtact.sensing.sensor import Sensor
 
 FEATURES = ("centroid x", "centroid y", "log area", "log size", "stretch along x", "stretch along the diagonal")
@@ -65,13 +65,8 @@ def without_specks(mask: NDArray[Any], pixel_area: float) -> NDArray[Any]:
     if mask.dtype != bool:
         touched = mask > 0.5
         return np.where(touched & ~without_specks(touched, pixel_area), 0, mask)
-    # labels of 16 bits take a third of the time, where no more patches fit into the mask
-    fit = np.prod([(side + 1) // 2 for side in mask.shape])
-    kind = cv2.CV_16U if fit < (1 << 16) - 1 else cv2.CV_32S
-    n, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
-        mask.astype(np.uint8), 8, kind, cv2.CCL_SPAGHETTI
-    )
-    areas = stats[:, cv2.CC_STAT_AREA] * pixel_area
+    labels, count = labelled(mask)
+    areas = count * pixel_area
     dust = areas < min(_SPECK, areas[1:].max(initial=0) / 10)
     dust[0] = True
-    return ~np.take(dust, np.asarray(labels)) if n > 1 else mask
+    return ~np.take(dust, labels) if len(count) > 1 else mask

@@ -7,8 +7,8 @@ import pytest
 from scipy.special import softmax
 
 from geomtact.scoring import fitted
-from geomtact.scoring.apart import mixed, ways
 from geomtact.scoring.calibration import Calibration, posterior_log_prob
+from geomtact.scoring.mixture import mixed, ways
 from geomtact.sensing.patches import patches
 
 MM = 1e-3
@@ -95,23 +95,29 @@ def density(rows):
     return np.exp((log_prob - rows.log_prior).astype(float)), np.exp(rows.log_prior.astype(float))
 
 
+@pytest.fixture(scope="module")
+def contact(localizer):
+    """A contact of two patches, each of them, and the shares of the mixture."""
+    mask, parts = two_patches(localizer)
+    return mask, parts, ways(mask, localizer.sensor)[0]
+
+
 @pytest.fixture(params=[1.0, 0.3])
-def fit(request, localizer):
+def fit(request, localizer, contact):
     """The localizer's scorer; and one for which contacts so far off are unusual, so that it trusts its scores for less."""
     fit = localizer.scorer
     if request.param == 1:
         return fit
-    mask, parts = two_patches(localizer)
+    mask, parts, _ = contact
     nearest = [-fit.scorer.score(localizer.index, each).max() for each in (mask, *parts)]
     encoder = replace(fit.scorer, usual=request.param * min(nearest))
     assert len({encoder.trust(-each) for each in nearest}) == 3
     return replace(fit, scorer=encoder, cascade=replace(fit.cascade, blocks=replace(fit.cascade.blocks, cells=encoder)))
 
 
-def test_blocks_are_told_by_the_mixture(localizer, fit):
+def test_blocks_are_told_by_the_mixture(localizer, fit, contact):
     index, cascade = localizer.index, fit.cascade
-    mask, parts = two_patches(localizer)
-    shares, _ = ways(mask, localizer.sensor)
+    mask, parts, shares = contact
     rows = fit.rows(index, mask, "blocks")
     said, weight = density(rows)
     held = np.exp(index.log_block_weight) > 0
@@ -119,23 +125,21 @@ def test_blocks_are_told_by_the_mixture(localizer, fit):
     assert said == pytest.approx(mixture(shares, scores, weight, cascade.coarse.temperature), rel=1e-3)
 
 
-def test_blocks_are_opened_by_the_mixture_and_their_cells_told_by_it(localizer, fit):
+def test_blocks_are_opened_by_the_mixture_and_their_cells_told_by_it(localizer, fit, contact):
     """Those that stay whole count in it as blocks."""
     index, cascade = localizer.index, fit.cascade
-    mask, parts = two_patches(localizer)
-    shares, _ = ways(mask, localizer.sensor)
+    mask, parts, shares = contact
     rows = fit.rows(index, mask, "cells")
     said, weight = density(rows)
     first, counts = index.block_runs
     blocks = [cascade.blocks.score(index, each) for each in (mask, *parts)]
     by_block = mixture(shares, blocks, np.exp(index.log_block_weight.astype(float)), cascade.coarse.temperature)
-    whole = np.isin(first, rows.first[rows.runs == counts[np.searchsorted(first, rows.first, "right") - 1]])
-    whole &= counts > 1
-    opened = by_block[~whole & (index.log_block_weight > -np.inf)]
-    assert 0 < whole.sum() < len(first)
+    whole = np.isin(first, rows.first[rows.runs > 1])
+    opened = ~whole & (counts > 1)
+    assert 0 < whole.sum() < len(first) and opened.any()
     # the blocks that were opened are those with the most mass
     mass = by_block * np.exp(index.log_block_weight)
-    assert len(opened) and mass[whole].max() <= mass[~whole & (counts > 1)].min() * 1.03
+    assert mass[whole].max() <= mass[opened].min() * 1.03
     block = np.searchsorted(first, rows.first, "right") - 1
     scores = [
         np.where(whole[block], by, cells.ravel()[rows.first])
@@ -147,11 +151,10 @@ def test_blocks_are_opened_by_the_mixture_and_their_cells_told_by_it(localizer, 
 
 
 @pytest.mark.parametrize("above", [0.0, 0.7 * MM])
-def test_cells_are_told_by_the_mixture(localizer, fit, above):
+def test_cells_are_told_by_the_mixture(localizer, fit, contact, above):
     """Of contour lines too: each patch belongs to as much deeper poses."""
     index = localizer.index
-    mask, parts = two_patches(localizer)
-    shares, _ = ways(mask, localizer.sensor)
+    mask, parts, shares = contact
     said, weight = density(fit.cells(index, mask, None, exact=False, above=above))
     deeper = round(above * len(index.height) / index.sensor.max_penetration)
     scores = []
