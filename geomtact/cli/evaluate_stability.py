@@ -25,7 +25,10 @@ def judge_stability(
     unit: Unit = None,
     sweep: Annotated[
         list[str] | None,
-        typer.Option("--sweep", help=f"What to make worse; may be repeated; all by default: {_NAMES}."),
+        typer.Option(
+            "--sweep",
+            help=f"What to make worse (docs/stability.md says how); may be repeated; all by default: {_NAMES}.",
+        ),
     ] = None,
     sensor: study_options.SensorName = "gelslim",
     touches: Annotated[
