@@ -241,6 +241,15 @@ def test_modes_are_allowed_poses(localizer, posteriors):
     assert np.isfinite(localizer.space.caster.penetration(localizer.sensor, T)).all()
 
 
+def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_touch):
+    posterior = localizer.localize(a_touch(localizer)[1], T_world_sensor=T_WORLD)
+    mass = posterior.log_prob - np.log(runs_of(posterior))
+    poses = posterior.likeliest(10)
+    row = [int(np.abs(posterior.poses - T).max((1, 2)).argmin()) for T in poses]
+    assert poses == pytest.approx(posterior.poses[row], abs=1e-12) and len(set(row)) == len(row) == min(10, len(mass))
+    assert mass[row].min() >= np.delete(mass, row).max(initial=-np.inf)
+
+
 # --- samples
 
 

@@ -111,6 +111,13 @@ class Posterior:
             return []
         return [mode_at(self, cell, mass) for cell, mass in grown(self, k)]
 
+    def likeliest(self, n: int) -> Array:
+        """The ``n`` most probable poses (m, 4, 4) in ``frame``, one a cell, most probable first: the thesis's best10, of ten.
+
+        Neighbours in one mode count apart; for places that are apart, see :meth:`modes`.
+        """
+        return self.T_frame_sensor @ self._poses_of_cells(self.likeliest_cells(n))
+
     def leading_cells(self, k: int) -> NDArray[np.int64]:
         """Pose ids (m,) of the index at the heart of the ``k`` leading modes, weighed by the most probable cells alone."""
         found = grown(self, k, full=False) if self.contact and k > 0 else []
