@@ -241,13 +241,29 @@ def test_modes_are_allowed_poses(localizer, posteriors):
     assert np.isfinite(localizer.space.caster.penetration(localizer.sensor, T)).all()
 
 
-def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_touch):
-    posterior = localizer.localize(a_touch(localizer)[1], T_world_sensor=T_WORLD)
+@pytest.mark.parametrize("effort", ["fast", "balanced"])
+def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_touch, effort):
+    posterior = localizer.localize(a_touch(localizer)[1], T_world_sensor=T_WORLD, effort=effort)
     mass = posterior.log_prob - np.log(runs_of(posterior))
     poses = posterior.likeliest(10)
     row = [int(np.abs(posterior.poses - T).max((1, 2)).argmin()) for T in poses]
     assert poses == pytest.approx(posterior.poses[row], abs=1e-12) and len(set(row)) == len(row) == min(10, len(mass))
-    assert mass[row].min() >= np.delete(mass, row).max(initial=-np.inf)
+    assert (np.diff(mass[row]) <= 1e-6).all() and mass[row].min() >= np.delete(mass, row).max(initial=-np.inf) - 1e-6
+    assert len(posterior.likeliest(10**7)) == (posterior.log_prob > -np.inf).sum()
+    assert posterior.likeliest(0).shape == (0, 4, 4)
+
+
+def test_as_many_of_the_likeliest_are_found_as_are_asked_for_wherever_they_stand(pin, posteriors):
+    """Also where the very likeliest are every fiftieth, by which the rest is sifted."""
+    posterior = posteriors(pin)
+    plain = replace(
+        posterior, cells=posterior.index.possible, log_prob=np.zeros(len(posterior.index.possible)), runs=None
+    )
+    for seed in range(20):
+        mass = np.random.default_rng(seed).normal(size=len(plain.cells))
+        mass[::50] += 5 * (seed % 2)
+        poses = replace(plain, log_prob=mass).likeliest(7)
+        assert np.array_equal(poses, plain.poses_of(np.argsort(-mass)[:7]))
 
 
 # --- samples

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from geomtact.sensing.noise import Noise
     from geomtact.sensing.sensor import Sensor
 
-SCHEMA = "geomtact/thesis-table/1"
+SCHEMA = "geomtact/thesis-table/2"
 _POSES = 50_000  # of a part that is touched from a known side
 
 
@@ -40,7 +40,7 @@ def judge_thesis_table(
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Judge one touch from a known side, as in the thesis's Table 1: the most probable pose, the best of ten, both refined.
+    """Judge one touch from a known side, as in the thesis's Table 1: the most probable pose, refined, and the best of ten.
 
     Prints median errors, absolute and normalised, and writes them and every outcome to --out; with --ambiguity also what the
     first touches from each side leave open, whoever reads them.
@@ -150,7 +150,7 @@ def _print(parts: Mapping[str, Any]) -> None:
         left = [f"{figures['median'][key]:.1f}" for key in ("span_mm", "random_mm", "least_mm")]
         left += [f"{100 * figures['mean'][key]:.0f} %" for key in ("precision", "recall")]
         for kind, table in figures["table"].items():
-            ours = [f"{table[row]['error_mm_quartiles'][1]:.1f}" for row in ("best", "answer", "refined best10")]
+            ours = [f"{table[row]['error_mm_quartiles'][1]:.1f}" for row in ("best", "answer", "answer10")]
             rows.append([name, kind, str(table["best"]["n"]), *(left if kind == "all" else [""] * len(left)), *ours])
     if rows:
         typer.echo(
@@ -166,6 +166,6 @@ def _print(parts: Mapping[str, Any]) -> None:
             "recall",
             "best",
             "answer",
-            "best of ten",
+            "answer10",
         ]
         print_table(["part", "kind", *numbers], rows, numbers)

@@ -22,7 +22,7 @@ from geomtact.sensing.noise import Noise
 
 THESIS_PARTS = ("pin", "damping_pin", "head", "elbow_pipe")
 NOMINAL = (0.5, 0.8, 0.9, 0.95)
-MODES = 10  # the thesis's best10, of modes instead of poses
+MODES = 10  # as many as the thesis's best10 has poses
 WRONG_MM = 10.0  # MSSD beyond which a first mode is wrong
 RESAMPLES = 2000
 CERTAIN = 0.5  # a first mode below this probability is one of high entropy

@@ -112,11 +112,13 @@ class Posterior:
         return [mode_at(self, cell, mass) for cell, mass in grown(self, k)]
 
     def likeliest(self, n: int) -> Array:
-        """The ``n`` most probable poses (m, 4, 4) in ``frame``, one a cell, most probable first: the thesis's best10, of ten.
+        """The ``n`` most probable poses (m, 4, 4) in ``frame``, most probable first: one a cell, or a run of cells that are told
+        alike; refined where registration found better.
 
-        Neighbours in one mode count apart; for places that are apart, see :meth:`modes`.
+        Fewer where there are fewer, none without contact. Most are neighbours; for places that are apart see :meth:`modes`.
         """
-        return self.T_frame_sensor @ self._poses_of_cells(self.likeliest_cells(n))
+        rows = self._top_rows(n) if self.contact and n > 0 else np.zeros(0, np.int64)
+        return self.poses_of(rows[np.argsort(-self._log_mass_of_a_cell()[rows], kind="stable")])
 
     def leading_cells(self, k: int) -> NDArray[np.int64]:
         """Pose ids (m,) of the index at the heart of the ``k`` leading modes, weighed by the most probable cells alone."""
@@ -313,19 +315,24 @@ class Posterior:
         cells[many] = self.index.within_runs(cells[many], runs[many], rng.random(int(many.sum())))
         return cells
 
-    def _top_rows(self, n: int = _SEEDS) -> NDArray[np.int64]:
-        """The ``n`` rows (m,) with the most mass a cell, where there are as many."""
+    def _log_mass_of_a_cell(self) -> NDArray[np.floating]:
+        """Log mass (N,) of each row, shared alike by the cells that it stands for."""
         p = self.log_prob
         if self.runs is not None:
             many = np.flatnonzero(self.runs > 1)
             p = p.copy()
             p[many] -= np.log(self.runs[many])
+        return p
+
+    def _top_rows(self, n: int = _SEEDS) -> NDArray[np.int64]:
+        """The ``n`` rows (m,) with the most mass a cell, where there are as many."""
+        p = self._log_mass_of_a_cell()
+        rows = np.arange(len(p))
         if len(p) > 100 * n:
-            # the quantile of every fiftieth row leaves few to look at
+            # the quantile of every fiftieth row leaves few to look at; for a small n, by chance, too few
             some, few = p[::50], max(1, n // 5)
-            rows = np.flatnonzero(p >= np.partition(some, -few)[-few])
-        else:
-            rows = np.arange(len(p))
+            above = np.flatnonzero(p >= np.partition(some, -few)[-few])
+            rows = above if len(above) >= n else rows
         if len(rows) > n:
             rows = rows[np.argpartition(p[rows], -n)[-n:]]
         return rows[p[rows] > -np.inf]

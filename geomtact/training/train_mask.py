@@ -91,7 +91,7 @@ def train_mask(
 
 
 def validate(network: MaskNetwork, seen: torch.Tensor, contact: torch.Tensor) -> float:
-    """Median IoU of what is likelier in contact than not with what is, over the first reading of each press."""
+    """Median IoU of what is likelier in contact than not, unsmoothed, with what is, over the first reading of each press."""
     network.eval()
     with torch.inference_mode():
         said = torch.cat([network(seen[i : i + 64, 0].float()) > 0 for i in range(0, len(seen), 64)])
