@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.options import (
+    Approaches,
     Background,
     CacheDir,
     Effort,
@@ -22,6 +23,7 @@ from geomtact.cli.options import (
     Seed,
     SensorName,
     Unit,
+    approach_from,
     check_name,
 )
 from geomtact.cli.prepare import open_localizer
@@ -31,6 +33,7 @@ from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from geomtact.cli.sensor_poses import SensorPoses
+    from geomtact.geometry.approach import Approach
     from geomtact.inference.identify import Identification
     from geomtact.inference.localizer import Localizer
 
@@ -70,6 +73,7 @@ def localize(
         ),
     ] = None,
     prior: Annotated[Path | None, typer.Option(help="posterior.npz of what is known before, or its folder.")] = None,
+    approach: Approaches = None,
     effort: EffortName = None,
     scorer: ScorerName = None,
     seed: Seed = 0,
@@ -133,10 +137,13 @@ def localize(
         raise UsageError(
             "--object: several parts go with images alone, not with --camera, --watch or --prior; give one of them"
         )
+    sides = approach_from(approach)
+    if len(parts) > 1 and sides:
+        raise UsageError("--approach: the sides of one part; give one part by --object")
     if len(parts) == 1:
         values["object"] = parts[0]
 
-    asked = _Asked(images, kind, values, sources, prior, scorer, seed, max_poses, cache_dir)
+    asked = _Asked(images, kind, values, sources, prior, sides, scorer, seed, max_poses, cache_dir)
     if live:
         _follow(asked, camera)
         return
@@ -169,6 +176,7 @@ class _Asked:
     values: dict[str, Any]
     sources: dict[str, str]
     prior: Path | None
+    approach: Approach | None
     scorer: str | None
     seed: int
     max_poses: int | None
@@ -179,7 +187,9 @@ class _Asked:
         told."""
         sources = {} if quiet else self.sources
         values = {**self.values, **own}
-        return open_localizer(values, sources, self.scorer, self.cache_dir, self.max_poses, self.prior, frame)
+        return open_localizer(
+            values, sources, self.scorer, self.cache_dir, self.max_poses, self.prior, frame, self.approach
+        )
 
 
 def _follow(asked: _Asked, camera: str | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -32,6 +33,16 @@ MaxPoses = Annotated[
     int | None,
     typer.Option("--max-poses", min=1, help="About how many poses; 1.2 million by default.", show_default=False),
 ]
+Approaches = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--approach",
+        metavar="X,Y,Z[:DEGREES]",
+        help="Side that is touched, as the direction from the part towards the sensor in the part's frame: exactly that face, or "
+        "within so many degrees of it. May be repeated.",
+        show_default=False,
+    ),
+]
 SensorName = Annotated[str | None, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
 KindName = Annotated[str, typer.Option("--kind", metavar="|".join(Kind), help="What the images are.")]
 Background = Annotated[Path | None, typer.Option("--background", help="Image of the untouched sensor, for readings.")]
@@ -51,6 +62,27 @@ CacheDir = Annotated[
         "--cache-dir", help="Folder of the cached indexes; else $GEOMTACT_CACHE, else the user's cache folder."
     ),
 ]
+
+
+def approach_from(sides: list[str] | None) -> list[tuple[list[float], float]] | None:
+    """``approach`` of ``Localizer.prepare``, from what ``--approach`` was given.
+
+    Raises
+    ------
+    UsageError
+    """
+    if not sides:
+        return None
+    out = []
+    for side in sides:
+        direction, _, angle = side.partition(":")
+        try:
+            out.append(([float(x) for x in direction.split(",")], math.radians(float(angle or 0))))
+        except ValueError:
+            raise UsageError(
+                f"--approach: expected X,Y,Z or X,Y,Z:DEGREES, such as 0,0,1 or 0,0,1:5, got {side!r}"
+            ) from None
+    return out
 
 
 def check_name(option: str, name: str, known: type[StrEnum], file: str | None = None) -> None:

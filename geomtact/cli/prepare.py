@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, part_of_task
-from geomtact.cli.options import CacheDir, MaxPoses, ScorerName, SensorName, Unit
+from geomtact.cli.options import Approaches, CacheDir, MaxPoses, ScorerName, SensorName, Unit, approach_from
 from geomtact.cli.shell import progress_bar, tell
+from geomtact.errors import UsageError
 
 if TYPE_CHECKING:
+    from geomtact.geometry.approach import Approach
     from geomtact.geometry.mesh import Mesh
     from geomtact.inference.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
@@ -27,6 +29,7 @@ def prepare(
     ] = None,
     unit: Unit = None,
     sensor: SensorName = None,
+    approach: Approaches = None,
     scorer: ScorerName = None,
     max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
@@ -42,10 +45,13 @@ def prepare(
 
     values, sources = resolve({"object": objects[0] if objects else None, "unit": unit, "sensor": sensor})
     began = time.perf_counter()
+    sides = approach_from(approach)
     if jobs is not None or ray is not None or (objects is not None and len(objects) > 1):
+        if sides:
+            raise UsageError("--approach: the sides of one part; give one part alone, without --jobs and --ray")
         _prepare_all(objects, values, sources, scorer, max_poses, cache_dir, jobs, ray)
     else:
-        localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, given="OBJECT")
+        localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, approach=sides, given="OBJECT")
         typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
 
 
@@ -126,11 +132,13 @@ def open_localizer(
     max_poses: int | None = None,
     prior: Path | None = None,
     frame: str = "sensor",
+    approach: Approach | None = None,
     given: str | None = None,
 ) -> Localizer:
     """The localizer for resolved options, with a progress bar where its index has to be built first.
 
-    A ``prior`` of another object, or not in ``frame``, is refused before that. ``given`` is how the object is named on the
+    A ``prior`` of another object, or not in ``frame``, is refused before that. ``approach`` is as of ``Localizer.prepare``,
+    ``given`` how the object is named on the
     command line, if not by --object.
     """
     from geomtact.cli.project import require
@@ -158,5 +166,12 @@ def open_localizer(
     _doubt_unit(mesh, gel)
     with progress_bar("preparing") as progress:
         return Localizer.prepare(
-            mesh, None, gel, scorer=scorer, max_poses=max_poses or MAX_POSES, cache_dir=cache_dir, progress=progress
+            mesh,
+            None,
+            gel,
+            approach,
+            scorer=scorer,
+            max_poses=max_poses or MAX_POSES,
+            cache_dir=cache_dir,
+            progress=progress,
         )
