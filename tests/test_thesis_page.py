@@ -211,7 +211,7 @@ def test_the_page_says_what_the_study_found():
     table = _cells(page, "## Table 1", None)
     for name, part in parts.items():
         ours = next(row for row in table if row[:2] == [name, "here"])
-        rows = ("best", "refined best", "answer", "best10", "refined best10")
+        rows = ("best", "refined best", "answer", "best10", "answer10", "ten modes", "answer's ten modes")
         assert ours[2:] == [_of(part["figures"], row) for row in rows]
         open_ = part["ambiguity"]["figures"]
         left = _cells(page, "## What a touch leaves open")[name]

@@ -18,7 +18,7 @@ PICTURES = {
     "geomtact/scores/2": {"scores": "score_plot.draw_scores"},
     "geomtact/stability/2": {"stability": "stability_plot.draw_stability"},
     "geomtact/study/3": {"calibration": "answers_plot.draw_answers"},
-    "geomtact/thesis-table/1": {"errors": "thesis_plot.draw_thesis"},
+    "geomtact/thesis-table/2": {"errors": "thesis_plot.draw_thesis"},
     "geomtact/touches/1": {"touches": "touches_plot.draw_touches"},
     "geomtact/track/1": {"track": "track_plot.draw_track"},
 }

@@ -15,7 +15,7 @@ _ROWS = {
     "refined best": "refined\nbest",
     "answer": "answer",
     "best10": "best10",
-    "refined best10": "refined\nbest10",
+    "answer10": "answer10",
 }
 _COLOURS = ("#0072B2", "#56B4E9", "#D55E00", "#009E73", "#A6D854")
 _BIN, _MOST = 0.05, 1.6  # normalised error
