@@ -329,11 +329,17 @@ def test_touches_of_a_known_side_are_judged_before_and_after_refinement(flat_nut
     done = CliRunner().invoke(app, args)
     assert done.exit_code == 0, done.output
     part = json.loads(out.read_text("utf-8"))["parts"]["hex_nut"]
+    distance = PoseDistance(flat_nut.mesh)
     assert [o["side"] for o in part["outcomes"]] == [0, 1]
     for outcome in part["outcomes"]:
-        best, _, _, answer, _, _, of_modes, of_answers_modes = outcome["error_mm"]
+        best, _, _, answer, best10, answer10, of_modes, of_answers_modes = outcome["error_mm"]
         # ten modes hold the first
         assert of_modes <= best + 1e-6 and of_answers_modes <= answer + 1e-6
+        touch = next(known_approach.touches_of_side(flat_nut, outcome["side"], 1, 1, MODERATE, True))
+        grid, _ = flat_nut.touch(touch.mask, "mask", None, np.eye(4), "sensor", None, "exact", 0)
+        told = flat_nut.localize(touch.mask, "mask", effort="exact")
+        near = [1e3 * distance.mean(touch.T_sensor_object, p.likeliest(10)).min() for p in (grid, told)]
+        assert near == pytest.approx([best10, answer10], abs=1e-6)
         assert 0 < outcome["random_mm"] < 100
     # a study that is whole is not made again
     monkeypatch.setattr(Localizer, "prepare", None)

@@ -3,7 +3,7 @@
     python docs/examples/face_on.py [--max-poses N] [--touches N] [--tilt DEGREES ...]
 
 Over the full pose space hardly any touch is as square as those of a robot that puts a face down, and the grid's tilts are 15
-degrees apart: none of its contacts is a whole face's. With approach, only touches near to that face are modelled.
+degrees apart: none of its contacts need be a whole face's. With approach, only touches near to that face are modelled.
 Some four minutes on two cores, the first time.
 """
 
@@ -40,11 +40,13 @@ def touches(mesh, tilt, n, rng):
     flat, _ = ContactSpace(mesh, SENSOR, [(FACE, 0.0)]).sample(4 * n, rng)
     found = []
     for i, T in enumerate(flat):
+        if len(found) == n:
+            break
         way = rng.normal(size=2)
         T = T @ exp(np.append(np.deg2rad(tilt) * way / np.linalg.norm(way), np.zeros(4)))
         T[2, 3] += space.caster.penetration(SENSOR, T[None])[0] - 0.8 * MM
         mask = felt_mask(space, T, elastic=i % 2 == 0)
-        if mask.sum() >= LEAST and len(found) < n:
+        if mask.sum() >= LEAST:
             found.append((T, spoilt(mask, space, MODERATE, rng)))
     return found
 

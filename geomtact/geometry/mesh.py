@@ -364,7 +364,7 @@ def _check_scale(mesh: Mesh, sensor: _SensorLike) -> None:
 
 def _wrong_unit(path: Path | None) -> str:
     metres = path is not None and path.suffix.lower() in METRE_FORMATS
-    return "the unit is likely wrong" + (_REEXPORT.format(unit="mm") if metres else "; give mm, cm, m or inch")
+    return "the unit is likely wrong" + (_REEXPORT.format(unit="mm") if metres else f"; give one of {', '.join(UNITS)}")
 
 
 def _mm(metres: float) -> str:

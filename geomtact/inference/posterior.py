@@ -118,7 +118,7 @@ class Posterior:
         Fewer where there are fewer, none without contact. Most are neighbours; for places that are apart see :meth:`modes`.
         """
         rows = self._top_rows(n) if self.contact and n > 0 else np.zeros(0, np.int64)
-        return self.poses_of(rows[np.argsort(-self._log_mass_of_a_cell()[rows], kind="stable")])
+        return self.poses_of(rows[np.argsort(-self._log_mass_of_a_cell[rows], kind="stable")])
 
     def leading_cells(self, k: int) -> NDArray[np.int64]:
         """Pose ids (m,) of the index at the heart of the ``k`` leading modes, weighed by the most probable cells alone."""
@@ -315,6 +315,7 @@ class Posterior:
         cells[many] = self.index.within_runs(cells[many], runs[many], rng.random(int(many.sum())))
         return cells
 
+    @cached_property
     def _log_mass_of_a_cell(self) -> NDArray[np.floating]:
         """Log mass (N,) of each row, shared alike by the cells that it stands for."""
         p = self.log_prob
@@ -326,7 +327,7 @@ class Posterior:
 
     def _top_rows(self, n: int = _SEEDS) -> NDArray[np.int64]:
         """The ``n`` rows (m,) with the most mass a cell, where there are as many."""
-        p = self._log_mass_of_a_cell()
+        p = self._log_mass_of_a_cell
         rows = np.arange(len(p))
         if len(p) > 100 * n:
             # the quantile of every fiftieth row leaves few to look at; for a small n, by chance, too few
