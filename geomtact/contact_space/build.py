@@ -18,7 +18,7 @@ from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Directions
 from geomtact.progress import Progress
-from geomtact.se3 import Array, transform
+from geomtact.se3 import Array
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.moments import moments
 from geomtact.sensing.sensor import Sensor
@@ -57,8 +57,7 @@ def build(
     MeshError
         No pose of the object touches the sensor as the approach and the housing allow.
     """
-    assert mesh.symmetry is not None
-    directions = Directions.make(mesh.symmetry, approach, resolution.level, resolution.turn_step)
+    directions = res.directions_of(mesh, sensor, approach, resolution.level, resolution.turn_step)
     caster = Caster(mesh.vertices, mesh.faces)
     reach = mesh.reach
     frame = Frame.make(reach, sensor, resolution.step)
@@ -85,9 +84,7 @@ def build(
             f"{mesh.name}: no pose touches the sensor {sensor.name!r} as the approach and the housing allow; "
             "widen the approach or check the object's unit"
         )
-    coarse = Directions.make(mesh.symmetry, approach, max(resolution.level - 1, 0), 2 * resolution.turn_step)
-    _, of, turn = coarse.lookup(transform(directions.rotations()[0], np.zeros(3)))
-    return _join(turns, directions, frame, _blocks(turns, coarse.first_turn[of] + turn, frame))
+    return _join(turns, directions, frame, _blocks(turns, directions.parents(resolution.turn_step), frame))
 
 
 def choose_resolution(
@@ -103,7 +100,7 @@ def choose_resolution(
         there = HeightMap.cast(caster, directions.vectors[k], mesh.centre, reach, 0.0, frame.pixel / 2)
         turn = 2.4 * k  # the golden angle, in short: every direction at another turn
         area += weight * allowed(there.turned(turn, frame), frame, sensor, [0.0]).sum() * frame.pixel**2
-    return res.choose(mesh.radius_rms, float(area), mesh.symmetry, sensor, approach, max_poses)
+    return res.choose(mesh, float(area), sensor, approach, max_poses)
 
 
 def places(

@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geomtact.contact_space.resolution import Resolution
+from geomtact.contact_space.resolution import Resolution, directions_of
 from geomtact.contact_space.space import ContactSpace
-from geomtact.geometry.approach import NO_TILT, Approach
+from geomtact.geometry.approach import NO_TILT, Approach, approach_of
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Directions
@@ -93,8 +93,7 @@ class Index:
     @cached_property
     def directions(self) -> Directions:
         """The modelled approach directions."""
-        assert self.mesh.symmetry is not None
-        return Directions.make(self.mesh.symmetry, self.approach, self.resolution.level, self.resolution.turn_step)
+        return directions_of(self.mesh, self.sensor, self.approach, self.resolution.level, self.resolution.turn_step)
 
     @cached_property
     def rotations(self) -> Array:
@@ -159,7 +158,8 @@ class Index:
         # an approach leaves no more tilt than its cones are wide
         cones = self.directions.cones
         turn, step = self.angle_step, self.resolution.step
-        tilt = turn if cones is None else min(turn, max(NO_TILT, 2 * max(half for _, half in cones)))
+        tilt = min(turn, self.directions.finer_step(approach_of(R)))
+        tilt = tilt if cones is None else min(tilt, max(NO_TILT, 2 * max(half for _, half in cones)))
         sideways = np.linalg.svd(up[None])[2][1:]
         turned = np.stack([tilt * sideways[0], tilt * sideways[1], turn * up, np.zeros(3), np.zeros(3)])
         moved = np.zeros((5, 3))

@@ -9,8 +9,10 @@ import numpy as np
 
 from geomtact.errors import UsageError
 from geomtact.geometry.approach import Approach
+from geomtact.geometry.faces import plane_faces
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.orbits import Cones, images_of, is_near
 from geomtact.geometry.rotations import Directions, level_step
-from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
@@ -19,6 +21,9 @@ LEVELS = (1, 2, 3, 4)
 PIXELS_PER_MASK_PIXEL = 3  # of the height maps, along each side
 _BYTES_FOR_FINE_MASKS = 120e6
 _BORDER = 1.3
+_FACES = 6  # at most, about which directions are finer
+_MOST_MORE = 1.25  # times as many poses, so that the lattice need not grow coarser for the faces' sake, or by less
+_DISK = 0.41  # half angle of the disk about a face in steps of the level: its middle cell is then a sixth of a step in radius
 
 
 @dataclass(frozen=True)
@@ -51,28 +56,58 @@ class Resolution:
         return cls(**values)
 
 
+def directions_of(
+    mesh: Mesh, sensor: Sensor, approach: Approach | None, level: int, turn_step: float | None = None
+) -> Directions:
+    """The approach directions of a grid of ``level``, finer about the faces that need it."""
+    assert mesh.symmetry is not None
+    return Directions.make(mesh.symmetry, approach, level, turn_step, finer_about(mesh, sensor, level))
+
+
+def finer_about(mesh: Mesh, sensor: Sensor, level: int) -> Cones:
+    """Disks (direction (3,), half angle [rad]) about plane faces for which the directions of ``level`` are too far apart, one for
+    those that symmetry makes equal.
+
+    A pixel's corner lies 0.7 steps off its middle. Where a tilt by as much lifts the edge of a face, or of the window on it,
+    by more than the mean penetration, none of the stored contacts need be the whole face's.
+    """
+    step = level_step(level)
+    width = 0.5 * sensor.max_penetration / np.tan(np.sqrt(0.5) * step)
+    if sensor.half_window.min() < width:
+        return []
+    assert mesh.symmetry is not None
+    disks: Cones = []
+    for face in plane_faces(mesh):
+        alike = any(is_near(image, disks) for image in images_of(face.normal, mesh.symmetry))
+        if face.half_width > width and not alike and len(disks) < _FACES:
+            disks.append((face.normal, _DISK * step))
+    return disks
+
+
 def choose(
-    radius_rms: float,
+    mesh: Mesh,
     footprint: float,
-    symmetry: Symmetry,
     sensor: Sensor,
     approach: Approach | None = None,
     max_poses: int = MAX_POSES,
 ) -> Resolution:
-    """The resolution whose cells are smallest, in mean point distance, at no more than about ``max_poses`` poses.
+    """The resolution whose cells are smallest, in mean point distance, at no more than about ``max_poses`` poses, or a quarter
+    more where directions are finer about faces.
 
     Parameters
     ----------
-    radius_rms : rms distance of the object's surface from its centre [m]: what a rotation moves
+    mesh : with its symmetry
     footprint : mean area of window positions that touch, over rotations [m^2]
     """
     if max_poses < 1000:
         raise UsageError(f"max_poses: expected at least 1000, got {max_poses}")
+    assert mesh.symmetry is not None
+    radius_rms = mesh.radius_rms  # what a rotation moves
     coarse, fine = sensor.along((24, 32)), sensor.along((48, 64))
     finest = float(_mask_pitch(sensor, fine).max())
     bins, best = 4, None
     # a level on which the symmetry or the approach leaves only points is the same at every level
-    directions = Directions.make(symmetry, approach, LEVELS[0])
+    directions = directions_of(mesh, sensor, approach, LEVELS[0])
     levels = LEVELS if directions.level is not None else LEVELS[:1]
     for level in levels:
         if directions.level is None:
@@ -86,9 +121,10 @@ def choose(
                 step = max(finest, _lattice_step(footprint, max_poses / (n * bins)))
         else:
             if level > LEVELS[0]:
-                directions = Directions.make(symmetry, approach, level)
+                directions = directions_of(mesh, sensor, approach, level)
             n, turn_step = float(directions.turns.sum()), level_step(level)
-            step = max(finest, _lattice_step(footprint, max_poses / (n * bins)))
+            more = min(n / float(Directions.make(mesh.symmetry, approach, level).turns.sum()), _MOST_MORE)
+            step = max(finest, _lattice_step(footprint, more * max_poses / (n * bins)))
         size = np.hypot(turn_step * radius_rms if n > 1 else 0.0, step)
         if best is None or size < best[0]:
             best = (size, level, turn_step, step, n * footprint / step**2)

@@ -3,7 +3,7 @@
 A rotation is its approach (``geometry.approach``) and its *turn*, what is left: a rotation about the sensor's z. Haar
 measure is solid angle times turn. Directions are HEALPix pixels (Gorski et al. 2005), so level l has 12 * 4^l directions
 and 6 * 2^l turns, nested and of equal volume (Yershova et al. 2010): 576, 4,608, 36,864 and 294,912 rotations for l = 1
-to 4.
+to 4. About plane faces, where a little tilt changes much of what is felt, directions may be finer (``finer``).
 
 What the object's symmetry makes equal is kept once, and what the scene rules out (``approach``) not at all: every
 allowed direction is mapped to one canonical image of its orbit, and a pixel's weight is the solid angle that lands in it.
@@ -29,20 +29,14 @@ from geomtact.geometry.approach import (
     in_cones,
 )
 from geomtact.geometry.orbits import (
+    Cones,
+    Partition,
     apart,
     at_polar,
     axis_of,
     azimuth_in_cones,
     azimuth_of,
-    band_edges,
-    band_vectors,
     canonical_image,
-    caps_of,
-    cell_count,
-    cell_of,
-    disk_around,
-    fine_points,
-    pixel_vectors,
     turn_period,
 )
 from geomtact.geometry.symmetry import Symmetry, about
@@ -74,6 +68,7 @@ class Directions:
     symmetry : the object's
     cones : the allowed approaches, None for all
     level : HEALPix level, or None for exact faces and spheres
+    partition : the cells of the sphere, None for exact faces and spheres
     """
 
     vectors: Array
@@ -81,40 +76,44 @@ class Directions:
     turns: NDArray[np.int64]
     periods: Array
     symmetry: Symmetry
-    cones: list[tuple[Array, float]] | None
+    cones: Cones | None
     level: int | None
+    partition: Partition | None
     _cell: NDArray[np.int64]
 
     @classmethod
     def make(
-        cls, symmetry: Symmetry, approach: Approach | None = None, level: int = 2, turn_step: float | None = None
+        cls,
+        symmetry: Symmetry,
+        approach: Approach | None = None,
+        level: int = 2,
+        turn_step: float | None = None,
+        finer: Cones | None = None,
     ) -> Directions:
-        """Directions of one HEALPix ``level``; ``turn_step`` [rad] spaces the turns of exact faces."""
+        """Directions of one HEALPix ``level``, seven in each of the disks ``finer`` (direction (3,), half angle [rad]);
+        ``turn_step`` [rad] spaces the turns of exact faces."""
         cones = check_approach(approach)
         if symmetry.kind == "sphere" or (cones and cones[0][1] == 0):
             return cls._faces(symmetry, cones, turn_step or level_step(level))
-        fine, area = fine_points(symmetry, cones, level)
+        partition = Partition.make(symmetry, cones, level, finer or [])
+        fine, area = partition.points()
         image = canonical_image(fine, symmetry, cones)[1]
-        key = cell_of(image, symmetry, level)
+        key = partition.cell_of(image)
         total = np.bincount(key, area)
-        mean = np.stack([np.bincount(key, area * image[:, i]) for i in range(3)], -1).astype(float)
         kept = np.flatnonzero(total)
-        cell = np.full(cell_count(symmetry, level), -1)
+        cell = np.full(len(partition), -1)
         cell[kept] = np.arange(len(kept))
-        weights = total[kept] / total.sum()
-        if symmetry.kind == "axis":
-            vectors = band_vectors(image, area, key, symmetry, cones)
-            if cones is None:  # the rows of fine points may line up with the bands, whose areas are known
-                weights = -np.diff(band_edges(symmetry, level))[kept]
-                weights /= weights.sum()
-        else:
-            vectors = pixel_vectors(mean[kept], image, cell[key], symmetry, cones, level)
+        weights: Array = total[kept].astype(float)
+        if symmetry.kind == "axis" and cones is None:
+            # the rows of fine points may line up with the bands, whose areas are known
+            weights = -np.diff(partition.band_cosines)[kept]
+        vectors = partition.vectors(image, area, key)
         turns = np.full(len(kept), level_turns(level))
         periods = np.full(len(kept), 2 * np.pi)
-        return cls(vectors, weights, turns, periods, symmetry, cones, level, cell)
+        return cls(vectors, weights / weights.sum(), turns, periods, symmetry, cones, level, partition, cell)
 
     @classmethod
-    def _faces(cls, symmetry: Symmetry, cones: list[tuple[Array, float]] | None, turn_step: float) -> Directions:
+    def _faces(cls, symmetry: Symmetry, cones: Cones | None, turn_step: float) -> Directions:
         if symmetry.kind == "sphere":
             vectors = np.array([cones[0][0] if cones else [0.0, 0.0, 1.0]])
             periods, weights = np.zeros(1), np.ones(1)
@@ -130,7 +129,7 @@ class Directions:
             # faces that symmetry makes equal are one, which stands for all of them
             weights = same[first].sum(1) / len(image)
         turns = np.maximum(1, np.ceil(periods / turn_step - 1e-9)).astype(np.int64)
-        return cls(vectors, weights, turns, periods, symmetry, cones, None, np.arange(len(vectors)))
+        return cls(vectors, weights, turns, periods, symmetry, cones, None, None, np.arange(len(vectors)))
 
     def angle_step(self, turn_step: float) -> float:
         """Angle between neighbouring rotations [rad]; ``turn_step`` is that of exact faces."""
@@ -138,10 +137,25 @@ class Directions:
             return level_step(self.level)
         return turn_step if self.periods.any() else 0.0
 
+    def finer_step(self, a: Array) -> float:
+        """Angle [rad] across the cell of an approach direction ``a`` (3,) in a disk that is cut finer; inf elsewhere."""
+        return np.inf if self.partition is None else self.partition.finer_step(a)
+
     @cached_property
     def first_turn(self) -> NDArray[np.int64]:
         """Which of :meth:`rotations` is turn 0 of each direction (D,)."""
         return np.cumsum(self.turns) - self.turns
+
+    def parents(self, turn_step: float) -> NDArray[np.int64]:
+        """The rotation of the next coarser grid that holds each of :meth:`rotations` (M,); what is finer stays as fine there.
+
+        ``turn_step`` [rad] spaces the turns of exact faces here.
+        """
+        level = max(self.level - 1, 0) if self.level is not None else 0
+        finer = self.partition.finer if self.partition else None
+        coarse = Directions.make(self.symmetry, self.cones, level, 2 * turn_step, finer)
+        _, direction, turn = coarse.lookup(transform(self.rotations()[0], np.zeros(3)))
+        return coarse.first_turn[direction] + turn
 
     def rotations(self) -> tuple[Array, NDArray[np.int64], Array]:
         """R_sensor_object (M, 3, 3) of all cells, direction by direction, their direction (M,) and turn [rad] (M,)."""
@@ -165,13 +179,13 @@ class Directions:
     def _draw_directions(self, k: NDArray[np.int64], rng: np.random.Generator) -> Array:
         """Approach directions (n, 3) uniform over the allowed ones of direction cells ``k`` (n,), made canonical."""
         a = self.vectors[k].copy()
-        if self.level is None:
+        if self.partition is None:
             return a
-        kept, level, sym = np.flatnonzero(self._cell >= 0), self.level, self.symmetry
+        kept, cells, sym = np.flatnonzero(self._cell >= 0), self.partition, self.symmetry
         if self.cones is not None:
             for cell in np.unique(k):
                 mine = np.flatnonzero(k == cell)
-                a[mine] = self._draw_in_cones(kept[cell], a[mine], self.cones, rng)
+                a[mine] = self._draw_in_cones(kept[cell], a[mine], cells, rng)
             return a
         todo = np.arange(len(k))
         for _ in range(200):  # until the draw falls into the cell; a cell too thin to be hit keeps its own direction
@@ -179,30 +193,26 @@ class Directions:
                 break
             cell = kept[k[todo]]
             if sym.axis is not None:
-                edges = band_edges(sym, level)
-                new = at_polar(np.atleast_1d(rng.uniform(edges[cell + 1], edges[cell])), a[todo], sym.axis)
+                cosine = cells.band_cosines
+                new = at_polar(np.atleast_1d(rng.uniform(cosine[cell + 1], cosine[cell])), a[todo], sym.axis)
                 fits = np.ones(len(new), bool)
             else:
-                middle, widest = disk_around(cell, level)
-                new = in_cone(middle, np.full(len(cell), widest), rng)
+                new = in_cone(*cells.disk_around(cell), rng)
                 own = np.abs(canonical_image(new, sym, None)[1] - new).max(-1) < 1e-9
-                fits = (cell_of(new, sym, level) == cell) & own
+                fits = (cells.cell_of(new) == cell) & own
             a[todo[fits]] = new[fits]
             todo = todo[~fits]
         return a
 
-    def _draw_in_cones(
-        self, cell: np.int64, a: Array, cones: list[tuple[Array, float]], rng: np.random.Generator
-    ) -> Array:
-        """``a`` (n, 3), the direction of one pixel or band, replaced by such draws; kept where the cell has no area."""
-        assert self.level is not None
-        caps = caps_of(cell, self.symmetry, cones, self.level)
+    def _draw_in_cones(self, cell: np.int64, a: Array, cells: Partition, rng: np.random.Generator) -> Array:
+        """``a`` (n, 3), the direction of one cell, replaced by such draws; kept where the cell has no area."""
+        caps = cells.caps_of(cell)
         n, tried, found = 0, 0, []
         while n < len(a) and tried < 16 * _BATCH:
             new = in_cones(caps, min(_BATCH, max(32, 8 * len(a), tried)), rng)
             tried += len(new)
-            image = canonical_image(new[allowed(new, cones)], self.symmetry, cones)[1]
-            found.append(image[cell_of(image, self.symmetry, self.level) == cell])
+            image = canonical_image(new[allowed(new, self.cones)], self.symmetry, self.cones)[1]
+            found.append(image[cells.cell_of(image) == cell])
             n += len(found[-1])
         new = np.concatenate(found)[: len(a)]
         if self.symmetry.axis is not None:
@@ -257,9 +267,9 @@ class Directions:
     def direction_of(self, a: ArrayLike) -> NDArray[np.int64]:
         """Cell (n,) of canonical approach directions ``a`` (n, 3); where a pixel is not kept, the nearest that is."""
         a = np.asarray(a, float)
-        if self.level is None:
+        if self.partition is None:
             return np.argmin(apart(a, self.vectors, self.symmetry), axis=1)
-        cell = self._cell[cell_of(a, self.symmetry, self.level)]
+        cell = self._cell[self.partition.cell_of(a)]
         missing = np.flatnonzero(cell < 0)
         if len(missing):
             cell[missing] = np.argmax(a[missing] @ self.vectors.T, axis=1)

@@ -1,0 +1,73 @@
+"""Plane faces that a part can be put down on: the directions about which a little tilt changes much of what is felt.
+
+Triangles are gathered by their normals (the extended Gaussian image, Horn 1984), then by the plane in which they lie.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import healpix
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.geometry.mesh import Mesh
+from geomtact.se3 import Array
+
+_NSIDE = 64  # HEALPix pixels of normals, about a degree wide
+_SAME_NORMAL = np.cos(np.deg2rad(0.5))
+_SAME_PLANE = 2e-5  # m: what lies no higher or lower is felt as one face
+_LEAST = 0.002  # share of the surface from which a pixel of normals is looked into
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """One plane face of a part, or several in one plane.
+
+    Attributes
+    ----------
+    normal : (3,) outward unit vector, object frame
+    area : [m^2]
+    half_width : half the width of a rectangle whose area is spread alike, across its narrow way [m]
+    """
+
+    normal: Array
+    area: float
+    half_width: float
+
+
+def plane_faces(mesh: Mesh) -> list[Face]:
+    """The plane faces of ``mesh``, for each normal the largest, the largest first."""
+    areas, normals = mesh.areas, mesh.normals
+    some = np.flatnonzero(areas > 0)
+    pixel = np.full(len(areas), -1)
+    pixel[some] = healpix.vec2pix(_NSIDE, *normals[some].T, nest=True)
+    total = np.bincount(pixel[some], areas[some])
+    found: list[Face] = []
+    for p in np.flatnonzero(total >= _LEAST * areas.sum()):
+        mine = np.flatnonzero(pixel == p)
+        normal = normals[mine[areas[mine].argmax()]]
+        # a face whose normals straddle pixels is met once
+        if any(normal @ face.normal > _SAME_NORMAL for face in found):
+            continue
+        flat = np.flatnonzero(normals @ normal > _SAME_NORMAL)
+        height = mesh.vertices[mesh.faces[flat]].mean(1) @ normal
+        order = np.argsort(height, kind="stable")
+        planes = np.split(flat[order], np.flatnonzero(np.diff(height[order]) > _SAME_PLANE) + 1)
+        found.append(max((_face(mesh, plane) for plane in planes), key=lambda face: face.area))
+    return sorted(found, key=lambda face: -face.area)
+
+
+def _face(mesh: Mesh, plane: NDArray[np.integer]) -> Face:
+    """The face that triangles ``plane`` (n,) make up."""
+    corners, areas = mesh.vertices[mesh.faces[plane]], mesh.areas[plane]
+    middles = corners.mean(1)
+    normal = areas @ mesh.normals[plane]
+    normal /= np.linalg.norm(normal)
+    along = np.linalg.svd(normal[None])[2][1:].T
+    origin = np.average(middles, axis=0, weights=areas)
+    x, m = (corners - origin) @ along, (middles - origin) @ along
+    # the mean of x x^T over a triangle of corners a, b, c is (a a^T + b b^T + c c^T + 9 m m^T) / 12, m its centroid
+    square = (np.einsum("tki,tkj->tij", x, x) + 9 * np.einsum("ti,tj->tij", m, m)) / 12
+    least = np.linalg.eigvalsh(np.average(square, axis=0, weights=areas))[0]
+    return Face(normal, float(areas.sum()), float(np.sqrt(3 * max(least, 0.0))))

@@ -1,0 +1,77 @@
+"""Plane faces of a mesh: what triangles make them up makes no difference, and the grid is finer about those that ask for it."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from geomtact.contact_space.resolution import directions_of, finer_about
+from geomtact.geometry.faces import plane_faces
+from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.geometry.rotations import Directions, level_step
+from geomtact.sensing.sensor import Sensor
+
+MM = 1e-3
+TURNED = Rotation.from_euler("xyz", [20, 35, 50], degrees=True).as_matrix()
+
+
+def part(solid: trimesh.Trimesh, R=None) -> Mesh:
+    vertices = MM * np.asarray(solid.vertices)
+    return Mesh(vertices if R is None else vertices @ R.T, solid.faces, "part", "mm")
+
+
+def test_a_box_has_six_faces_as_wide_as_its_sides():
+    faces = plane_faces(part(trimesh.creation.box((40, 30, 8))))
+    assert len(faces) == 6
+    assert [face.area for face in faces] == pytest.approx(MM**2 * np.repeat([1200, 320, 240], 2))
+    assert [face.half_width for face in faces] == pytest.approx(MM * np.repeat([15, 4, 4], 2))
+    normals = np.array([face.normal for face in faces])
+    assert np.abs(normals).argmax(1).tolist() == [2, 2, 1, 1, 0, 0]
+    assert normals.sum(0) == pytest.approx(np.zeros(3))
+
+
+@pytest.mark.parametrize("cuts", [0, 3])
+def test_the_object_frame_and_the_triangles_make_no_difference(cuts):
+    solid = trimesh.creation.box((40, 30, 8))
+    for _ in range(cuts):
+        solid = solid.subdivide()
+    here, there = plane_faces(part(solid)), plane_faces(part(trimesh.creation.box((40, 30, 8)), TURNED))
+    assert len(here) == len(there) == 6
+    for face in there:
+        same = min(here, key=lambda other: np.linalg.norm(TURNED @ other.normal - face.normal))
+        assert np.linalg.norm(TURNED @ same.normal - face.normal) < 1e-9
+        assert (same.area, same.half_width) == pytest.approx((face.area, face.half_width))
+
+
+def test_steps_are_faces_of_their_own_and_feet_are_one():
+    low, high, foot = (trimesh.creation.box(size) for size in ((20, 20, 10), (10, 10, 14), (4, 4, 4)))
+    stairs = trimesh.boolean.union([low, high])
+    up = next(face for face in plane_faces(part(stairs)) if face.normal[2] > 0.9)
+    assert up.area == pytest.approx(MM**2 * (400 - 100))  # the lower step, the larger of the two
+    feet = [foot.copy() for _ in range(4)]
+    for each, (x, y) in zip(feet, ((8, 8), (8, -8), (-8, 8), (-8, -8)), strict=True):
+        each.apply_translation((x, y, -6))
+    down = next(face for face in plane_faces(part(trimesh.boolean.union([low, *feet]))) if face.normal[2] < -0.9)
+    assert down.area == pytest.approx(MM**2 * (400 - 64))  # the floor between them
+
+
+def test_what_is_round_has_no_wide_face():
+    assert all(face.half_width < 1.2 * MM for face in plane_faces(part(trimesh.creation.icosphere(4, 10))))
+    rod = plane_faces(part(trimesh.creation.cylinder(10, 60, 64)))
+    assert [face.half_width > MM for face in rod].count(True) == 2  # its ends; of the mantle each strip is one
+
+
+def test_the_grid_is_finer_where_a_cells_tilt_lifts_a_face_off():
+    sensor, plate = Sensor.load("gelslim"), part(trimesh.creation.box((60, 45, 30)), TURNED).with_symmetry()
+    for level in (1, 2, 3, 4):
+        width = 0.5 * sensor.max_penetration / np.tan(level_step(level) / np.sqrt(2))
+        disks = finer_about(plate, sensor, level)
+        wide = sum(min(half, sensor.half_window.min()) > width for half in MM * np.array([15, 15, 22.5]))
+        assert len(disks) == wide  # opposite sides are one by symmetry
+        assert all(half < 0.5 * level_step(level) for _, half in disks)
+        even = Directions.make(plate.symmetry, None, level)
+        assert (len(directions_of(plate, sensor, None, level).vectors) > len(even.vectors)) == bool(disks)
+    assert finer_about(load_mesh("ball").with_symmetry(), sensor, 2) == []
+    # a window too small to see a tilt asks for nothing
+    pinhole = Sensor("pinhole", (64, 48), (0.05 * MM, 0.05 * MM), 20 * MM, 2 * MM)
+    assert finer_about(plate, pinhole, 2) == []
