@@ -43,16 +43,49 @@ def test_the_object_frame_and_the_triangles_make_no_difference(cuts):
         assert (same.area, same.half_width) == pytest.approx((face.area, face.half_width))
 
 
+def facing_z(solid, sign):
+    """Area and half width, mm, of the faces that look along +z or -z, the largest first."""
+    faces = [face for face in plane_faces(part(solid)) if sign * face.normal[2] > 0.99]
+    return [(face.area / MM**2, face.half_width / MM) for face in faces]
+
+
 def test_steps_are_faces_of_their_own_and_feet_are_one():
     low, high, foot = (trimesh.creation.box(size) for size in ((20, 20, 10), (10, 10, 14), (4, 4, 4)))
-    stairs = trimesh.boolean.union([low, high])
-    up = next(face for face in plane_faces(part(stairs)) if face.normal[2] > 0.9)
-    assert up.area == pytest.approx(MM**2 * (400 - 100))  # the lower step, the larger of the two
+    (lower, _), upper = facing_z(trimesh.boolean.union([low, high]), 1)
+    assert lower == pytest.approx(400 - 100) and upper == pytest.approx((100, 5))
     feet = [foot.copy() for _ in range(4)]
     for each, (x, y) in zip(feet, ((8, 8), (8, -8), (-8, 8), (-8, -8)), strict=True):
         each.apply_translation((x, y, -6))
-    down = next(face for face in plane_faces(part(trimesh.boolean.union([low, *feet]))) if face.normal[2] < -0.9)
-    assert down.area == pytest.approx(MM**2 * (400 - 64))  # the floor between them
+    (floor, _), stand = facing_z(trimesh.boolean.union([low, *feet]), -1)
+    assert floor == pytest.approx(400 - 64)
+    assert stand == pytest.approx((64, np.sqrt(3 * (8**2 + 4**2 / 12))))
+
+
+def test_a_rail_hides_no_pad_beside_it():
+    """The larger of two faces that look the same way is too narrow to ask for a finer grid, the other is not."""
+    base, rail, pad = (trimesh.creation.box(size) for size in ((100, 24, 10), (100, 3, 8), (16, 16, 6)))
+    rail.apply_translation((0, 10.5, 5))
+    pad.apply_translation((0, -2, 4))
+    base.vertices[base.vertices[:, 2] > 0, 1] *= 0.2  # a ridge: its own top is narrow too
+    mesh = part(trimesh.boolean.union([base, rail, pad])).with_symmetry()
+    up = [face for face in plane_faces(mesh) if face.normal[2] > 0.99]
+    assert up[0].half_width < 3 * MM and max(face.half_width for face in up) > 7 * MM
+    assert any(v[2] > 0.99 for v, _ in finer_about(mesh, Sensor.load("gelslim"), 2))
+
+
+def test_nearly_parallel_faces_share_a_disk():
+    """A roof of 1 degree: one disk holds the middle cells of both."""
+    roof = trimesh.convex.convex_hull(
+        [
+            (x, y, z)
+            for x in (-20, 20)
+            for y, z in ((-25, 0), (25, 0), (-25, -30), (25, -30), (0, 25 * np.tan(np.radians(0.5))))
+        ]
+    )
+    up = [face for face in plane_faces(part(roof)) if face.normal[2] > 0.9]
+    assert len(up) == 2
+    disks = finer_about(part(roof).with_symmetry(), Sensor.load("gelslim"), 2)
+    assert sum(v[2] > 0.9 for v, _ in disks) == 1
 
 
 def test_what_is_round_has_no_wide_face():

@@ -213,6 +213,21 @@ def test_a_face_lies_in_a_small_cell_of_its_own(symmetry, rng):
     assert (directions.lookup(transform(facing(within((face, 0.999 * small), 500, rng)), np.zeros(3)))[1] == k).all()
 
 
+@pytest.mark.parametrize("symmetry", ["none", "six turns"])
+@pytest.mark.parametrize("level", [1, 2])
+def test_cones_about_a_face_weigh_what_they_put_into_its_cells(symmetry, level, rng):
+    """From far narrower than a cell of the disk to wider than the disk, about its middle and off it."""
+    face, disk = np.array([0.54, 0.29, 0.79]) / np.linalg.norm([0.54, 0.29, 0.79]), 0.2 / level
+    for half in (3e-4, 5e-3, 0.3 * disk, 0.9 * disk, 1.5 * disk):
+        for off in (0, 0.2, 0.8):
+            v = face + off * disk * np.cross(face, ACROSS)
+            cone = (v / np.linalg.norm(v), half)
+            directions = Directions.make(SYMMETRIES[symmetry], [cone], level, finer=[(face, disk)])
+            k = cells_in(directions, cone, 4000, rng)
+            observed = np.bincount(k, minlength=len(directions.weights))
+            assert chi_square(observed, directions.weights * 4000) > 1e-5
+
+
 @pytest.mark.parametrize("symmetry", ["axis", "axis with flip"])
 def test_about_a_symmetry_axis_a_face_has_two_bands_of_its_own(symmetry):
     sym, half = SYMMETRIES[symmetry], 0.11

@@ -11,7 +11,7 @@ from geomtact.errors import UsageError
 from geomtact.geometry.approach import Approach
 from geomtact.geometry.faces import plane_faces
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.orbits import Cones, images_of, is_near
+from geomtact.geometry.orbits import Cones, images_of, is_near, middle_cell
 from geomtact.geometry.rotations import Directions, level_step
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
@@ -78,9 +78,10 @@ def finer_about(mesh: Mesh, sensor: Sensor, level: int) -> Cones:
     assert mesh.symmetry is not None
     disks: Cones = []
     for face in plane_faces(mesh):
-        alike = any(is_near(image, disks) for image in images_of(face.normal, mesh.symmetry))
-        if face.half_width > width and not alike and len(disks) < _FACES:
-            disks.append((face.normal, _DISK * step))
+        if face.half_width > width and len(disks) < _FACES:
+            # what lies within the middle cell of another's disk needs none of its own
+            near = [is_near(image, disks, middle_cell(_DISK * step)) for image in images_of(face.normal, mesh.symmetry)]
+            disks += [] if any(near) else [(face.normal, _DISK * step)]
     return disks
 
 

@@ -17,7 +17,7 @@ from geomtact.se3 import Array
 _NSIDE = 64  # HEALPix pixels of normals, about a degree wide
 _SAME_NORMAL = np.cos(np.deg2rad(0.5))
 _SAME_PLANE = 2e-5  # m: what lies no higher or lower is felt as one face
-_LEAST = 0.002  # share of the surface from which a pixel of normals is looked into
+_LEAST = 0.002  # share of the surface from which a face counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,24 +37,27 @@ class Face:
 
 
 def plane_faces(mesh: Mesh) -> list[Face]:
-    """The plane faces of ``mesh``, for each normal the largest, the largest first."""
+    """The plane faces of ``mesh`` that make up a share of its surface that counts, the largest first."""
     areas, normals = mesh.areas, mesh.normals
+    least = _LEAST * areas.sum()
     some = np.flatnonzero(areas > 0)
     pixel = np.full(len(areas), -1)
     pixel[some] = healpix.vec2pix(_NSIDE, *normals[some].T, nest=True)
     total = np.bincount(pixel[some], areas[some])
     found: list[Face] = []
-    for p in np.flatnonzero(total >= _LEAST * areas.sum()):
+    met: list[Array] = []
+    for p in np.flatnonzero(total >= least):
         mine = np.flatnonzero(pixel == p)
         normal = normals[mine[areas[mine].argmax()]]
-        # a face whose normals straddle pixels is met once
-        if any(normal @ face.normal > _SAME_NORMAL for face in found):
+        # faces whose normals straddle pixels are met once
+        if any(normal @ other > _SAME_NORMAL for other in met):
             continue
+        met.append(normal)
         flat = np.flatnonzero(normals @ normal > _SAME_NORMAL)
         height = mesh.vertices[mesh.faces[flat]].mean(1) @ normal
         order = np.argsort(height, kind="stable")
         planes = np.split(flat[order], np.flatnonzero(np.diff(height[order]) > _SAME_PLANE) + 1)
-        found.append(max((_face(mesh, plane) for plane in planes), key=lambda face: face.area))
+        found += [_face(mesh, plane) for plane in planes if areas[plane].sum() >= least]
     return sorted(found, key=lambda face: -face.area)
 
 

@@ -22,7 +22,7 @@ Cones = list[tuple[Array, float]]
 _PARTS = 7  # cells of a disk that is cut finer: one in its middle, six round about
 _SAME = 0.01  # rad: how near to each other the directions of one face come out, by mesh and symmetry
 _FINE = 3  # levels between a pixel and the points that measure how much of it is kept
-_PER_CONE = 2048  # points that measure a cone or a disk at least
+_PER_CONE, _MOST = 2048, 1 << 16  # points that measure a cone or a disk at least, and a cone about a disk at most
 _GENERIC = np.array([0.5402, 0.2911, 0.7896])  # of no machined part's symmetry: picks one image of each orbit
 
 
@@ -50,9 +50,14 @@ def images_of(v: Array, symmetry: Symmetry) -> Array:
     return np.asarray(symmetry.elements[:, :3, :3].swapaxes(1, 2) @ v)
 
 
-def is_near(v: Array, disks: Cones) -> bool:
-    """Whether a direction (3,) is that of one of the disks."""
-    return any(np.linalg.norm(v - other) < _SAME for other, _ in disks)
+def is_near(v: Array, disks: Cones, tolerance: float = _SAME) -> bool:
+    """Whether a direction (3,) is that of one of the disks, give or take ``tolerance`` [rad]."""
+    return any(np.linalg.norm(v - other) < tolerance for other, _ in disks)
+
+
+def middle_cell(half: float) -> float:
+    """Half angle [rad] of the cell in the middle of a disk of half angle ``half`` [rad]."""
+    return float(half / np.sqrt(_PARTS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +100,7 @@ class Partition:
         n = int(np.ceil(np.pi / np.sqrt(4 * np.pi / (12 * 4**self.level))))
         edges = [np.linspace(0, np.pi, n + 1)]
         for v, half in self.finer:
-            rings = np.array([half / np.sqrt(_PARTS), half])
+            rings = np.array([middle_cell(half), half])
             edges.append(rings if v @ axis > 0 else np.pi - rings)
         return np.unique(np.concatenate(edges))
 
@@ -121,7 +126,7 @@ class Partition:
 
     def finer_step(self, a: Array) -> float:
         """Angle [rad] across the cell of a direction ``a`` (3,) in a disk that is cut finer; inf elsewhere."""
-        return min((2 * half / np.sqrt(_PARTS) for v, half in self.finer if a @ v >= np.cos(half)), default=np.inf)
+        return min((2 * middle_cell(half) for v, half in self.finer if a @ v >= np.cos(half)), default=np.inf)
 
     def _part_of(self, a: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The disk (n,) that holds each direction, -1 for none, and which of its cells does (n,): 0 the middle one."""
@@ -145,15 +150,19 @@ class Partition:
         def pixels(half: float) -> float:
             return float(12 * nside**2 * np.sin(half / 2) ** 2)
 
+        # as close together as over the smallest disk, up to a number
+        smallest = min((pixels(half) for _, half in self.finer), default=np.inf)
+
         def spread(disks: Cones, first: int = 0) -> list[tuple[Array, float]]:
             """Points over each disk from the ``first`` on, as far as it sticks out of those before it, and the area of one."""
             found = []
             for rank, (v, half) in enumerate(disks[first:], first):
-                own = sunflower(v, half, max(_PER_CONE, int(pixels(half))))
+                n = min(_PER_CONE * pixels(half) / smallest, _MOST)
+                own = sunflower(v, half, int(max(_PER_CONE, pixels(half), n)))
                 found.append((own[~allowed(own, disks[:rank])], pixels(half) / len(own)))
             return found
 
-        sets = [(fine, 1.0)]
+        sets, wide = [(fine, 1.0)], self.cones
         if self.cones is not None:
             # widest first: of a narrow cone only what sticks out of a wide one counts
             ordered = sorted(self.cones, key=lambda cone: -cone[1])
@@ -161,8 +170,9 @@ class Partition:
             wide = [cone for cone in ordered if pixels(cone[1]) >= _PER_CONE and self.symmetry.axis is None]
             sets = [(fine[allowed(fine, wide)], 1.0), *spread(ordered, len(wide))]
         if self.finer and self.symmetry.axis is None:
-            sets = [(a[~allowed(a, self.finer)], area) for a, area in sets]
-            sets += [(a[allowed(a, self.cones)], area) for a, area in spread(self.finer)]
+            # the finest grid is too coarse for their cells; the points of thin cones are not
+            sets[0] = fine[allowed(fine, wide) & ~allowed(fine, self.finer)], 1.0
+            sets += [(a[allowed(a, wide)], area) for a, area in spread(self.finer)]
         return np.concatenate([a for a, _ in sets]), np.concatenate([np.full(len(a), area) for a, area in sets])
 
     def disk_around(self, cell: ArrayLike) -> tuple[Array, Array]:
@@ -175,7 +185,7 @@ class Partition:
         for i, (v, half) in enumerate(self.finer):
             middle[disk == i] = v
             widest[disk == i] = half
-        return middle, np.where((disk >= 0) & (part == 0), widest / np.sqrt(_PARTS) * 1.001, widest)
+        return middle, np.where((disk >= 0) & (part == 0), 1.001 * widest / np.sqrt(_PARTS), widest)
 
     def caps_of(self, cell: np.int64) -> Cones:
         """Caps that hold all allowed directions whose images fall into a cell: the smaller of its disk and the cones."""
