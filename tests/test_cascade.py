@@ -42,8 +42,8 @@ def test_a_block_is_a_cell_of_the_next_coarser_grid(localizer):
     index = localizer.index
     size = np.diff(index.blocks)
     assert index.blocks[0] == 0 and index.blocks[-1] == index.places and (size > 0).all()
-    finer = index.directions.partition.finer
-    coarse = Directions.make(index.mesh.symmetry, index.approach, index.resolution.level - 1, finer=finer)
+    disks = index.directions.cells.disks
+    coarse = Directions.make(index.mesh.symmetry, index.approach, index.resolution.level - 1, disks=disks)
     _, k, j = coarse.lookup(transform(index.rotations, np.zeros(3)))
     parent = (coarse.first_turn[k] + j)[index.rotation]
     x, y = index.lattice(index.shift.astype(float))

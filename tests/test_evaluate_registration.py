@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 from geomtact import load_mesh, se3
 from geomtact.cli import app
 from geomtact.contact_space.build import choose_resolution
-from geomtact.contact_space.resolution import directions_of
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask
 from geomtact.evaluation import registration
@@ -112,7 +111,7 @@ def test_agreement_counts_directions():
 
 def grid_of(space):
     resolution = choose_resolution(space.mesh, space.sensor, None, 20_000)
-    directions = directions_of(space.mesh, space.sensor, None, resolution.level, resolution.turn_step)
+    directions = resolution.directions(space.mesh.symmetry, None)
     return Grid(directions, resolution)
 
 
@@ -166,9 +165,8 @@ def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
             assert trial.error_mm == trial.start_mm and trial.drift_mm == pytest.approx(0, abs=1e-9)
         for start, trial in zip(seen["a"][7 * i + 4 :], whole[i][-6::2], strict=False):
             assert trial.turn_deg is None and trial.shift_mm is None
-            if (
-                np.abs(start - grid.directions.canonical(touch.T_sensor_object[None])[0]).max() < 1e-9
-            ):  # the pose of its cell does not touch
+            true = grid.directions.canonical(touch.T_sensor_object[None])[0]
+            if np.abs(start - true).max() < 1e-9:  # the pose of its cell does not touch
                 continue
             from_grid += 1
             rotations = grid.directions.rotations()[0]

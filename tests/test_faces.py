@@ -1,14 +1,18 @@
 """Plane faces of a mesh: what triangles make them up makes no difference, and the grid is finer about those that ask for it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from geomtact.contact_space.resolution import directions_of, finer_about
+from geomtact.contact_space.build import choose_resolution
+from geomtact.contact_space.resolution import disks_about_faces
+from geomtact.geometry.cells import within_any
 from geomtact.geometry.faces import plane_faces
 from geomtact.geometry.mesh import Mesh, load_mesh
-from geomtact.geometry.rotations import Directions, level_step
+from geomtact.geometry.orbits import images_of
 from geomtact.sensing.sensor import Sensor
 
 MM = 1e-3
@@ -70,7 +74,7 @@ def test_a_rail_hides_no_pad_beside_it():
     mesh = part(trimesh.boolean.union([base, rail, pad])).with_symmetry()
     up = [face for face in plane_faces(mesh) if face.normal[2] > 0.99]
     assert up[0].half_width < 3 * MM and max(face.half_width for face in up) > 7 * MM
-    assert any(v[2] > 0.99 for v, _ in finer_about(mesh, Sensor.load("gelslim"), 2))
+    assert any(v[2] > 0.99 for v, _ in disks_about_faces(mesh, Sensor.load("gelslim"), None, 2))
 
 
 def test_nearly_parallel_faces_share_a_disk():
@@ -84,7 +88,7 @@ def test_nearly_parallel_faces_share_a_disk():
     )
     up = [face for face in plane_faces(part(roof)) if face.normal[2] > 0.9]
     assert len(up) == 2
-    disks = finer_about(part(roof).with_symmetry(), Sensor.load("gelslim"), 2)
+    disks = disks_about_faces(part(roof).with_symmetry(), Sensor.load("gelslim"), None, 2)
     assert sum(v[2] > 0.9 for v, _ in disks) == 1
 
 
@@ -94,17 +98,41 @@ def test_what_is_round_has_no_wide_face():
     assert [face.half_width > MM for face in rod].count(True) == 2  # its ends; of the mantle each strip is one
 
 
-def test_the_grid_is_finer_where_a_cells_tilt_lifts_a_face_off():
-    sensor, plate = Sensor.load("gelslim"), part(trimesh.creation.box((60, 45, 30)), TURNED).with_symmetry()
-    for level in (1, 2, 3, 4):
-        width = 0.5 * sensor.max_penetration / np.tan(level_step(level) / np.sqrt(2))
-        disks = finer_about(plate, sensor, level)
-        wide = sum(min(half, sensor.half_window.min()) > width for half in MM * np.array([15, 15, 22.5]))
-        assert len(disks) == wide  # opposite sides are one by symmetry
-        assert all(half < 0.5 * level_step(level) for _, half in disks)
-        even = Directions.make(plate.symmetry, None, level)
-        assert (len(directions_of(plate, sensor, None, level).vectors) > len(even.vectors)) == bool(disks)
-    assert finer_about(load_mesh("ball").with_symmetry(), sensor, 2) == []
-    # a window too small to see a tilt asks for nothing
+def lifted(part, sensor, resolution, normals, approach=None):
+    """How far the tilt of the nearest direction of the grid lifts each face's edge, or the window's, off the gel [m]."""
+    directions = resolution.directions(part.symmetry, approach)
+    widths = {tuple(face.normal): face.half_width for face in plane_faces(part)}
+    images = np.concatenate([v @ part.symmetry.elements[:, :3, :3] for v in directions.vectors[:, None]])[:, 0]
+    tilt = np.arccos(np.clip(np.max(normals @ images.T, 1), -1, 1))
+    return np.minimum([widths[tuple(v)] for v in normals], sensor.half_window.min()) * np.tan(tilt)
+
+
+@pytest.mark.parametrize("name", ["bracket", "head", "elbow_pipe"])
+@pytest.mark.parametrize("sensor", ["gelslim", "gelsight-mini"])
+def test_a_face_put_down_is_felt_whole_by_some_pose_of_the_grid(name, sensor):
+    """Of the six widest faces; of a grid without disks many are not."""
+    part, sensor = load_mesh(name).with_symmetry(), Sensor.load(sensor)
+    resolution = choose_resolution(part, sensor)
+    faces = [face.normal for face in plane_faces(part) if face.half_width > 5.5 * MM][:6]
+    mean = 0.5 * sensor.max_penetration
+    assert lifted(part, sensor, resolution, faces).max() < 0.1 * mean
+    assert lifted(part, sensor, replace(resolution, disks=()), faces).max() > 0.9 * mean
+
+
+def test_faces_that_the_approach_rules_out_take_no_place():
+    """The elbow has more than six wide faces; the last of them is met where the scene leaves it alone."""
+    elbow, sensor = load_mesh("elbow_pipe").with_symmetry(), Sensor.load("gelslim")
+    met = disks_about_faces(elbow, sensor, None, 1)
+    wide = [face.normal for face in plane_faces(elbow) if face.half_width > 5.5 * MM]
+    left = [v for v in wide if not within_any(images_of(v[None], elbow.symmetry)[0], met, met[0][1] / 2.6)]
+    assert len(met) == 6 and left
+    assert within_any(left[0], disks_about_faces(elbow, sensor, [(left[0], 0.05)], 1))
+
+
+def test_a_window_or_a_level_that_needs_no_disks_has_none():
+    plate = part(trimesh.creation.box((60, 45, 30)), TURNED).with_symmetry()
+    assert len(disks_about_faces(plate, Sensor.load("gelslim"), None, 2)) == 3  # opposite sides are one by symmetry
+    assert disks_about_faces(plate, Sensor.load("gelslim"), None, 4) == []
     pinhole = Sensor("pinhole", (64, 48), (0.05 * MM, 0.05 * MM), 20 * MM, 2 * MM)
-    assert finer_about(plate, pinhole, 2) == []
+    assert disks_about_faces(plate, pinhole, None, 2) == []
+    assert disks_about_faces(load_mesh("ball").with_symmetry(), Sensor.load("gelslim"), None, 2) == []

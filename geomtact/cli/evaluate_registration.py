@@ -45,7 +45,7 @@ def judge_registration(
     Prints success, errors and times of each method, and writes them and every trial to --out.
     """
     from geomtact.contact_space.build import choose_resolution
-    from geomtact.contact_space.resolution import MAX_POSES, directions_of
+    from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.contact_space.space import ContactSpace
     from geomtact.evaluation import registration
     from geomtact.evaluation.peers import peers
@@ -67,7 +67,7 @@ def judge_registration(
         space = ContactSpace(mesh, pressed)
         resolution = choose_resolution(mesh, pressed, None, MAX_POSES)
         assert mesh.symmetry is not None
-        directions = directions_of(mesh, pressed, None, resolution.level, resolution.turn_step)
+        directions = resolution.directions(mesh.symmetry, None)
         grid = registration.Grid(directions, resolution)
         surface = Refinery(space).surface
 

@@ -57,7 +57,8 @@ def build(
     MeshError
         No pose of the object touches the sensor as the approach and the housing allow.
     """
-    directions = res.directions_of(mesh, sensor, approach, resolution.level, resolution.turn_step)
+    assert mesh.symmetry is not None
+    directions = resolution.directions(mesh.symmetry, approach)
     caster = Caster(mesh.vertices, mesh.faces)
     reach = mesh.reach
     frame = Frame.make(reach, sensor, resolution.step)
@@ -84,7 +85,7 @@ def build(
             f"{mesh.name}: no pose touches the sensor {sensor.name!r} as the approach and the housing allow; "
             "widen the approach or check the object's unit"
         )
-    return _join(turns, directions, frame, _blocks(turns, directions.parents(resolution.turn_step), frame))
+    return _join(turns, directions, frame, _blocks(turns, directions.coarser_rotations(resolution.turn_step), frame))
 
 
 def choose_resolution(

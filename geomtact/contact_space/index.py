@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geomtact.contact_space.resolution import Resolution, directions_of
+from geomtact.contact_space.resolution import Resolution
 from geomtact.contact_space.space import ContactSpace
 from geomtact.geometry.approach import NO_TILT, Approach, approach_of
 from geomtact.geometry.distance import PoseDistance
@@ -93,7 +93,8 @@ class Index:
     @cached_property
     def directions(self) -> Directions:
         """The modelled approach directions."""
-        return directions_of(self.mesh, self.sensor, self.approach, self.resolution.level, self.resolution.turn_step)
+        assert self.mesh.symmetry is not None
+        return self.resolution.directions(self.mesh.symmetry, self.approach)
 
     @cached_property
     def rotations(self) -> Array:
@@ -155,10 +156,10 @@ class Index:
         """
         R = np.asarray(T, float)[:3, :3]
         up = R[2]
-        # an approach leaves no more tilt than its cones are wide
         cones = self.directions.cones
         turn, step = self.angle_step, self.resolution.step
-        tilt = min(turn, self.directions.finer_step(approach_of(R)))
+        # the cells of disks leave less tilt, and an approach no more than its cones are wide
+        tilt = min(turn, self.directions.disk_step(approach_of(R)))
         tilt = tilt if cones is None else min(tilt, max(NO_TILT, 2 * max(half for _, half in cones)))
         sideways = np.linalg.svd(up[None])[2][1:]
         turned = np.stack([tilt * sideways[0], tilt * sideways[1], turn * up, np.zeros(3), np.zeros(3)])

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from geomtact.errors import UsageError
-from geomtact.geometry.approach import Approach
+from geomtact.geometry.approach import Approach, Cones, allowed, check_approach
+from geomtact.geometry.cells import middle_angle, within_any
 from geomtact.geometry.faces import plane_faces
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.orbits import Cones, images_of, is_near, middle_cell
+from geomtact.geometry.orbits import images_of
 from geomtact.geometry.rotations import Directions, level_step
+from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
@@ -21,9 +23,9 @@ LEVELS = (1, 2, 3, 4)
 PIXELS_PER_MASK_PIXEL = 3  # of the height maps, along each side
 _BYTES_FOR_FINE_MASKS = 120e6
 _BORDER = 1.3
-_FACES = 6  # at most, about which directions are finer
-_MOST_MORE = 1.25  # times as many poses, so that the lattice need not grow coarser for the faces' sake, or by less
-_DISK = 0.41  # half angle of the disk about a face in steps of the level: its middle cell is then a sixth of a step in radius
+_FACES = 6  # at most, about which there are disks
+_MOST_MORE = 1.25  # times ``max_poses`` that there may be before the lattice grows coarser for the disks' sake
+_DISK = 0.41  # steps, half angle of a disk: its cells are then a third of a step across, the tilt that a face is felt whole at
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Resolution:
     pixel : pixel of the height maps [m]
     penetrations : depths of the deepest point at the centres of the penetration bins [m]
     mask_shape : (h, w) of the stored masks
+    disks : (x, y, z, half angle [rad]) of each disk about a direction, object frame, in which directions are finer
     """
 
     level: int
@@ -46,6 +49,12 @@ class Resolution:
     pixel: float
     penetrations: tuple[float, ...]
     mask_shape: tuple[int, int]
+    disks: tuple[tuple[float, ...], ...] = ()
+
+    def directions(self, symmetry: Symmetry, approach: Approach | None) -> Directions:
+        """The approach directions of the grid."""
+        disks = [(np.array(disk[:3]), disk[3]) for disk in self.disks]
+        return Directions.make(symmetry, approach, self.level, self.turn_step, disks)
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -53,35 +62,34 @@ class Resolution:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Resolution:
         values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-        return cls(**values)
+        return cls(**values | {"disks": tuple(tuple(disk) for disk in data.get("disks", ()))})
 
 
-def directions_of(
-    mesh: Mesh, sensor: Sensor, approach: Approach | None, level: int, turn_step: float | None = None
-) -> Directions:
-    """The approach directions of a grid of ``level``, finer about the faces that need it."""
-    assert mesh.symmetry is not None
-    return Directions.make(mesh.symmetry, approach, level, turn_step, finer_about(mesh, sensor, level))
+def disks_about_faces(mesh: Mesh, sensor: Sensor, cones: Cones | None, level: int) -> Cones:
+    """Disks (direction (3,), half angle [rad]) about the plane faces for which the directions of ``level`` are too far apart.
 
-
-def finer_about(mesh: Mesh, sensor: Sensor, level: int) -> Cones:
-    """Disks (direction (3,), half angle [rad]) about plane faces for which the directions of ``level`` are too far apart, one for
-    those that symmetry makes equal.
-
-    A pixel's corner lies 0.7 steps off its middle. Where a tilt by as much lifts the edge of a face, or of the window on it,
-    by more than the mean penetration, none of the stored contacts need be the whole face's.
+    A pixel's corner lies 0.7 steps off its middle. Where a tilt by as much lifts the edge of a face, across its narrow way, or of
+    the window on it, by more than the mean penetration, none of the stored contacts need be the whole face's. One disk stands for
+    all faces that symmetry makes equal, and for those within its middle cell; there are six at most, about the largest of the
+    faces that ``cones`` leave.
     """
-    step = level_step(level)
-    width = 0.5 * sensor.max_penetration / np.tan(np.sqrt(0.5) * step)
-    if sensor.half_window.min() < width:
-        return []
     assert mesh.symmetry is not None
+    step = level_step(level)
+    half = _DISK * step
+    width = 0.5 * sensor.max_penetration / np.tan(np.sqrt(0.5) * step)
     disks: Cones = []
+    if sensor.half_window.min() < width:
+        return disks
     for face in plane_faces(mesh):
-        if face.half_width > width and len(disks) < _FACES:
-            # what lies within the middle cell of another's disk needs none of its own
-            near = [is_near(image, disks, middle_cell(_DISK * step)) for image in images_of(face.normal, mesh.symmetry)]
-            disks += [] if any(near) else [(face.normal, _DISK * step)]
+        images = images_of(face.normal[None], mesh.symmetry)[0]
+        left = cones is None or allowed(images, [(v, angle + half) for v, angle in cones]).any()
+        if (
+            face.half_width > width
+            and left
+            and len(disks) < _FACES
+            and not within_any(images, disks, middle_angle(half))
+        ):
+            disks.append((face.normal, half))
     return disks
 
 
@@ -92,13 +100,19 @@ def choose(
     approach: Approach | None = None,
     max_poses: int = MAX_POSES,
 ) -> Resolution:
-    """The resolution whose cells are smallest, in mean point distance, at no more than about ``max_poses`` poses, or a quarter
-    more where directions are finer about faces.
+    """The resolution whose cells are smallest, in mean point distance, outside of disks about faces, at no more than about
+    ``max_poses`` poses, or a quarter more where there are such disks.
 
     Parameters
     ----------
     mesh : with its symmetry
     footprint : mean area of window positions that touch, over rotations [m^2]
+    sensor, approach, max_poses : as of ``Localizer.prepare``
+
+    Raises
+    ------
+    UsageError
+        ``max_poses`` below 1000, or an approach that makes no sense.
     """
     if max_poses < 1000:
         raise UsageError(f"max_poses: expected at least 1000, got {max_poses}")
@@ -108,9 +122,11 @@ def choose(
     finest = float(_mask_pitch(sensor, fine).max())
     bins, best = 4, None
     # a level on which the symmetry or the approach leaves only points is the same at every level
-    directions = directions_of(mesh, sensor, approach, LEVELS[0])
+    directions = Directions.make(mesh.symmetry, approach, LEVELS[0])
     levels = LEVELS if directions.level is not None else LEVELS[:1]
+    cones = check_approach(approach)
     for level in levels:
+        disks: Cones = []
         if directions.level is None:
             rotating = float((directions.periods > 0).sum())
             if rotating:
@@ -121,22 +137,23 @@ def choose(
                 n, turn_step = len(directions.vectors), 2 * np.pi
                 step = max(finest, _lattice_step(footprint, max_poses / (n * bins)))
         else:
-            if level > LEVELS[0]:
-                directions = directions_of(mesh, sensor, approach, level)
-            n, turn_step = float(directions.turns.sum()), level_step(level)
-            more = min(n / float(Directions.make(mesh.symmetry, approach, level).turns.sum()), _MOST_MORE)
-            step = max(finest, _lattice_step(footprint, more * max_poses / (n * bins)))
+            even = Directions.make(mesh.symmetry, approach, level).turns.sum()
+            disks = disks_about_faces(mesh, sensor, cones, level)
+            n = float(Directions.make(mesh.symmetry, approach, level, disks=disks).turns.sum())
+            turn_step = level_step(level)
+            step = max(finest, _lattice_step(footprint, max_poses / (max(even, n / _MOST_MORE) * bins)))
         size = np.hypot(turn_step * radius_rms if n > 1 else 0.0, step)
         if best is None or size < best[0]:
-            best = (size, level, turn_step, step, n * footprint / step**2)
+            best = (size, level, turn_step, step, n * footprint / step**2, disks)
     assert best is not None
-    _, level, turn_step, step, places = best
+    _, level, turn_step, step, places, disks = best
     if places * bins * 4 < max_poses:
         bins = 8
     shape = fine if places * bins * fine[0] * fine[1] / 8 < _BYTES_FOR_FINE_MASKS else coarse
     pixel = float(_mask_pitch(sensor, shape).min()) / PIXELS_PER_MASK_PIXEL
     depths = tuple(float(d) for d in (np.arange(bins) + 0.5) / bins * sensor.max_penetration)
-    return Resolution(level, float(turn_step), float(step), pixel, depths, shape)
+    found = tuple((*map(float, v), float(half)) for v, half in disks)
+    return Resolution(level, float(turn_step), float(step), pixel, depths, shape, found)
 
 
 def _lattice_step(footprint: float, cells: float) -> float:

@@ -26,7 +26,7 @@ from geomtact.geometry.symmetry import Symmetry
 from geomtact.progress import Progress
 from geomtact.sensing.sensor import Sensor
 
-FORMAT = 7  # raise whenever a built index would differ
+FORMAT = 8  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
 _KEY_LENGTH = 32  # hexadecimal digits of an entry's name
 

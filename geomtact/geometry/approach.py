@@ -15,6 +15,7 @@ from geomtact.errors import UsageError
 from geomtact.se3 import Array
 
 Approach = Sequence[tuple[ArrayLike, float]]
+Cones = list[tuple[Array, float]]  # unit vectors (3,) and half angles [rad]
 NO_TILT = 1e-8  # rad that an approach of half angle 0 leaves, so that no variance is 0
 FACE_TOLERANCE = 1e-6  # rad: how near a pose must come to an approach of half angle 0
 

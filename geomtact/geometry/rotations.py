@@ -3,7 +3,7 @@
 A rotation is its approach (``geometry.approach``) and its *turn*, what is left: a rotation about the sensor's z. Haar
 measure is solid angle times turn. Directions are HEALPix pixels (Gorski et al. 2005), so level l has 12 * 4^l directions
 and 6 * 2^l turns, nested and of equal volume (Yershova et al. 2010): 576, 4,608, 36,864 and 294,912 rotations for l = 1
-to 4. About plane faces, where a little tilt changes much of what is felt, directions may be finer (``finer``).
+to 4. About plane faces, where a little tilt changes much of what is felt, directions may be finer (``disks``).
 
 What the object's symmetry makes equal is kept once, and what the scene rules out (``approach``) not at all: every
 allowed direction is mapped to one canonical image of its orbit, and a pixel's weight is the solid angle that lands in it.
@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from geomtact.geometry.approach import (
     FACE_TOLERANCE,
     Approach,
+    Cones,
     allowed,
     approach_of,
     check_approach,
@@ -28,15 +29,15 @@ from geomtact.geometry.approach import (
     in_cone,
     in_cones,
 )
+from geomtact.geometry.cells import SphereCells
 from geomtact.geometry.orbits import (
-    Cones,
-    Partition,
     apart,
     at_polar,
     axis_of,
     azimuth_in_cones,
     azimuth_of,
     canonical_image,
+    images_of,
     turn_period,
 )
 from geomtact.geometry.symmetry import Symmetry, about
@@ -68,7 +69,7 @@ class Directions:
     symmetry : the object's
     cones : the allowed approaches, None for all
     level : HEALPix level, or None for exact faces and spheres
-    partition : the cells of the sphere, None for exact faces and spheres
+    cells : of the sphere, None for exact faces and spheres
     """
 
     vectors: Array
@@ -78,7 +79,7 @@ class Directions:
     symmetry: Symmetry
     cones: Cones | None
     level: int | None
-    partition: Partition | None
+    cells: SphereCells | None
     _cell: NDArray[np.int64]
 
     @classmethod
@@ -88,29 +89,29 @@ class Directions:
         approach: Approach | None = None,
         level: int = 2,
         turn_step: float | None = None,
-        finer: Cones | None = None,
+        disks: Cones | None = None,
     ) -> Directions:
-        """Directions of one HEALPix ``level``, seven in each of the disks ``finer`` (direction (3,), half angle [rad]);
+        """Directions of one HEALPix ``level``, finer in ``disks`` (direction (3,), half angle [rad]): see ``SphereCells``;
         ``turn_step`` [rad] spaces the turns of exact faces."""
         cones = check_approach(approach)
         if symmetry.kind == "sphere" or (cones and cones[0][1] == 0):
             return cls._faces(symmetry, cones, turn_step or level_step(level))
-        partition = Partition.make(symmetry, cones, level, finer or [])
-        fine, area = partition.points()
+        cells = SphereCells.make(symmetry, cones, level, disks or [])
+        fine, area = cells.points()
         image = canonical_image(fine, symmetry, cones)[1]
-        key = partition.cell_of(image)
+        key = cells.cell_of(image)
         total = np.bincount(key, area)
         kept = np.flatnonzero(total)
-        cell = np.full(len(partition), -1)
+        cell = np.full(len(cells), -1)
         cell[kept] = np.arange(len(kept))
         weights: Array = total[kept].astype(float)
         if symmetry.kind == "axis" and cones is None:
             # the rows of fine points may line up with the bands, whose areas are known
-            weights = -np.diff(partition.band_cosines)[kept]
-        vectors = partition.vectors(image, area, key)
+            weights = -np.diff(cells.band_cosines)[kept]
+        vectors = cells.vectors(image, area, key)
         turns = np.full(len(kept), level_turns(level))
         periods = np.full(len(kept), 2 * np.pi)
-        return cls(vectors, weights / weights.sum(), turns, periods, symmetry, cones, level, partition, cell)
+        return cls(vectors, weights / weights.sum(), turns, periods, symmetry, cones, level, cells, cell)
 
     @classmethod
     def _faces(cls, symmetry: Symmetry, cones: Cones | None, turn_step: float) -> Directions:
@@ -137,23 +138,23 @@ class Directions:
             return level_step(self.level)
         return turn_step if self.periods.any() else 0.0
 
-    def finer_step(self, a: Array) -> float:
-        """Angle [rad] across the cell of an approach direction ``a`` (3,) in a disk that is cut finer; inf elsewhere."""
-        return np.inf if self.partition is None else self.partition.finer_step(a)
+    def disk_step(self, a: Array) -> float:
+        """Angle [rad] across the cells of the disk that holds an approach direction ``a`` (3,); inf where none does."""
+        return np.inf if self.cells is None else self.cells.disk_step(a)
 
     @cached_property
     def first_turn(self) -> NDArray[np.int64]:
         """Which of :meth:`rotations` is turn 0 of each direction (D,)."""
         return np.cumsum(self.turns) - self.turns
 
-    def parents(self, turn_step: float) -> NDArray[np.int64]:
-        """The rotation of the next coarser grid that holds each of :meth:`rotations` (M,); what is finer stays as fine there.
+    def coarser_rotations(self, turn_step: float) -> NDArray[np.int64]:
+        """The rotation of the next coarser grid that holds each of :meth:`rotations` (M,); disks are cut alike on both.
 
         ``turn_step`` [rad] spaces the turns of exact faces here.
         """
         level = max(self.level - 1, 0) if self.level is not None else 0
-        finer = self.partition.finer if self.partition else None
-        coarse = Directions.make(self.symmetry, self.cones, level, 2 * turn_step, finer)
+        disks = self.cells.disks if self.cells else None
+        coarse = Directions.make(self.symmetry, self.cones, level, 2 * turn_step, disks)
         _, direction, turn = coarse.lookup(transform(self.rotations()[0], np.zeros(3)))
         return coarse.first_turn[direction] + turn
 
@@ -179,9 +180,9 @@ class Directions:
     def _draw_directions(self, k: NDArray[np.int64], rng: np.random.Generator) -> Array:
         """Approach directions (n, 3) uniform over the allowed ones of direction cells ``k`` (n,), made canonical."""
         a = self.vectors[k].copy()
-        if self.partition is None:
+        if self.cells is None:
             return a
-        kept, cells, sym = np.flatnonzero(self._cell >= 0), self.partition, self.symmetry
+        kept, cells, sym = np.flatnonzero(self._cell >= 0), self.cells, self.symmetry
         if self.cones is not None:
             for cell in np.unique(k):
                 mine = np.flatnonzero(k == cell)
@@ -204,7 +205,7 @@ class Directions:
             todo = todo[~fits]
         return a
 
-    def _draw_in_cones(self, cell: np.int64, a: Array, cells: Partition, rng: np.random.Generator) -> Array:
+    def _draw_in_cones(self, cell: np.int64, a: Array, cells: SphereCells, rng: np.random.Generator) -> Array:
         """``a`` (n, 3), the direction of one cell, replaced by such draws; kept where the cell has no area."""
         caps = cells.caps_of(cell)
         n, tried, found = 0, 0, []
@@ -236,7 +237,7 @@ class Directions:
         if sym.kind == "sphere":
             turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, (n, 1))).as_matrix()
             return _about(T, sym.centre, turn @ facing(in_cones(self.cones, n, rng)))
-        images = np.einsum("gji,nj->ngi", sym.elements[:, :3, :3], approach_of(T[:, :3, :3]))
+        images = images_of(approach_of(T[:, :3, :3]), sym)
         if sym.axis is None:
             ok = allowed(images, self.cones)
             return T @ sym.elements[np.argmax(ok * (1 - rng.random(ok.shape)), axis=1)]
@@ -267,9 +268,9 @@ class Directions:
     def direction_of(self, a: ArrayLike) -> NDArray[np.int64]:
         """Cell (n,) of canonical approach directions ``a`` (n, 3); where a pixel is not kept, the nearest that is."""
         a = np.asarray(a, float)
-        if self.partition is None:
+        if self.cells is None:
             return np.argmin(apart(a, self.vectors, self.symmetry), axis=1)
-        cell = self._cell[self.partition.cell_of(a)]
+        cell = self._cell[self.cells.cell_of(a)]
         missing = np.flatnonzero(cell < 0)
         if len(missing):
             cell[missing] = np.argmax(a[missing] @ self.vectors.T, axis=1)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomtact.geometry.rotations import level_step
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array
 
@@ -76,7 +75,7 @@ def marginals(posterior: Posterior, T_first: Array) -> list[Samples]:
     few = poses[:: _POSES // _TURNS, :3, :3]
     turn, tilt = turn_and_tilt(few, T_first[:3, :3], posterior.mesh.symmetry)
     even = np.full(len(few), 1 / len(few))
-    angle = float(np.degrees(level_step(grid.level)))
+    angle = float(np.degrees(posterior.index.angle_step))
     return [
         *out,
         Samples("turn about z from mode 1 [°]", turn, even, 0.0, angle, -180.0, 180.0),

@@ -1,6 +1,7 @@
 """What a network learns from: touches of a part beside the stored contacts of the cells that hold them.
 
-A scene is one part on one sensor with the grid that a localizer would choose. Of its rotations a few are drawn. Their
+A scene is one part on one sensor with the grid that a localizer would choose, but for the disks about its faces: what is told
+apart in a wide cell is in a narrow one, too. Of its rotations a few are drawn. Their
 stored contacts are what the network has to tell apart; the touches are drawn within the cells, tilted, turned, shifted
 and pressed by up to half a grid step, rigid and elastic.
 """
@@ -58,7 +59,7 @@ class Scene:
 
 
 def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Generator) -> Scene:
-    """A scene of ``mesh`` on ``sensor``, with the grid that ``max_poses`` affords."""
+    """A scene of ``mesh`` on ``sensor``, with a grid of the level and the step that ``max_poses`` affords."""
     symmetry = Symmetry("none", np.eye(4)[None], None, np.zeros(3))
     mesh = replace(mesh, symmetry=symmetry)
     shape = sensor.along(KEY_SHAPE)
