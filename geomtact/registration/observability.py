@@ -42,8 +42,8 @@ class Spread:
 
     @classmethod
     def of_grid(cls, angle_step: float, step: float, approach: Approach | None = None) -> Spread:
-        """Of poses uniform in a cell of ``angle_step`` [rad], the widest of the grid, and ``step`` [m], no farther tilted than ``approach`` allows; where
-        symmetry leaves no rotation to search, registration is still free to turn a little."""
+        """Of poses uniform in a cell of ``angle_step`` [rad], the widest of the grid, and ``step`` [m], no farther tilted than
+        ``approach`` allows; where symmetry leaves no rotation to search, registration is still free to turn a little."""
         rotation, tilt = max(angle_step, _LEAST_TURN) / np.sqrt(12), None
         if approach is not None:
             tilt = min(rotation, max(NO_TILT, 2 * max(half for _, half in approach) / np.sqrt(12)))
