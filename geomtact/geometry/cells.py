@@ -125,9 +125,8 @@ class SphereCells:
         ordered = sorted(self.cones or [], key=lambda cone: -cone[1])
         # about an axis the rows of the finest grid may line up with the bands
         wide = [cone for cone in ordered if self._pixels(cone[1]) >= _PER_CONE and self.symmetry.axis is None]
-        measured = (
-            None if self.cones is None else wide
-        )  # by the finest grid, or within a disk, where that is too coarse, by more
+        # these the finest grid measures, or a disk's points within it; thin cones have points of their own
+        measured = None if self.cones is None else wide
         disks = self.disks if self.symmetry.axis is None else []
         sets = [(fine[allowed(fine, measured) & ~allowed(fine, disks)], 1.0), *self._over(ordered, len(wide))]
         sets += [(a[allowed(a, measured)], area) for a, area in self._over(disks)]
