@@ -44,6 +44,7 @@ class FakeMode:
 @dataclass
 class FakeIndex:
     resolution: SimpleNamespace
+    angle_step: float = 0.26
 
     def __len__(self):
         return 4000
