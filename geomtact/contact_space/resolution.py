@@ -137,10 +137,12 @@ def choose(
                 n, turn_step = len(directions.vectors), 2 * np.pi
                 step = max(finest, _lattice_step(footprint, max_poses / (n * bins)))
         else:
-            even = Directions.make(mesh.symmetry, approach, level).turns.sum()
-            disks = disks_about_faces(mesh, sensor, cones, level)
-            n = float(Directions.make(mesh.symmetry, approach, level, disks=disks).turns.sum())
-            turn_step = level_step(level)
+            if level > LEVELS[0]:
+                directions = Directions.make(mesh.symmetry, approach, level)
+            even = n = float(directions.turns.sum())
+            disks, turn_step = disks_about_faces(mesh, sensor, cones, level), level_step(level)
+            if disks:
+                n = float(Directions.make(mesh.symmetry, approach, level, disks=disks).turns.sum())
             step = max(finest, _lattice_step(footprint, max_poses / (max(even, n / _MOST_MORE) * bins)))
         size = np.hypot(turn_step * radius_rms if n > 1 else 0.0, step)
         if best is None or size < best[0]:
