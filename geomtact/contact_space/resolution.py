@@ -68,27 +68,22 @@ class Resolution:
 def disks_about_faces(mesh: Mesh, sensor: Sensor, cones: Cones | None, level: int) -> Cones:
     """Disks (direction (3,), half angle [rad]) about the plane faces for which the directions of ``level`` are too far apart.
 
-    A pixel's corner lies 0.7 steps off its middle. Where a tilt by as much lifts the edge of a face, across its narrow way, or of
-    the window on it, by more than the mean penetration, none of the stored contacts need be the whole face's. One disk stands for
-    all faces that symmetry makes equal, and for those within its middle cell; there are six at most, about the largest of the
-    faces that ``cones`` leave.
+    A pixel's corner lies 0.7 steps off its middle. Tilted so far about its middle, a face that is long enough, as far as the
+    window sees it, has one end off the gel at the mean penetration: none of the stored contacts need be the whole face's. What is
+    narrower than that penetration, to either side, is an edge. One disk stands for all faces that symmetry makes equal, and for
+    those within its middle cell; there are six at most, about the largest of the faces that ``cones`` leave.
     """
     assert mesh.symmetry is not None
     step = level_step(level)
     half = _DISK * step
-    width = 0.5 * sensor.max_penetration / np.tan(np.sqrt(0.5) * step)
+    deep = 0.5 * sensor.max_penetration
+    long = deep / np.tan(np.sqrt(0.5) * step)
     disks: Cones = []
-    if sensor.half_window.min() < width:
-        return disks
     for face in plane_faces(mesh):
         images = images_of(face.normal[None], mesh.symmetry)[0]
         left = cones is None or allowed(images, [(v, angle + half) for v, angle in cones]).any()
-        if (
-            face.half_width > width
-            and left
-            and len(disks) < _FACES
-            and not within_any(images, disks, middle_angle(half))
-        ):
+        wide = min(face.half_length, sensor.half_window.max()) > long and face.half_width > deep
+        if wide and left and len(disks) < _FACES and not within_any(images, disks, middle_angle(half)):
             disks.append((face.normal, half))
     return disks
 

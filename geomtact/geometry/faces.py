@@ -28,12 +28,14 @@ class Face:
     ----------
     normal : (3,) outward unit vector, object frame
     area : [m^2]
-    half_width : half the width of a rectangle whose area is spread alike, across its narrow way [m]
+    half_width, half_length : half the sides of a rectangle whose area is spread alike, the shorter and the longer [m]: of its
+        standard deviations along its two main directions sqrt(3) times each
     """
 
     normal: Array
     area: float
     half_width: float
+    half_length: float
 
 
 def plane_faces(mesh: Mesh) -> list[Face]:
@@ -72,5 +74,5 @@ def _face(mesh: Mesh, plane: NDArray[np.integer]) -> Face:
     x, m = (corners - origin) @ along, (middles - origin) @ along
     # the mean of x x^T over a triangle of corners a, b, c is (a a^T + b b^T + c c^T + 9 m m^T) / 12, m its centroid
     square = (np.einsum("tki,tkj->tij", x, x) + 9 * np.einsum("ti,tj->tij", m, m)) / 12
-    least = np.linalg.eigvalsh(np.average(square, axis=0, weights=areas))[0]
-    return Face(normal, float(areas.sum()), float(np.sqrt(3 * max(least, 0.0))))
+    width, length = np.sqrt(3 * np.maximum(np.linalg.eigvalsh(np.average(square, axis=0, weights=areas)), 0))
+    return Face(normal, float(areas.sum()), float(width), float(length))
