@@ -197,8 +197,11 @@ def test_the_side_that_is_touched_may_be_said(geomtact, flat_nut, a_touch, tmp_p
     assert "ready" in geomtact("prepare", *nut[2:], "--approach", "-0.0,0,2").stdout
     assert approach_from(["0,0,1:3", "-1,0,0:0.5"]) == [([0, 0, 1], np.deg2rad(3)), ([-1, 0, 0], np.deg2rad(0.5))]
     assert approach_from(None) is None
-    for wrong in ("0,0,a", "up", "0,0,1:x", ""):
+    for wrong in ("0,0,a", "up", "0,0,1:x", "0,0,1:", "0,1", ""):
         with pytest.raises(UsageError, match="such as 0,0,1 or 0,0,1:5"):
+            approach_from([wrong])
+    for wrong, why in (("0,0,1:-3", "0 to 180 degrees"), ("0,0,1:400", "0 to 180 degrees"), ("0,0,0", "no length")):
+        with pytest.raises(UsageError, match=why):
             approach_from([wrong])
     assert "three numbers" in geomtact("localize", *nut, "--approach", "0,1", status=2).stderr
     assert (

@@ -80,13 +80,19 @@ def approach_from(sides: list[str] | None) -> list[tuple[list[float], float]] | 
         return None
     out = []
     for side in sides:
-        direction, _, angle = side.partition(":")
+        direction, colon, angle = side.partition(":")
         try:
-            out.append(([float(x) for x in direction.split(",")], math.radians(float(angle or 0))))
+            x, y, z = (float(x) for x in direction.split(","))
+            degrees = float(angle) if colon else 0.0
         except ValueError:
             raise UsageError(
-                f"--approach: expected X,Y,Z or X,Y,Z:DEGREES, such as 0,0,1 or 0,0,1:5, got {side!r}"
+                f"--approach: expected three numbers X,Y,Z or X,Y,Z:DEGREES, such as 0,0,1 or 0,0,1:5, got {side!r}"
             ) from None
+        if not 0 <= degrees <= 180:
+            raise UsageError(f"--approach: expected an angle of 0 to 180 degrees, got {side!r}")
+        if not x**2 + y**2 + z**2:
+            raise UsageError(f"--approach: expected a direction, got {side!r}, which has no length")
+        out.append(([x, y, z], math.radians(degrees)))
     return out
 
 
