@@ -47,7 +47,7 @@ def test_the_pencils_ends_tell_most(example, tmp_path):
 
 
 def test_a_gripper_that_reads_its_width(example):
-    said = example("gripper.py", "--part", "connector_plug", "--max-poses", "20000")
+    said = example("gripper.py", "--part", "connector_plug", "--max-poses", "60000")
     assert float(re.search(r"the truth: (\S+) nats", said)[1]) > 0
     assert re.search(r"the jaw is \d+\.\d mm open", said)
 

@@ -355,7 +355,7 @@ def test_bad_rigs_are_refused(plug):
 
 def test_sensors_may_differ(make_localizer, plug, cache_dir, rng):
     """The second sensor has another window and other optics."""
-    other = make_localizer("connector_plug", "gelsight-mini", max_poses=8_000, touches=120)
+    other = make_localizer("connector_plug", "gelsight-mini", touches=120)
     both = type(plug)(plug.index, plug.scorer, plug.max_poses, plug.cache_dir, (other,))
     gains = []
     for i in range(8):
@@ -460,7 +460,9 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
     assert told["right"] <= 1 and told["off"] >= 3 and told["known to be"] == 0, told
     exact = plug.localize(masks, "mask", T_world_sensor=off, rig=RigStd())
     assert np.array_equal(exact.log_prob, last["off"].log_prob)
-    # a mode is told no better than the rig
-    for mode in last["known to be"].modes(3):
+    # what registration finds is told no better than the rig
+    found = [mode for mode in last["known to be"].modes(3) if len(mode.observable)]
+    assert found
+    for mode in found:
         assert np.linalg.eigvalsh(mode.covariance[3:, 3:]).min() >= 0.99 * 5e-3**2
     assert _badly_agreed({"unexplained_nats": None}) and not _badly_agreed({})

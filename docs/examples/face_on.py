@@ -1,6 +1,6 @@
 """A part pressed flat onto the gel, with and without saying so: where the truth lies in the answer.
 
-    python docs/examples/face_on.py [--max-poses N] [--touches N] [--tilt DEGREES ...]
+    python docs/examples/face_on.py [--face X Y Z] [--max-poses N] [--touches N] [--tilt DEGREES ...]
 
 Half a step of a coarse grid lifts a large face off the gel, so directions are finer about plane faces. With approach, only
 touches near to that face are modelled. Some four minutes on two cores, the first time; needs manifold3d (by pip).
@@ -19,7 +19,7 @@ from geomtact.sensing.noise import MODERATE
 
 MM = 1e-3
 SENSOR = Sensor.load("gelsight-mini")
-FACE = (0.0, 0.0, -1.0)  # towards the sensor, in the part's frame
+FACE = (0.0, 0.0, -1.0)  # the largest: towards the sensor, in the part's frame
 LEAST = 200  # pixels of contact that are worth a look
 
 
@@ -33,17 +33,19 @@ def make_part():
     return load_mesh(Mesh(MM * part.vertices, part.faces, "corner", "m"), sensor=SENSOR)
 
 
-def touches(mesh, tilt, n, rng):
-    """Poses (4, 4) at which the face lies on the gel but for ``tilt`` degrees any way, and what is felt there."""
+def touches(mesh, face, tilt, n, rng):
+    """Poses (4, 4) at which ``face`` (3,) lies on the gel but for ``tilt`` degrees any way, and what is felt there."""
     space = ContactSpace(mesh, SENSOR)
-    flat, _ = ContactSpace(mesh, SENSOR, [(FACE, 0.0)]).sample(4 * n, rng)
+    flat, _ = ContactSpace(mesh, SENSOR, [(face, 0.0)]).sample(4 * n, rng)
     found = []
     for i, T in enumerate(flat):
         if len(found) == n:
             break
-        way = rng.normal(size=2)
-        T = T @ exp(np.append(np.deg2rad(tilt) * way / np.linalg.norm(way), np.zeros(4)))
+        way = np.cross(face, rng.normal(size=3))
+        T = T @ exp(np.append(np.deg2rad(tilt) * way / np.linalg.norm(way), np.zeros(3)))
         T[2, 3] += space.caster.penetration(SENSOR, T[None])[0] - 0.8 * MM
+        if not np.isfinite(space.penetration(T[None])[0]):  # the housing is in the way
+            continue
         mask = felt_mask(space, T, elastic=i % 2 == 0)
         if mask.sum() >= LEAST:
             found.append((T, spoilt(mask, space, MODERATE, rng)))
@@ -52,18 +54,19 @@ def touches(mesh, tilt, n, rng):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--face", type=float, nargs=3, default=FACE)
     parser.add_argument("--max-poses", type=int, default=1_200_000)
     parser.add_argument("--touches", type=int, default=24)
     parser.add_argument("--tilt", type=float, nargs="*", default=[0.0, 1.0, 3.0])
     asked = parser.parse_args()
     mesh = make_part()
-    known = {"any side": None, "that side, within 3 degrees": [(FACE, np.deg2rad(3))]}
+    known = {"any side": None, "that side, within 3 degrees": [(asked.face, np.deg2rad(3))]}
     localizers = {
         name: Localizer.prepare(mesh, sensor=SENSOR, approach=side, max_poses=asked.max_poses)
         for name, side in known.items()
     }
     for tilt in asked.tilt:
-        felt = touches(mesh, tilt, asked.touches, np.random.default_rng(1))
+        felt = touches(mesh, asked.face, tilt, asked.touches, np.random.default_rng(1))
         for name, localizer in localizers.items():
             told = [(localizer.localize(mask), T) for T, mask in felt]
             level = np.array([posterior.credible_level(T) for posterior, T in told])
