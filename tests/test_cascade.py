@@ -80,22 +80,24 @@ def test_a_blocks_score_is_the_mean_likelihood_of_normal_vectors(localizer, rng)
     first, counts = index.block_runs
     middle = np.repeat(rng.normal(size=(len(first), d)), counts, axis=0)
     spread = np.repeat(rng.uniform(0, 0.4, len(first)), counts)
-    stored = (middle + np.sqrt(spread)[:, None] * rng.normal(size=(n, d))).astype(np.float32)
 
     class Given(EncoderScorer):
         def seen(self, index, mask):
             return np.array([0.3, -0.2, 0.5], np.float32)
 
-    scorer = Given(None, stored)
-    blocks = BlockScorer.make(scorer, index, temperature)
     w = np.maximum(np.asarray(index.weight, float).ravel(), 1e-30)
-    score = scorer.score(index, None).ravel() / temperature
-    exact = np.log(np.add.reduceat(w * np.exp(score), first) / np.add.reduceat(w, first)) * temperature
-    found = blocks.score(index, None)
+    found, exact = [], []
+    for _ in range(4):  # a block of a dozen is a coarse sample of the normal
+        stored = (middle + np.sqrt(spread)[:, None] * rng.normal(size=(n, d))).astype(np.float32)
+        scorer = Given(None, stored)
+        score = scorer.score(index, None).ravel() / temperature
+        exact.append(np.log(np.add.reduceat(w * np.exp(score), first) / np.add.reduceat(w, first)) * temperature)
+        found.append(BlockScorer.make(scorer, index, temperature).score(index, None))
+    found, exact = np.mean(found, 0), np.mean(exact, 0)
     large = counts >= 12
     assert large.sum() > 50
     assert np.corrcoef(found[large], exact[large])[0, 1] > 0.98
-    assert abs(np.mean(found[large] - exact[large])) < 0.12  # a dozen cells are a coarse sample of the normal
+    assert abs(np.mean(found[large] - exact[large])) < 0.1
     # without spread it is the cells' own score
     same = BlockScorer.make(Given(None, middle.astype(np.float32)), index, temperature)
     one = Given(None, middle.astype(np.float32)).score(index, None).ravel()[first]

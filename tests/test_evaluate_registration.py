@@ -110,7 +110,7 @@ def test_agreement_counts_directions():
 
 
 def grid_of(space):
-    resolution = choose_resolution(space.mesh, space.sensor, None, 20_000)
+    resolution = choose_resolution(space.mesh, space.sensor, None, 200_000)
     directions = resolution.directions(space.mesh.symmetry, None)
     return Grid(directions, resolution)
 
@@ -152,7 +152,6 @@ def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
     whole = list(trials(nut, touches, lambda _: methods, grid, CLEAN, 5, turns_deg=(0.0, 5.0), shifts_mm=(0.0, 2.0)))
     assert [len(some) for some in whole] == [14, 14, 14]
     np.testing.assert_array_equal(seen["a"], seen["b"])
-    from_grid = 0
     for i, touch in enumerate(touches):
         problem = make_problem(touch.mask, SENSOR)
         for start, trial in zip(seen["a"][7 * i :], whole[i][:-6:2], strict=False):
@@ -165,15 +164,10 @@ def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
             assert trial.error_mm == trial.start_mm and trial.drift_mm == pytest.approx(0, abs=1e-9)
         for start, trial in zip(seen["a"][7 * i + 4 :], whole[i][-6::2], strict=False):
             assert trial.turn_deg is None and trial.shift_mm is None
-            true = grid.directions.canonical(touch.T_sensor_object[None])[0]
-            if np.abs(start - true).max() < 1e-9:  # the pose of its cell does not touch
-                continue
-            from_grid += 1
             rotations = grid.directions.rotations()[0]
             assert np.abs(rotations - start[:3, :3]).max((1, 2)).min() < 1e-9
             depth = nut.penetration(start[None])[0]
             assert np.abs(np.array(grid.resolution.penetrations) - depth).min() < 1e-5
-    assert from_grid >= 3
     again = list(trials(nut, touches, lambda _: {"a": stay}, grid, CLEAN, 5, (0.0, 5.0), (0.0, 2.0), first=2))
     assert [t.start_mm for t in again[0]] == [t.start_mm for t in whole[2] if t.method == "a"]
 

@@ -97,11 +97,11 @@ def test_mssd_of_a_ball_is_the_distance_of_the_centres(rng):
 
 def test_expected_error_of_a_random_guess(localizer):
     distance, rng = PoseDistance(localizer.mesh), np.random.default_rng(5)
-    expected = random_add(distance, localizer.space, n=60)
-    T, _ = localizer.space.sample(60, rng)
-    guess, _ = localizer.space.sample(60, rng)
+    expected = random_add(distance, localizer.space, n=150)
+    T, _ = localizer.space.sample(150, rng)
+    guess, _ = localizer.space.sample(150, rng)
     found = [distance.mean(a, b[None])[0] for a, b in zip(T, guess, strict=True)]
-    assert np.mean(found) == pytest.approx(expected, abs=5 * np.std(found) * np.sqrt(2 / 60))
+    assert np.mean(found) == pytest.approx(expected, abs=5 * np.std(found) * np.sqrt(2 / 150))
 
 
 def test_coverage_of_calibrated_levels_and_its_intervals():

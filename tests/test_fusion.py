@@ -125,8 +125,8 @@ def test_sensors_that_vary_alike_count_as_one(rng):
 
 def test_each_more_sensor_tells_more_of_the_true_pose(plug):
     gains = []
-    touches = random_touches(plug.space, 12, 3)
-    for i in range(4):
+    touches = random_touches(plug.space, 18, 3)
+    for i in range(6):
         rng = np.random.default_rng(i)
         some = touches[3 * i : 3 * i + 3]
         T, sensors = world(some, rng)
@@ -137,7 +137,7 @@ def test_each_more_sensor_tells_more_of_the_true_pose(plug):
             gains.append(posterior.log_density(T))
             for mode in posterior.modes(3):
                 assert np.isfinite(posterior.log_density(mode.T))
-    gains = np.reshape(gains, (4, 3))
+    gains = np.reshape(gains, (6, 3))
     assert np.isfinite(gains).all()
     assert gains[:, 1].mean() > gains[:, 0].mean() + 0.2 and gains[:, 2].mean() > gains[:, 0].mean() + 0.5
 
@@ -441,7 +441,7 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
     """Each of the sensors but the first off by 5 mm, in a direction of its own: unless the rig is said to be known no better."""
     rng = np.random.default_rng(5)
     told, last = {"right": 0, "off": 0, "known to be": 0}, {}
-    for scene in make_scenes(plug, 4, 9, MODERATE, None, 3):
+    for scene in make_scenes(plug, 6, 9, MODERATE, None, 3):
         masks = [touch.mask for touch in scene.touches]
         off = scene.T_world_sensor.copy()
         way = rng.normal(size=(2, 3))
@@ -457,12 +457,10 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
             except NoPoseAgreesError:
                 continue
             told[name] += any("agree badly" in warning for warning in posterior.warnings)
-    assert told["right"] <= 1 and told["off"] >= 3 and told["known to be"] == 0, told
+    assert told["right"] <= 1 and told["off"] >= 4 and told["known to be"] == 0, told
     exact = plug.localize(masks, "mask", T_world_sensor=off, rig=RigStd())
     assert np.array_equal(exact.log_prob, last["off"].log_prob)
-    # what registration finds is told no better than the rig
-    found = [mode for mode in last["known to be"].modes(3) if len(mode.observable)]
-    assert found
-    for mode in found:
+    # a mode is told no better than the rig
+    for mode in last["known to be"].modes(3):
         assert np.linalg.eigvalsh(mode.covariance[3:, 3:]).min() >= 0.99 * 5e-3**2
     assert _badly_agreed({"unexplained_nats": None}) and not _badly_agreed({})

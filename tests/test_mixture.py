@@ -142,14 +142,13 @@ def test_blocks_are_opened_by_the_mixture_and_their_cells_told_by_it(localizer, 
     assert mass[whole].max() <= mass[opened].min() * 1.03
     block = np.searchsorted(first, rows.first, "right") - 1
     scores = []
-    for each, by_block in zip((mask, *parts), blocks, strict=True):
+    for each, whole_score in zip((mask, *parts), blocks, strict=True):
         seen = fit.scorer.seen(index, each)
         trust = cascade.blocks.trusted(index, seen)[1]
         every = fit.scorer.of(np.arange(len(index)), seen)
-        assert trust == pytest.approx(
-            fit.scorer.trust(every.max()), rel=0.05
-        )  # the best is looked for in some blocks only
-        scores.append(np.where(whole[block], by_block[block], trust * every[rows.first]))
+        # the best is looked for in some blocks only
+        assert trust == pytest.approx(fit.scorer.trust(every.max()), rel=0.05)
+        scores.append(np.where(whole[block], whole_score[block], trust * every[rows.first]))
     assert said == pytest.approx(mixture(shares, scores, weight, cascade.partly.temperature), rel=2e-3)
 
 

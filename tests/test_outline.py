@@ -165,14 +165,14 @@ def upright(make_localizer):
 
 def test_of_a_known_side_outlines_tell_more_than_the_grid(upright):
     """Of every touch at least as much, rigid and elastic gels in turn; with noise, see docs/no-more-than-needed.md."""
-    touches = random_touches(upright.space, 5, 5, None, CLEAN)
+    touches = random_touches(upright.space, 8, 5, None, CLEAN)
     more, said = [], []
     for touch in touches:
         balanced, exact = (upright.localize(touch.mask, "mask", effort=e) for e in ("balanced", "exact"))
         more.append(exact.log_density(touch.T_sensor_object) - balanced.log_density(touch.T_sensor_object))
         said.append(exact.settings.get("by_outline", False))
         assert np.exp(exact.log_prob).sum() == pytest.approx(1, abs=1e-3)
-    assert np.mean(said) >= 0.8 and np.mean(more) > 0.5 and min(more) > -0.2
+    assert np.mean(said) > 0.8 and np.mean(more) > 0.5 and min(more) > -0.2
     again = upright.localize(touches[-1].mask, "mask", effort="exact")
     assert np.array_equal(again.log_prob, exact.log_prob) and np.array_equal(again.modes(3)[2].T, exact.modes(3)[2].T)
 

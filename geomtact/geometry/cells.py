@@ -61,7 +61,8 @@ class SphereCells:
         for v, half in disks:
             if symmetry.axis is None or np.linalg.norm(np.cross(v, symmetry.axis)) < _SAME:
                 for image in images_of(v[None], symmetry)[0]:
-                    images += [] if within_any(image, images) else [(image, half)]
+                    if not within_any(image, images):
+                        images.append((image, half))
         return cls(symmetry, cones, level, images)
 
     def __len__(self) -> int:

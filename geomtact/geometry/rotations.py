@@ -68,7 +68,6 @@ class Directions:
     periods : (D,) range of the turn [rad]: 2 pi, less where symmetry repeats it, 0 where the turn means nothing
     symmetry : the object's
     cones : the allowed approaches, None for all
-    level : HEALPix level, or None for exact faces and spheres
     cells : of the sphere, None for exact faces and spheres
     """
 
@@ -78,7 +77,6 @@ class Directions:
     periods: Array
     symmetry: Symmetry
     cones: Cones | None
-    level: int | None
     cells: SphereCells | None
     _cell: NDArray[np.int64]
 
@@ -111,7 +109,7 @@ class Directions:
         vectors = cells.vectors(image, area, key)
         turns = np.full(len(kept), level_turns(level))
         periods = np.full(len(kept), 2 * np.pi)
-        return cls(vectors, weights / weights.sum(), turns, periods, symmetry, cones, level, cells, cell)
+        return cls(vectors, weights / weights.sum(), turns, periods, symmetry, cones, cells, cell)
 
     @classmethod
     def _faces(cls, symmetry: Symmetry, cones: Cones | None, turn_step: float) -> Directions:
@@ -130,7 +128,12 @@ class Directions:
             # faces that symmetry makes equal are one, which stands for all of them
             weights = same[first].sum(1) / len(image)
         turns = np.maximum(1, np.ceil(periods / turn_step - 1e-9)).astype(np.int64)
-        return cls(vectors, weights, turns, periods, symmetry, cones, None, None, np.arange(len(vectors)))
+        return cls(vectors, weights, turns, periods, symmetry, cones, None, np.arange(len(vectors)))
+
+    @property
+    def level(self) -> int | None:
+        """HEALPix level, or None for exact faces and spheres."""
+        return None if self.cells is None else self.cells.level
 
     def angle_step(self, turn_step: float) -> float:
         """Angle between neighbouring rotations [rad]; ``turn_step`` is that of exact faces."""
