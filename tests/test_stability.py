@@ -123,6 +123,21 @@ def test_pixels_that_are_larger_than_said_show_a_smaller_contact(here, plug):
     assert whole >= 2
 
 
+@pytest.mark.parametrize("level", [0, 0.2])
+def test_a_halo_is_where_the_part_is_so_far_above_the_gel(level):
+    """Around a ball it is a disc as large as that of one pressed in deeper by as much."""
+    ball = load_mesh("ball")
+    radius = np.linalg.norm(ball.vertices - ball.centre, axis=1).mean()
+    here = World(ball, Sensor.load("gelsight-mini"), CLEAN, (3e-4, 1e-3), border=(0.0, 0.0))
+    space, found = ContactSpace(ball, here.sensor), 0
+    for T, mask in worlds.touches(SWEEPS["halo"].world(here, level), 4, 3):
+        deep = float(space.penetration(T[None])[0]) + level * MM
+        area = mask.sum() * np.prod(here.sensor.pixel_pitch)
+        assert area == pytest.approx(np.pi * (2 * radius * deep - deep**2), rel=0.03)
+        found += 1
+    assert found == 4
+
+
 @pytest.mark.parametrize(("name", "level"), [("area", 4), ("area", 1), ("border", 10), ("border", 0)])
 def test_touches_are_as_the_sweep_wants_them(here, name, level):
     world = replace(SWEEPS[name].world(here, level), noise=CLEAN)

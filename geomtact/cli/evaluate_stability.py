@@ -15,8 +15,8 @@ from geomtact.cli.shell import print_table, tell
 SCHEMA = "geomtact/stability/2"
 _ALIKE = ("sensor_sha256", "scorer", "touches", "effort", "seed")  # settings that parts taken together share
 _NAMES = (
-    "noise, specks, depth, pitch, size, surface, faces, threshold, area, border, kind, shown, detail, rig_shift, rig_turn, "
-    "jaw, slips, other_part"
+    "noise, specks, depth, pitch, size, surface, faces, threshold, halo, area, border, kind, shown, detail, rig_shift, "
+    "rig_turn, jaw, slips, other_part"
 )
 
 

@@ -228,6 +228,12 @@ SWEEPS = {
         (0, 0.05),
         lambda w, x: replace(w, threshold=1e-3 * x),
     ),
+    "halo": Sweep(
+        "contact found where the part is above the gel by [mm]",
+        (0, 0.05, 0.1, 0.2, 0.4),
+        (0, 0.05, 0.1),
+        lambda w, x: replace(w, threshold=-1e-3 * x),
+    ),
     "area": Sweep(
         "area of contact, to twice as much [mm2]",
         (16, 8, 4, 2, 1, 0.5, 0.1),

@@ -29,7 +29,7 @@ class World:
     Attributes
     ----------
     pressed : (least, largest) penetration [m]
-    threshold : a rigid gel feels what is so deep [m]; None for rigid and elastic gels in turn
+    threshold : a rigid gel feels what is so deep [m], below 0 what is still above it; None for rigid and elastic gels in turn
     area : (least, largest) area of contact [m^2], without noise
     border : (least, largest) share of the contact's outline that the window's border cuts off
     kind : one of ``contact_class.CLASSES`` that contacts are of; any, if None

@@ -170,9 +170,10 @@ class Directions:
 
     def draw(self, cells: ArrayLike, rng: np.random.Generator) -> Array:
         """Allowed rotations (n, 3, 3) uniform within cells (n,), counted as :meth:`rotations` does."""
-        _, direction, turn = self.rotations()
-        k = direction[np.asarray(cells)]
-        psi = turn[np.asarray(cells)] + rng.uniform(-0.5, 0.5, len(k)) * self.periods[k] / self.turns[k]
+        cells = np.asarray(cells)
+        k = np.searchsorted(self.first_turn, cells, side="right") - 1
+        turn = cells - self.first_turn[k]
+        psi = turn * self.periods[k] / self.turns[k] + rng.uniform(-0.5, 0.5, len(k)) * self.periods[k] / self.turns[k]
         a = self._draw_directions(k, rng)
         Rz = Rotation.from_euler("z", psi[:, None]).as_matrix()
         R = Rz @ facing(self.vectors[k]) @ np.swapaxes(_smallest_rotation(self.vectors[k], a), -1, -2)

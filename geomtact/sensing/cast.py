@@ -131,16 +131,16 @@ class Caster:
 
     def _cast(self, sensor: Sensor, T: Array, rays: Array) -> NDArray[np.float32]:
         origin, direction, below = self._rays(sensor, T, rays)
-        t = self._scene.distances(origin, direction).reshape(len(T), len(rays)).astype(float)
-        length = sensor.camera_distance or 1.0
-        missed = t > MISSED
-        depth = np.subtract(below[:, None], length * t, out=t)
+        t = self._scene.distances(origin, direction).reshape(len(T), len(rays))
+        depth = t.astype(float)
+        depth *= -(sensor.camera_distance or 1.0)
+        depth += below[:, None]
         if sensor.membrane_radius:
             # a camera's rays spread: where they are when they have come so far
             scale = 1 - depth / sensor.camera_distance if sensor.camera_distance else 1.0
             with np.errstate(over="ignore", invalid="ignore"):
                 depth -= sensor.sag(scale * rays[:, 0], scale * rays[:, 1])
-        depth[missed] = -np.inf
+        depth[t > MISSED] = -np.inf
         return depth.astype(np.float32)
 
     def _rays(self, sensor: Sensor, T: Array, rays: Array) -> tuple[NDArray[np.float32], NDArray[np.float32], Array]:
@@ -159,8 +159,10 @@ class Caster:
             direction = R[:, 2, None]
         middle = np.einsum("ni,nij->nj", below[:, None] * [0.0, 0.0, -1.0] - T[:, :3, 3], R) - self._centre
         origin = middle[:, None] if sensor.camera_distance else middle[:, None] + _combined(R, rays, 0.0)
-        shape = (len(T), len(rays), 3)
-        rows = [np.ascontiguousarray(np.broadcast_to(each, shape), np.float32) for each in (origin, direction)]
+        rows = [
+            np.repeat(x.astype(np.float32, copy=False), len(rays) if x.shape[1] == 1 else 1, 1)
+            for x in (origin, direction)
+        ]
         return rows[0].reshape(-1, 3), rows[1].reshape(-1, 3), below
 
     def _camera_inside(self, sensor: Sensor, T: Array) -> NDArray[np.bool_]:
@@ -176,13 +178,16 @@ class Caster:
 def _combined(R: Array, rays: Array, z: float) -> NDArray[np.float32]:
     """Vectors (x, y, z) of the sensor, x and y of ``rays`` (m, 2), in the object frame (n, m, 3), for rotations ``R`` (n, 3, 3).
 
-    In single precision, as Embree has it, and without matrix products: those of so small matrices wait for threads.
+    In single precision, as Embree has it, and one component after the other: loops over three numbers each are ten times as slow.
     """
-    R, rays = R.astype(np.float32), rays.astype(np.float32)
-    out = rays[:, :1] * R[:, None, 0]
-    out += rays[:, 1:] * R[:, None, 1]
-    out += np.float32(z) * R[:, None, 2]
-    return np.asarray(out)
+    R, (x, y) = R.astype(np.float32), rays.T.astype(np.float32)
+    out = np.empty((len(R), len(x), 3), np.float32)
+    for i in range(3):
+        part = R[:, 0, i, None] * x
+        part += R[:, 1, i, None] * y
+        part += np.float32(z) * R[:, 2, i, None]
+        out[..., i] = part
+    return out
 
 
 def _border(sensor: Sensor) -> Array:
