@@ -10,7 +10,7 @@ from scipy.stats import multivariate_t
 
 from geomtact.contact_space.index import pack
 from geomtact.errors import MeshError, UsageError
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.scoring.calibration import (
     FLOORS,
     Calibration,
@@ -302,6 +302,19 @@ def test_simulated_touches_are_of_the_cells_they_say(plug):
     assert len(touches.masks) == 20 and all(m.any() for m in touches.masks)
     w = np.asarray(plug.index.weight).ravel()
     assert (w[touches.ids] > 0).all()
+
+
+def test_simulated_touches_are_as_often_where_a_cell_hardly_touches_as_poses_are(make_localizer):
+    """A plate on a sensor with a housing: a little tilt lets its far end strike, so many a pose lies in a cell whose own
+    rotation touches in a corner only."""
+    solid = trimesh.creation.box((60e-3, 40e-3, 2e-3))
+    index = make_localizer(Mesh(solid.vertices, solid.faces, "plate", "m"), "gelsight-mini").index
+    little = index.touching < 0.5
+    poses = index.lookup(*index.space.sample(2000, np.random.default_rng(1)))
+    touches = simulate_touches(index, 250, seed=2).ids
+    expected, found = (little[ids % index.places].mean() for ids in (poses, touches))
+    assert expected > 0.1
+    assert found == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) * (1 / 250 + 1 / 2000)))
 
 
 def test_touches_are_kept_and_read_back(plug, tmp_path):

@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touch import CALIBRATION_NOISE, LEAST_CONTACT, draw_noise, felt_mask, spoilt
 from geomtact.progress import Progress
@@ -77,21 +76,23 @@ def simulate_touches(
     """``n`` touches uniform over the contact pose space, with noise of any strength up to ``noise``; rigid and elastic in turn,
     unless ``elastic`` says which.
 
-    Poses are drawn within the cells, not at their centres: the score has to bridge what lies between.
+    Poses lie anywhere within the cells, and where a cell's own rotation touches nothing: the score has to bridge what lies
+    between.
+
+    Raises
+    ------
+    MeshError
+        Hardly any pose of the object touches.
     """
     rng = np.random.default_rng(seed)
     space = index.space
     shape = index.sensor.along(_SHAPE)
     pixel = index.sensor.pixel_area(shape)
-    weight = index.weight.ravel().astype(float)
-    total = np.cumsum(weight)
     masks: list[NDArray[np.bool_]] = []
     ids: list[int] = []
     for _ in range(100):
-        drawn = np.searchsorted(total, rng.random(64) * total[-1])
-        cells = np.minimum(drawn, len(weight) - 1)
-        T, _, found = draw_within(index, space, cells, rng, tries=5)
-        for pose, i in zip(T[found], cells[found], strict=True):
+        T, depth = space.sample(128, rng)
+        for pose, i in zip(T, index.lookup(T, depth), strict=True):
             mask = felt_mask(space, pose, len(masks) % 2 == 1 if elastic is None else elastic, shape)
             if mask.sum() * pixel < min(LEAST_CONTACT, 12 * pixel):
                 continue
