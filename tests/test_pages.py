@@ -239,8 +239,8 @@ def answers(content):
             yield [*cells(row, name, felt, **part["figures"][felt]), *inside(part["figures"][felt])]
 
 
-def sweeps(content):
-    for name, sweep in content["together"].items():
+def sweeps(*contents):
+    for name, sweep in (each for content in contents for each in content["together"].items()):
         levels, held = [at["level"] for at in sweep["levels"]], sweep["inside"]
         begin = f"{held[0]:g}" if held[0] != levels[0] else "down" if levels[0] > levels[-1] else "up"
         promised = "all" if held == levels else "0" if held == [0] else f"{begin} to {held[-1]:g}"
@@ -268,7 +268,7 @@ TABLES = [
     ("benchmark", "| score | pin", scores, "scores"),
     ("benchmark", "| contact |", kinds, "classes", "flat"),
     ("benchmark", "| part |", answers, "localize"),
-    ("stability", "| sweep |", sweeps, "stability"),
+    ("stability", "| sweep |", sweeps, "stability", "halo"),
 ]
 
 

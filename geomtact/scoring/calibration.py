@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touch import CALIBRATION_NOISE, LEAST_CONTACT, draw_noise, felt_mask, spoilt
 from geomtact.progress import Progress
@@ -76,13 +77,12 @@ def simulate_touches(
     """``n`` touches uniform over the contact pose space, with noise of any strength up to ``noise``; rigid and elastic in turn,
     unless ``elastic`` says which.
 
-    Poses lie anywhere within the cells, and where a cell's own rotation touches nothing: the score has to bridge what lies
-    between.
+    Poses lie anywhere within the cells, not at their centres: the score has to bridge what lies between.
 
     Raises
     ------
     MeshError
-        Hardly any pose of the object touches.
+        Hardly any pose touches a sensor that has a housing.
     """
     rng = np.random.default_rng(seed)
     space = index.space
@@ -91,8 +91,7 @@ def simulate_touches(
     masks: list[NDArray[np.bool_]] = []
     ids: list[int] = []
     for _ in range(100):
-        T, depth = space.sample(128, rng)
-        for pose, i in zip(T, index.lookup(T, depth), strict=True):
+        for pose, i in zip(*_drawn(index, 64, rng), strict=True):
             mask = felt_mask(space, pose, len(masks) % 2 == 1 if elastic is None else elastic, shape)
             if mask.sum() * pixel < min(LEAST_CONTACT, 12 * pixel):
                 continue
@@ -103,6 +102,21 @@ def simulate_touches(
             if len(masks) == n:
                 return Touches(masks, np.array(ids))
     return Touches(masks, np.array(ids, np.int64))
+
+
+def _drawn(index: Index, n: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
+    """Up to ``n`` poses (m, 4, 4) uniform over the contact pose space, and the ids (m,) of the cells that hold them.
+
+    They are drawn from the cells. But a housing forbids most tilts of a large part, so that many a pose touches where the own
+    rotation of its cell does not: there cells are no measure of poses, which are drawn from the space itself, in more time.
+    """
+    if index.sensor.housing_depth is not None:
+        T, depth = index.space.sample(n, rng)
+        return T, index.lookup(T, depth)
+    total = np.cumsum(index.weight.ravel().astype(float))
+    cells = np.minimum(np.searchsorted(total, rng.random(n) * total[-1]), len(total) - 1)
+    T, _, found = draw_within(index, index.space, cells, rng, tries=5)
+    return T[found], cells[found]
 
 
 def calibrate(
