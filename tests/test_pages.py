@@ -269,6 +269,7 @@ TABLES = [
     ("benchmark", "| contact |", kinds, "classes", "flat"),
     ("benchmark", "| part |", answers, "localize"),
     ("stability", "| sweep |", sweeps, "stability", "halo"),
+    ("stability", "| part |", answers, "housing"),
 ]
 
 
