@@ -88,10 +88,11 @@ def simulate_touches(
     space = index.space
     shape = index.sensor.along(_SHAPE)
     pixel = index.sensor.pixel_area(shape)
+    total = np.cumsum(index.weight.ravel().astype(float))
     masks: list[NDArray[np.bool_]] = []
     ids: list[int] = []
     for _ in range(100):
-        for pose, i in zip(*_drawn(index, 64, rng), strict=True):
+        for pose, i in zip(*_drawn(index, total, 64, rng), strict=True):
             mask = felt_mask(space, pose, len(masks) % 2 == 1 if elastic is None else elastic, shape)
             if mask.sum() * pixel < min(LEAST_CONTACT, 12 * pixel):
                 continue
@@ -104,8 +105,9 @@ def simulate_touches(
     return Touches(masks, np.array(ids, np.int64))
 
 
-def _drawn(index: Index, n: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
-    """Up to ``n`` poses (m, 4, 4) uniform over the contact pose space, and the ids (m,) of the cells that hold them.
+def _drawn(index: Index, total: Array, n: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
+    """Up to ``n`` poses (m, 4, 4) uniform over the contact pose space, and the ids (m,) of the cells that hold them; ``total``
+    (N,) is the measure of all cells up to each.
 
     They are drawn from the cells. But a housing forbids most tilts of a large part, so that many a pose touches where the own
     rotation of its cell does not: there cells are no measure of poses, which are drawn from the space itself, in more time.
@@ -113,7 +115,6 @@ def _drawn(index: Index, n: int, rng: np.random.Generator) -> tuple[Array, NDArr
     if index.sensor.housing_depth is not None:
         T, depth = index.space.sample(n, rng)
         return T, index.lookup(T, depth)
-    total = np.cumsum(index.weight.ravel().astype(float))
     cells = np.minimum(np.searchsorted(total, rng.random(n) * total[-1]), len(total) - 1)
     T, _, found = draw_within(index, index.space, cells, rng, tries=5)
     return T[found], cells[found]
