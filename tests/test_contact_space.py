@@ -10,13 +10,13 @@ import pytest
 import trimesh
 from scipy.stats import chi2, kstest
 
-from geomtact.contact_space import store
+from geomtact.contact_space import space, store
 from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index, pack
 from geomtact.contact_space.resolution import choose
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache, open_index
-from geomtact.errors import CacheError, UsageError
+from geomtact.errors import CacheError, MeshError, UsageError
 from geomtact.geometry.approach import allowed, approach_of
 from geomtact.geometry.mesh import Mesh, load_mesh
 from geomtact.se3 import inverse, log, random_rotations, transform
@@ -510,6 +510,46 @@ def test_the_index_says_what_it_was_built_from(tmp_path):
 def test_samples_are_the_same_for_the_same_seed(ball):
     one, other = (ball.space.sample(20, np.random.default_rng(5)) for _ in range(2))
     assert (one[0] == other[0]).all() and (one[1] == other[1]).all()
+
+
+@pytest.mark.parametrize("name", ["plug", "curved", "plate", "plate on a bulge"])
+def test_what_is_not_cast_could_not_touch(name, request, curved_sensor, monkeypatch):
+    """The poses drawn are those of casting every one."""
+    if name.startswith("plate"):
+        solid = trimesh.creation.box((60 * MM, 40 * MM, 2 * MM))
+        sensor = curved_sensor if "bulge" in name else Sensor.load("gelsight-mini")
+        housed = replace(sensor, housing_depth=3 * MM)
+        poses = ContactSpace(Mesh(solid.vertices, solid.faces, "plate", "m"), housed)
+    else:
+        poses = request.getfixturevalue(name).space
+    some, left_out = poses.sample(30, np.random.default_rng(4)), []
+    may_touch = ContactSpace._may_touch
+
+    def all_of_them(self, T, depth):
+        left_out.append(~may_touch(self, T, depth))
+        return np.ones(len(T), bool)
+
+    monkeypatch.setattr(ContactSpace, "_may_touch", all_of_them)
+    for one, other in zip(some, poses.sample(30, np.random.default_rng(4)), strict=True):
+        assert np.array_equal(one, other)
+    assert np.mean(left_out) > 0.1
+
+
+def test_a_part_much_larger_than_its_sensor_is_drawn_though_it_hardly_ever_touches():
+    """One in 400 of the poses within reach, for the housing is in the way."""
+    solid = trimesh.creation.box((600 * MM, 500 * MM, 10 * MM))
+    poses = ContactSpace(Mesh(solid.vertices, solid.faces, "plate", "m"), Sensor.load("gelsight-mini"))
+    T, depth = poses.sample(64, np.random.default_rng(0))
+    assert np.isfinite(poses.penetration(T)).all() and len(T) == len(depth) == 64
+
+
+def test_where_hardly_any_pose_touches_it_is_said_how_many_were_tried(ball, monkeypatch):
+    for name, few in {"_FIRST": 300, "_MORE": 0}.items():
+        monkeypatch.setattr(space, name, few)
+    with pytest.raises(
+        MeshError, match=r"^ball: expected 5000 poses that touch the sensor 'gelsight-mini' .* found \d+ among"
+    ):
+        ball.space.sample(5000, np.random.default_rng(0))
 
 
 def test_rotations_of_samples_are_uniform_over_the_cones(cone, rng):

@@ -305,8 +305,8 @@ def test_simulated_touches_are_of_the_cells_they_say(plug):
 
 
 def test_simulated_touches_are_as_often_where_a_cell_hardly_touches_as_poses_are(make_localizer):
-    """A plate on a sensor with a housing: a little tilt lets its far end strike, so many a pose lies in a cell whose own
-    rotation touches in a corner only."""
+    """A plate on a sensor with a housing: a little tilt lets its far end strike, so many a pose lies in a cell of which, at the
+    cell's own rotation, little touches."""
     solid = trimesh.creation.box((60e-3, 40e-3, 2e-3))
     index = make_localizer(Mesh(solid.vertices, solid.faces, "plate", "m"), "gelsight-mini").index
     little = index.touching < 0.5

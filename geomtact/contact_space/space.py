@@ -18,6 +18,9 @@ from geomtact.sensing.sensor import Sensor
 # a pose settles to this, and so may press deeper than the gel allows, or not quite touch, by as much
 _SETTLED = 1e-6  # m
 _LOOKED_AT = 4096  # points of the surface, for what faces them
+_STEEP = (0.0, 0.25, 0.7, 1.5, 4.0, 12.0)  # slopes along which the object's lowest part is bounded
+# Poses cast at most: at any rate, and more for each that is asked for; and poses drawn for each of these
+_FIRST, _MORE, _IDLE = 25_000, 20, 50
 
 
 @dataclass(frozen=True)
@@ -123,23 +126,48 @@ class ContactSpace:
         half = self.mesh.reach + self.sensor.half_window
         found: list[Array] = []
         pressed: list[Array] = []
-        for _ in range(200 + 20 * n // batch):
+        most, tried, drawn = _FIRST + _MORE * n, 0, 0
+        while tried < most and drawn < _IDLE * most:
             R = self._rotations(batch, rng)
             depth = rng.uniform(low, high, batch)
             centre = np.zeros((batch, 3))
             centre[:, :2] = rng.uniform(-half, half, (batch, 2))
             # the object's lowest point is a first guess for where it meets the membrane
             centre[:, 2] = -(R[:, 2] @ (self.mesh.vertices - self.mesh.centre).T).min(1) - depth
-            T, ok = self.settle(transform(R, centre - R @ self.mesh.centre), depth)
+            T = transform(R, centre - R @ self.mesh.centre)
+            near = self._may_touch(T, depth)
+            T, depth = T[near], depth[near]
+            drawn, tried = drawn + batch, tried + len(T)
+            T, ok = self.settle(T, depth)
             ok[ok] = np.isfinite(self.penetration(T[ok]))
             found.append(T[ok])
             pressed.append(depth[ok])
             if sum(map(len, found)) >= n:
                 return np.concatenate(found)[:n], np.concatenate(pressed)[:n]
         raise MeshError(
-            f"{self.mesh.name}: hardly any pose touches the sensor {self.sensor.name!r} as the approach and the housing "
-            "allow; widen the approach"
+            f"{self.mesh.name}: expected {n} poses that touch the sensor {self.sensor.name!r} as the approach and the housing "
+            f"allow, found {sum(map(len, found))} among {drawn}; widen the approach, or check the object's unit"
         )
+
+    def _may_touch(self, T: Array, depth: Array) -> NDArray[np.bool_]:
+        """Whether any of the object may be in the window (n,) once it is moved along z from ``T`` (n, 4, 4) until its deepest
+        point there is ``depth`` (n,) [m] below the membrane: the others need not be cast.
+
+        Its lowest point of all may lie farther down, outside the window, but not below the housing. So the deepest one in the
+        window belongs to the object's lowest part, up to ``above`` over its lowest point; and that part reaches no farther
+        along x, or y, than the largest x - k (z - above) of the hull's corners, for any slope k >= 0 (weak duality).
+        """
+        sag = float(self.sensor.sag(*self.sensor.half_window))
+        x, y, z = np.moveaxis(T[:, :3, :3] @ self.mesh.corners.T + T[:, :3, 3, None], 1, 0)
+        steep: tuple[float, ...] = (0.0,)
+        if self.sensor.housing_depth is not None:
+            above = np.maximum(self.sensor.housing_depth - depth, sag) + 10 * _SETTLED
+            z, steep = z - (z.min(1) + above)[:, None], _STEEP
+        near = np.ones(len(T), bool)
+        for along, half in zip((x, y), self.sensor.half_window + 10 * _SETTLED, strict=True):
+            for way in (along, -along):
+                near &= np.min([(way - k * z).max(1) for k in steep], 0) >= -half
+        return near
 
     def approaches(self, T: Array) -> NDArray[np.bool_]:
         """Whether the approach allows poses ``T`` (n, 4, 4)."""

@@ -71,11 +71,8 @@ class Fixture:
     @cached_property
     def points(self) -> Array:
         """Points all over the surface, and corners of its hull, which reach farthest out (m, 3) [m]; in no order."""
-        from scipy.spatial import ConvexHull
-
-        corners = self.mesh.vertices[ConvexHull(self.mesh.vertices).vertices]
         points, rng = self.mesh.surface_points(self.n), np.random.default_rng(0)
-        return rng.permutation(np.concatenate([points, rng.permutation(corners)[: self.n // 5]]))
+        return rng.permutation(np.concatenate([points, rng.permutation(self.mesh.corners)[: self.n // 5]]))
 
     def clearance_needed(self, T_fixture_part: ArrayLike) -> Array:
         """How far (n,) [m] the part at ``T_fixture_part`` (n, 4, 4) reaches out of the recess before it is widened.

@@ -40,16 +40,13 @@ def mssd(T_true: ArrayLike, T: ArrayLike, mesh: Mesh) -> Array:
     Over a finite symmetry group it is the least over the group; over a continuous one it is taken at the image that is
     nearest in mean square. A point's distance is convex in the point, so the hull's vertices hold the largest.
     """
-    from scipy.spatial import ConvexHull
-
-    corners = mesh.vertices[ConvexHull(mesh.vertices).vertices]
     symmetry = mesh.symmetry
     if symmetry is not None and symmetry.kind == "discrete":
         images = _poses(T)[:, None] @ symmetry.elements
     else:
         images = PoseDistance(mesh).aligned(T_true, _poses(T))[:, None]
-    here = apply(T_true, corners)
-    return np.array([np.linalg.norm(apply(some, corners) - here, axis=-1).max(-1).min() for some in images])
+    here = apply(T_true, mesh.corners)
+    return np.array([np.linalg.norm(apply(some, mesh.corners) - here, axis=-1).max(-1).min() for some in images])
 
 
 def random_add(distance: PoseDistance, space: ContactSpace, n: int = 200) -> float:

@@ -82,11 +82,16 @@ class Mesh:
         return digest.hexdigest()
 
     @cached_property
-    def diameter(self) -> float:
-        """Largest distance between two points of the mesh [m]."""
+    def corners(self) -> Array:
+        """Vertices of the convex hull (m, 3) [m]: nothing of the mesh reaches farther out."""
         from scipy.spatial import ConvexHull
 
-        return _largest_distance(self.vertices[ConvexHull(self.vertices).vertices])
+        return self.vertices[ConvexHull(self.vertices).vertices]
+
+    @cached_property
+    def diameter(self) -> float:
+        """Largest distance between two points of the mesh [m]."""
+        return _largest_distance(self.corners)
 
     @cached_property
     def centre(self) -> Array:

@@ -74,7 +74,7 @@ def simulate_touches(
     elastic: bool | None = None,
     noise: Noise = CALIBRATION_NOISE,
 ) -> Touches:
-    """``n`` touches uniform over the contact pose space, with noise of any strength up to ``noise``; rigid and elastic in turn,
+    """``n`` touches all over the contact pose space, with noise of any strength up to ``noise``; rigid and elastic in turn,
     unless ``elastic`` says which.
 
     Poses lie anywhere within the cells, not at their centres: the score has to bridge what lies between.
@@ -88,11 +88,10 @@ def simulate_touches(
     space = index.space
     shape = index.sensor.along(_SHAPE)
     pixel = index.sensor.pixel_area(shape)
-    total = np.cumsum(index.weight.ravel().astype(float))
     masks: list[NDArray[np.bool_]] = []
     ids: list[int] = []
     for _ in range(100):
-        for pose, i in zip(*_drawn(index, total, 64, rng), strict=True):
+        for pose, i in zip(*_drawn(index, 64, rng), strict=True):
             mask = felt_mask(space, pose, len(masks) % 2 == 1 if elastic is None else elastic, shape)
             if mask.sum() * pixel < min(LEAST_CONTACT, 12 * pixel):
                 continue
@@ -105,17 +104,18 @@ def simulate_touches(
     return Touches(masks, np.array(ids, np.int64))
 
 
-def _drawn(index: Index, total: Array, n: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
-    """Up to ``n`` poses (m, 4, 4) uniform over the contact pose space, and the ids (m,) of the cells that hold them; ``total``
-    (N,) is the measure of all cells up to each.
+def _drawn(index: Index, n: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
+    """Up to ``n`` poses (m, 4, 4) all over the contact pose space, and the ids (m,) of the cells that hold them.
 
-    They are drawn from the cells. But a housing forbids most tilts of a large part, so that many a pose touches where the own
-    rotation of its cell does not: there cells are no measure of poses, which are drawn from the space itself, in more time.
+    They are drawn from the cells, by their measure; one that hardly touches may not give any. A housing forbids most tilts of a
+    large part, so that many a pose touches where the own rotation of its cell does not: there cells are no measure of poses,
+    which are drawn from the space itself, uniformly and in more time.
     """
     if index.sensor.housing_depth is not None:
         T, depth = index.space.sample(n, rng)
         return T, index.lookup(T, depth)
-    cells = np.minimum(np.searchsorted(total, rng.random(n) * total[-1]), len(total) - 1)
+    every = np.full(n, len(index))
+    cells = index.within_runs(np.zeros(n, np.int64), every, rng.random(n))
     T, _, found = draw_within(index, index.space, cells, rng, tries=5)
     return T[found], cells[found]
 

@@ -159,11 +159,7 @@ class Caster:
             direction = R[:, 2, None]
         middle = np.einsum("ni,nij->nj", below[:, None] * [0.0, 0.0, -1.0] - T[:, :3, 3], R) - self._centre
         origin = middle[:, None] if sensor.camera_distance else middle[:, None] + _combined(R, rays, 0.0)
-        rows = [
-            np.repeat(x.astype(np.float32, copy=False), len(rays) if x.shape[1] == 1 else 1, 1)
-            for x in (origin, direction)
-        ]
-        return rows[0].reshape(-1, 3), rows[1].reshape(-1, 3), below
+        return _of_every_ray(origin, len(rays)), _of_every_ray(direction, len(rays)), below
 
     def _camera_inside(self, sensor: Sensor, T: Array) -> NDArray[np.bool_]:
         if not sensor.camera_distance:
@@ -175,10 +171,16 @@ class Caster:
         return np.asarray(((hit.normal * direction).sum(1) > 0) & (hit.face >= 0))
 
 
+def _of_every_ray(x: Array | NDArray[np.float32], rays: int) -> NDArray[np.float32]:
+    """``x`` (n, rays or 1, 3) as (n rays, 3), in single precision."""
+    x = x.astype(np.float32, copy=False)
+    return (np.repeat(x, rays, 1) if x.shape[1] == 1 else x).reshape(-1, 3)
+
+
 def _combined(R: Array, rays: Array, z: float) -> NDArray[np.float32]:
     """Vectors (x, y, z) of the sensor, x and y of ``rays`` (m, 2), in the object frame (n, m, 3), for rotations ``R`` (n, 3, 3).
 
-    In single precision, as Embree has it, and one component after the other: loops over three numbers each are ten times as slow.
+    In single precision, as Embree has it, and one component after the other: loops over three numbers each are slower.
     """
     R, (x, y) = R.astype(np.float32), rays.T.astype(np.float32)
     out = np.empty((len(R), len(x), 3), np.float32)
