@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import MeshError
 from geomtact.geometry.approach import Approach, allowed, approach_of, check_approach, facing, in_cones
-from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh import Mesh, outermost
 from geomtact.se3 import Array, random_rotations, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
@@ -41,6 +41,10 @@ class ContactSpace:
     @cached_property
     def caster(self) -> Caster:
         return Caster(self.mesh.vertices, self.mesh.faces)
+
+    @cached_property
+    def _corners(self) -> Array:
+        return outermost(self.mesh.vertices)
 
     @cached_property
     def cones(self) -> list[tuple[Array, float]] | None:
@@ -158,7 +162,7 @@ class ContactSpace:
         along x, or y, than the largest x - k (z - above) of the hull's corners, for any slope k >= 0 (weak duality).
         """
         sag = float(self.sensor.sag(*self.sensor.half_window))
-        x, y, z = np.moveaxis(T[:, :3, :3] @ self.mesh.corners.T + T[:, :3, 3, None], 1, 0)
+        x, y, z = np.moveaxis(T[:, :3, :3] @ self._corners.T + T[:, :3, 3, None], 1, 0)
         steep: tuple[float, ...] = (0.0,)
         if self.sensor.housing_depth is not None:
             above = np.maximum(self.sensor.housing_depth - depth, sag) + 10 * _SETTLED

@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from geomtact.geometry.approach import facing
-from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh import Mesh, outermost
 from geomtact.se3 import Array, apply
 
 _FEW, _HOPELESS = 200, 6e-3  # points that are asked first, and the clearance [m] beyond which no others are
@@ -72,7 +72,7 @@ class Fixture:
     def points(self) -> Array:
         """Points all over the surface, and corners of its hull, which reach farthest out (m, 3) [m]; in no order."""
         points, rng = self.mesh.surface_points(self.n), np.random.default_rng(0)
-        return rng.permutation(np.concatenate([points, rng.permutation(self.mesh.corners)[: self.n // 5]]))
+        return rng.permutation(np.concatenate([points, rng.permutation(outermost(self.mesh.vertices))[: self.n // 5]]))
 
     def clearance_needed(self, T_fixture_part: ArrayLike) -> Array:
         """How far (n,) [m] the part at ``T_fixture_part`` (n, 4, 4) reaches out of the recess before it is widened.

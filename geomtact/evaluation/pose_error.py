@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.geometry.distance import PoseDistance
-from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh import Mesh, outermost
 from geomtact.se3 import Array, apply
 
 
@@ -45,8 +45,9 @@ def mssd(T_true: ArrayLike, T: ArrayLike, mesh: Mesh) -> Array:
         images = _poses(T)[:, None] @ symmetry.elements
     else:
         images = PoseDistance(mesh).aligned(T_true, _poses(T))[:, None]
-    here = apply(T_true, mesh.corners)
-    return np.array([np.linalg.norm(apply(some, mesh.corners) - here, axis=-1).max(-1).min() for some in images])
+    corners = outermost(mesh.vertices)
+    here = apply(T_true, corners)
+    return np.array([np.linalg.norm(apply(some, corners) - here, axis=-1).max(-1).min() for some in images])
 
 
 def random_add(distance: PoseDistance, space: ContactSpace, n: int = 200) -> float:

@@ -82,16 +82,9 @@ class Mesh:
         return digest.hexdigest()
 
     @cached_property
-    def corners(self) -> Array:
-        """Vertices of the convex hull (m, 3) [m]: nothing of the mesh reaches farther out."""
-        from scipy.spatial import ConvexHull
-
-        return self.vertices[ConvexHull(self.vertices).vertices]
-
-    @cached_property
     def diameter(self) -> float:
         """Largest distance between two points of the mesh [m]."""
-        return _largest_distance(self.corners)
+        return _largest_distance(outermost(self.vertices))
 
     @cached_property
     def centre(self) -> Array:
@@ -380,6 +373,13 @@ def _mm(metres: float) -> str:
     if mm > 1e9:
         return "more than 1,000,000,000 mm"
     return f"{mm:,.0f} mm" if mm >= 100 else f"{mm:.3g} mm"
+
+
+def outermost(points: Array) -> Array:
+    """Those of ``points`` (n, 3) that are corners of their convex hull (m, 3): none of the others reaches farther out."""
+    from scipy.spatial import ConvexHull
+
+    return points[ConvexHull(points).vertices]
 
 
 def _largest_distance(points: Array) -> float:
