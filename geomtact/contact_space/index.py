@@ -313,9 +313,8 @@ class Index:
     @cached_property
     def drawn_moments(self) -> NDArray[np.float32]:
         """Moments (6, m) of poses drawn by their measure; always the same ones."""
-        at = (np.arange(_DRAWN) + np.random.default_rng(0).random(_DRAWN)) / _DRAWN * self._mass_before[-1]
-        found = np.searchsorted(self._mass_before, at, "right") - 1
-        return np.ascontiguousarray(self.moments[:, np.clip(found, 0, len(self) - 1)])
+        found = self.within_runs(0, len(self), (np.arange(_DRAWN) + np.random.default_rng(0).random(_DRAWN)) / _DRAWN)
+        return np.ascontiguousarray(self.moments[:, found])
 
     def block_of(self, ids: ArrayLike) -> NDArray[np.int64]:
         """Which of :attr:`block_runs` (n,) holds each pose id (n,)."""

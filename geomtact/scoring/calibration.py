@@ -114,8 +114,7 @@ def _drawn(index: Index, n: int, rng: np.random.Generator) -> tuple[Array, NDArr
     if index.sensor.housing_depth is not None:
         T, depth = index.space.sample(n, rng)
         return T, index.lookup(T, depth)
-    every = np.full(n, len(index))
-    cells = index.within_runs(np.zeros(n, np.int64), every, rng.random(n))
+    cells = index.within_runs(0, len(index), rng.random(n))
     T, _, found = draw_within(index, index.space, cells, rng, tries=5)
     return T[found], cells[found]
 
