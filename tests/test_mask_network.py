@@ -163,10 +163,22 @@ def test_what_trembles_from_pixel_to_pixel_is_smoothed(monkeypatch, rng):
     assert ((trembling > 0) != inside).sum() > 35
     assert ((smoothed(trembling) > 0) != inside).sum() < 8 and ((smoothed(shape) > 0) != inside).sum() < 8
     # and this is what the probability is made of
-    monkeypatch.setattr(mask_network, "_network", lambda: lambda x: torch.from_numpy(trembling)[None])
+    looks = torch.from_numpy(np.stack([trembling, trembling[::-1, ::-1]]))
+    monkeypatch.setattr(mask_network, "_network", lambda: lambda x: looks)
     change = rng.normal(0, 0.01, (60, 80, 3))
     expected = 1 / (1 + np.exp(-smoothed(trembling)))
     assert contact_probability(change, np.full((60, 80, 3), 0.4)) == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_gel_turned_round_whose_red_and_blue_lamps_are_exchanged_is_told_alike(rng):
+    change, image = (
+        cv2.resize(rng.uniform(*ends, (12, 16, 3)), (160, 120), interpolation=cv2.INTER_CUBIC)
+        for ends in ((-0.3, 0.3), (0.2, 1.1))
+    )
+    turned = [np.rot90(each[..., ::-1], 2) for each in (change, image)]
+    probability = contact_probability(change, image)
+    assert np.ptp(probability) > 0.2
+    assert np.rot90(contact_probability(*turned), 2) == pytest.approx(probability, abs=1e-4)
 
 
 @pytest.mark.parametrize("shape", [(240, 320), (320, 240), (123, 161)])

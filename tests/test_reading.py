@@ -13,6 +13,7 @@ from geomtact.errors import ImageError, UsageError
 from geomtact.evaluation.readings import find, imprints
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 from geomtact.sensing.local_shape import contact_mask
+from geomtact.sensing.pixels import median_of
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
 
@@ -98,6 +99,13 @@ def test_a_faint_pixel_beside_a_rigid_contact_is_no_fading():
     height = HEIGHT.copy()
     height[5, 5] = 5e-6
     assert read_observation(height, MINI).warnings == []
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 1000])
+def test_the_median_is_numpys(n, rng):
+    values = rng.integers(0, 5, n) + np.round(rng.normal(size=n), 1)
+    for dtype in (np.float32, np.float64):
+        assert median_of(values.astype(dtype)) == np.median(values.astype(dtype))
 
 
 def test_noise_all_over_a_soft_gel_is_no_contact(rng):

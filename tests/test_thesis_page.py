@@ -135,9 +135,9 @@ def test_a_posterior_that_holds_what_feels_the_same_and_nothing_else_has_precisi
     def judged(posterior, T):
         return ambiguity.held(posterior, np.stack(T), distance, np.random.default_rng(0))
 
-    assert judged(told([here, there], lambda T: 0.5), [here, there]) == (1, 1)
-    assert judged(told([here, there], lambda T: 0.5), [here]) == (0.5, 1)
-    assert judged(told([here], lambda T: 0.5 if T is not there and T[0, 3] < 0.01 else 1.0), [here, there]) == (1, 0.5)
+    assert judged(told([here, there], lambda T: np.full(len(T), 0.5)), [here, there]) == (1, 1)
+    assert judged(told([here, there], lambda T: np.full(len(T), 0.5)), [here]) == (0.5, 1)
+    assert judged(told([here], lambda T: np.where(T[:, 0, 3] < 0.01, 0.5, 1.0)), [here, there]) == (1, 0.5)
     assert judged(SimpleNamespace(contact=False), [here]) == (0, 0)
 
 

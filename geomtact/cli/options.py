@@ -33,7 +33,7 @@ MaxPoses = Annotated[
     int | None,
     typer.Option(
         "--max-poses",
-        min=1,
+        min=1000,
         help="About how many poses, plane faces adding up to a quarter; 1.2 million by default.",
         show_default=False,
     ),

@@ -85,7 +85,7 @@ def held(posterior: Posterior, T: Array, distance: PoseDistance, rng: np.random.
         return 0.0, 0.0
     drawn, radius = posterior.sample(DRAWS, rng), mode_radius(distance.mesh)
     near = np.any([distance.within(one, drawn, radius) for one in T], axis=0)
-    inside = np.array([posterior.credible_level(one) <= REGION for one in T])
+    inside = posterior.credible_level(T) <= REGION
     return float(near.mean()), float(inside.mean())
 
 

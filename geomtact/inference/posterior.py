@@ -19,6 +19,7 @@ from geomtact.inference.modes import Mode, Refined, grown, mode_at
 from geomtact.se3 import Array, check_transforms, inverse
 from geomtact.sensing.sensor import Sensor
 
+_TIE = 1e-9  # log densities that differ by less are the same
 _SEEDS = 400  # of the most probable cells, from which modes are grown
 
 
@@ -209,14 +210,14 @@ class Posterior:
         """
         T = check_transforms(T)
         density = np.atleast_1d(self.log_density(T)).ravel()
-        level, above = self._density_levels
-        out = np.ones(len(density))
-        for i, (rho, pose) in enumerate(zip(density, T.reshape(-1, 4, 4), strict=True)):
-            if np.isfinite(rho):
-                j = np.searchsorted(-level, -rho - 1e-9)  # first level not above rho
-                j = min(j, len(level) - 1)
-                before = above[j - 1] if j else 0.0
-                out[i] = before + _share(pose, self.seed) * (above[j] - before)
+        known, share = np.isfinite(density), np.array([_share(pose, self.seed) for pose in T.reshape(-1, 4, 4)])
+        if len(self.cells):
+            edges = np.unique(np.concatenate([density[known] - _TIE, density[known] + _TIE]))
+            whole = np.rint(self._probability * 2.0**52)  # whole numbers up to 2**53 add up to the same in any order
+            below = np.cumsum(np.bincount(np.searchsorted(edges, self._log_density), whole, len(edges) + 1))
+            above, upto = (1 - below[np.searchsorted(edges, density + off)] / below[-1] for off in (_TIE, -_TIE))
+            share = above + share * (upto - above)
+        out = np.where(known, share, 1.0)
         return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
 
     def sample(self, n: int, rng: np.random.Generator | int) -> Array:
@@ -274,18 +275,6 @@ class Posterior:
                 log_mass = np.log(self.index.mass(self.cells[rows], self.runs[rows]))
             density = (self.log_prob[rows] - log_mass).astype(float)
         return np.where(np.isfinite(density), density, -np.inf)
-
-    @cached_property
-    def _density_levels(self) -> tuple[Array, Array]:
-        """Distinct log densities, highest first, and the mass at or above each."""
-        if not len(self.cells):
-            return np.zeros(1), np.ones(1)
-        density, mass = self._log_density, self._probability
-        order = np.argsort(-density, kind="stable")
-        order = order[mass[order] > 0]
-        density, mass = density[order], mass[order]
-        last = np.append(np.diff(density) < -1e-9, True)
-        return density[last], np.cumsum(mass)[last]
 
     def _sensor_poses(self, rows: NDArray[np.int64]) -> Array:
         """Poses (m, 4, 4) of ``rows`` in the sensor frame."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geomtact.errors import ImageError
 from geomtact.se3 import Array
 from geomtact.sensing.image_file import read_image
-from geomtact.sensing.pixels import Mask, blurred, closed, filled, opened, pixels_apart, size_of
+from geomtact.sensing.pixels import Mask, blurred, closed, filled, median_of, opened, pixels_apart, size_of
 from geomtact.sensing.sensor import Sensor
 
 GRID = 120  # smoothing lengths along an image's shorter side
@@ -32,7 +32,7 @@ def change_from(image: Any, background: Any, sigma: float) -> tuple[Array, Mask,
     reference = smooth_background(smooth) if background is None else blurred(background, sigma)
     change = _without_light_drift(smooth, reference, max(1, round(sigma)))
     # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
-    floor = 0.0 if background is not None else float(np.median(size_of(change)))
+    floor = 0.0 if background is not None else median_of(size_of(change).ravel())
     return change, *_felt(change, sigma, floor)
 
 
@@ -65,7 +65,7 @@ def _without_light_drift(image: Array, reference: Array, step: int) -> Array:
             gain = np.clip(dx @ calm_y / dx.size / variance, 0.8, 1.25) if variance > _GREY**2 else dx.dtype.type(1)
             offset = mean_y - gain * mean_x
             error = np.abs(y - gain * x - offset)
-            calm = np.flatnonzero(error <= np.median(error))
+            calm = np.flatnonzero(error <= median_of(error))
             calm_x, calm_y = x.take(calm), y.take(calm)
         gains[c], offsets[c] = gain, offset
     return image - gains * reference - offsets
@@ -79,7 +79,7 @@ def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]
         # second differences over three smoothing lengths cancel slopes, and most pixels lie outside any rim
         lines = (a[:, ::apart] for a in (change[..., c], change[..., c].T))
         second = [np.abs(a[2 * step :: apart] - 2 * a[step:-step:apart] + a[: -2 * step : apart]) for a in lines]
-        deviation = np.median(np.concatenate([s.ravel() for s in second])) / 0.6745 / np.sqrt(6)
+        deviation = median_of(np.concatenate([s.ravel() for s in second])) / 0.6745 / np.sqrt(6)
         noise2 += max(float(deviation), 0.25 * _GREY) ** 2
     noise = max(np.sqrt(noise2), floor)
     size = size_of(change)

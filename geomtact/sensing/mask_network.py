@@ -78,12 +78,20 @@ class _Residual(nn.Module):
 
 def contact_probability(change: ArrayLike, image: ArrayLike) -> Image:
     """Probability (H, W) of contact at each pixel, of a ``change`` of colour (H, W, 3) of an ``image`` (H, W, 3) 0..1 from its
-    background, RGB."""
-    x = torch.from_numpy(seen(change, image))[None]
+    background, RGB: the mean log odds of two looks."""
+    x = torch.from_numpy(seen(change, image))
+    looks = torch.stack([x, _the_other_way(x)])
     with torch.inference_mode():
-        log_odds = _network()(x.contiguous(memory_format=torch.channels_last))[0].numpy()
-    full = cv2.resize(smoothed(log_odds), np.shape(change)[1::-1], interpolation=cv2.INTER_CUBIC)
+        once, again = _network()(looks.contiguous(memory_format=torch.channels_last))
+    log_odds = (once + again.rot90(2)) / 2
+    full = cv2.resize(smoothed(log_odds.numpy()), np.shape(change)[1::-1], interpolation=cv2.INTER_CUBIC)
     return np.asarray(1 / (1 + np.exp(-full)), np.float32)
+
+
+def _the_other_way(x: torch.Tensor) -> torch.Tensor:
+    """What is :func:`seen` (``CHANNELS``, h, w), turned by 180 degrees, red and blue exchanged: the same contact under other
+    lamps, of which the network errs otherwise."""
+    return x.reshape(-1, 3, *x.shape[1:]).flip(1, 2, 3).reshape(x.shape)
 
 
 def smoothed(log_odds: Image) -> Image:

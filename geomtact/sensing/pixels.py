@@ -28,6 +28,13 @@ def size_of(change: Array) -> Array:
     return np.sqrt(np.einsum("hwc,hwc->hw", change, change))
 
 
+def median_of(values: Array) -> float:
+    """The median of ``values`` (n,), none of them NaN, as ``np.median`` tells it in several times the time."""
+    below = (len(values) - 1) // 2
+    parted = np.partition(values, below)
+    return float(parted[below] if len(values) % 2 else np.mean([parted[below], parted[below + 1 :].min()]))
+
+
 def pixels_apart(sigma: float) -> int:
     """Pixels from one to the next that tells something else, where all are smoothed by ``sigma``."""
     return max(1, round(1.5 * sigma))
