@@ -236,6 +236,8 @@ def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touch
     shutil.copytree(cache, tmp_path / "copy")
     assert "ball" in geomtact("cache", "--cache-dir", "copy").stdout
     assert "1 index," in geomtact("cache", "--cache-dir", "copy", "--limit-gb", 1).stdout
+    assert "did you mean 'ball'?" in geomtact("cache", "--cache-dir", "copy", "--remove", "bell", status=2).stderr
+    assert "0 indexes" in geomtact("cache", "--cache-dir", "copy", "--remove", "ball").stdout
     assert "0 indexes" in geomtact("cache", "--cache-dir", "copy", "--clear").stdout
     geomtact("cache", "--clear", "--limit-gb", 1, status=2)
 

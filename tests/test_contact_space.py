@@ -15,7 +15,7 @@ from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index, pack
 from geomtact.contact_space.resolution import choose
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache, open_index
+from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache, open_index, remove_from_cache
 from geomtact.errors import CacheError, MeshError, UsageError
 from geomtact.geometry.approach import allowed, approach_of
 from geomtact.geometry.mesh import Mesh, load_mesh
@@ -484,11 +484,19 @@ def test_the_cache_is_listed_bounded_and_cleared(tmp_path):
     newest = entries[0].key
     (tmp_path / ("0" * 32)).mkdir()
     assert [e.object for e in cache_entries(tmp_path) if not e.poses] == ["damaged"]
+    with pytest.raises(UsageError, match="got 'bal'; did you mean 'ball'"):
+        remove_from_cache([newest[:6], "bal"], tmp_path)
+    assert newest in {e.key for e in cache_entries(tmp_path)}, "nothing is removed where one name fits none"
+    assert [e.key for e in remove_from_cache([newest[:12], newest], tmp_path)] == [newest]
+    tiny_index(tmp_path)
+    open_index(load_mesh("ball"), TINY, None, 3000, tmp_path)
     removed = bound_cache(entries[0].size_bytes, tmp_path)
     assert newest in {e.key for e in cache_entries(tmp_path)} and not {first.key, second.key} <= {
         e.key for e in cache_entries(tmp_path)
     }
     assert removed
+    remove_from_cache(["ball"], tmp_path)
+    assert not [e for e in cache_entries(tmp_path) if e.object == "ball"]
     clear_cache(tmp_path)
     assert cache_entries(tmp_path) == [] and not list(tmp_path.iterdir())
 

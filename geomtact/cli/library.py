@@ -49,20 +49,27 @@ def cache(
         float | None,
         typer.Option("--limit-gb", min=0, help="Remove those used longest ago until at most this is left."),
     ] = None,
+    remove: Annotated[
+        list[str] | None,
+        typer.Option("--remove", metavar="PART|KEY", help="Remove those of a part, or of a key. May be repeated."),
+    ] = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """List the cached indexes; clear or bound the cache."""
+    """List the cached indexes; remove some, or all."""
     import time
 
-    from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache, default_cache_dir
+    from geomtact.contact_space import store
 
-    if clear and limit_gb is not None:
-        raise UsageError("--clear and --limit-gb exclude each other; give one of them")
-    folder = cache_dir or default_cache_dir()
-    if clear or limit_gb is not None:
-        removed = clear_cache(folder) if limit_gb is None else bound_cache(int(1e9 * limit_gb), folder)
+    if clear + (limit_gb is not None) + bool(remove) > 1:
+        raise UsageError("--clear, --limit-gb and --remove exclude each other; give one of them")
+    folder = cache_dir or store.default_cache_dir()
+    if clear or limit_gb is not None or remove:
+        if remove:
+            removed = store.remove_from_cache(remove, folder)
+        else:
+            removed = store.clear_cache(folder) if limit_gb is None else store.bound_cache(int(1e9 * limit_gb), folder)
         tell(f"removed {_count(len(removed))}, {sum(e.size_bytes for e in removed) / 1e6:.0f} MB")
-    entries = cache_entries(folder)
+    entries = store.cache_entries(folder)
     rows = [
         [e.key[:12], e.object, e.sensor, f"{e.poses:,}", f"{e.size_bytes / 1e6:.0f}", _when(time.time() - e.last_used)]
         for e in entries

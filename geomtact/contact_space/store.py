@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ import numpy as np
 from geomtact.contact_space.build import build, choose_resolution
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.resolution import MAX_POSES, Resolution
-from geomtact.errors import CacheError
+from geomtact.errors import CacheError, UsageError, did_you_mean
 from geomtact.geometry.approach import Approach, check_approach
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
@@ -28,7 +29,7 @@ from geomtact.sensing.sensor import Sensor
 
 FORMAT = 8  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
-_KEY_LENGTH = 32  # hexadecimal digits of an entry's name
+_KEY_LENGTH, _KEY_AT_LEAST = 32, 6  # hexadecimal digits of an entry's name, and by how many it may be named
 
 
 @dataclass(frozen=True)
@@ -124,13 +125,37 @@ def cache_entries(cache_dir: str | Path | None = None) -> list[CacheEntry]:
 
 def bound_cache(limit_bytes: int, cache_dir: str | Path | None = None, keep: str = "") -> list[CacheEntry]:
     """Remove the entries used longest ago until the cache holds at most ``limit_bytes``; returns what was removed."""
-    removed, total = [], 0
+    too_many, total = [], 0
     for entry in cache_entries(cache_dir):
         total += entry.size_bytes
         if total > limit_bytes and entry.key != keep:
-            shutil.rmtree(entry.folder, ignore_errors=True)
-            removed.append(entry)
-    return removed
+            too_many.append(entry)
+    return _removed(too_many)
+
+
+def remove_from_cache(names: Sequence[str], cache_dir: str | Path | None = None) -> list[CacheEntry]:
+    """Remove the indexes of parts of these ``names``, or whose keys begin so; returns what was removed.
+
+    Raises
+    ------
+    UsageError
+        One of the names fits none; then nothing is removed.
+    """
+    entries = cache_entries(cache_dir)
+    meant = [(name, e) for e in entries for name in names if name in (e.object, e.key[: max(_KEY_AT_LEAST, len(name))])]
+    for name in names:
+        if all(name != of for of, _ in meant):
+            raise UsageError(
+                f"cache: expected parts or keys that geomtact cache lists, got {name!r}"
+                + did_you_mean(name, {e.object for e in entries})
+            )
+    return _removed(list(dict.fromkeys(e for _, e in meant)))
+
+
+def _removed(entries: list[CacheEntry]) -> list[CacheEntry]:
+    for entry in entries:
+        shutil.rmtree(entry.folder, ignore_errors=True)
+    return entries
 
 
 def clear_cache(cache_dir: str | Path | None = None) -> list[CacheEntry]:
