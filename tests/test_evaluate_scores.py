@@ -226,6 +226,13 @@ def test_other_settings_leave_the_file_as_it_is(whole, evaluate, folder):
     told = evaluate("ball", "--scores", "iou", "--out", out, touches=7, status=3).stderr
     assert "other settings (touches)" in told and told.count("\n") == 1
     assert out.read_text() == before
+    other = folder / "other_part.json"
+    held = json.loads(before)
+    held["parts"]["ball"]["object_sha256"] = "0" * 64
+    other.write_text(json.dumps(held))
+    told = evaluate("ball", "--scores", "iou", "--out", other, status=3).stderr
+    assert "a study of ball with other settings (object_sha256)" in told and told.count("\n") == 1
+    assert json.loads(other.read_text()) == held
 
 
 def test_words_are_told_apart_and_wrong_ones_named(evaluate):

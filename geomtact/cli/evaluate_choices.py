@@ -56,6 +56,7 @@ def judge_choices(
     All ways meet each touch in turn. Everything is prepared anew in a folder that is removed afterwards, so that the time of
     preparing is known too. Prints tables, and writes all answers to --out.
     """
+    from geomtact.contact_space.store import FORMAT
     from geomtact.evaluation import choices
     from geomtact.report.result import plain
     from geomtact.sensing.sensor import Sensor
@@ -69,6 +70,7 @@ def judge_choices(
                 "object_sha256": mesh.sha256,
                 "sensor": gel.name,
                 "sensor_sha256": gel.sha256,
+                "index_format": FORMAT,
                 "touches": touches,
                 "seed": seed,
                 "ways": {name: asdict(way) | {"scorer": Path(way.scorer).name} for name, way in ways.items()},

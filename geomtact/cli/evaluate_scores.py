@@ -108,7 +108,6 @@ def judge_scores(
     Prints gain, coverage, pose errors and times of each, and writes them and every outcome to --out.
     """
     from geomtact.contact_space.resolution import MAX_POSES
-    from geomtact.errors import InputError
     from geomtact.report.result import plain
     from geomtact.sensing.sensor import Sensor
 
@@ -125,9 +124,8 @@ def judge_scores(
     )
     content = study_file.load(out, SCHEMA)
     settings = plain(options.settings())
-    if content.setdefault("settings", settings) != settings:
-        other = ", ".join(key for key in settings if content["settings"].get(key) != settings[key])
-        raise InputError(f"{out}: holds a study with other settings ({other}); give another file with --out")
+    if not study_file.begun(content if "settings" in content else None, settings):
+        content["settings"] = settings
     content.pop("overall", None)
     for mesh in study_options.meshes(chosen, unit, options.sensor):
         part = _part(content, mesh, options.sensor)
@@ -149,11 +147,11 @@ def judge_scores(
 
 
 def _part(content: dict[str, Any], mesh: Mesh, sensor: Sensor) -> dict[str, Any]:
-    """What the file holds of the same part on the same sensor, or room for it."""
+    """What the file holds of the part on the sensor, or room for it."""
     pressed = {"object_sha256": mesh.sha256, "sensor_sha256": sensor.sha256}
-    part = content["parts"].get(mesh.name)
-    if part is None or any(part[key] != value for key, value in pressed.items()):
-        part = content["parts"][mesh.name] = {**pressed, "index_s": None, "random_add_mm": None, "scores": {}}
+    part = content["parts"].setdefault(mesh.name, {**pressed, "index_s": None, "random_add_mm": None, "scores": {}})
+    held = {key: part[key] for key in pressed}
+    study_file.begun({"settings": {"object": mesh.name, **held}}, {"object": mesh.name, **pressed})
     return part
 
 

@@ -83,7 +83,7 @@ def judge_stability(
     content["together"] = plain(_together(list(content["parts"].values())))
     study_file.save(out, content)
     if len(content["parts"]) > 1:
-        _print("all parts", {name: content["together"][name] for name in names})
+        _print("all parts", {name: content["together"][name] for name in names if name in content["together"]})
     study_file.plot(content, plot)
 
 

@@ -45,6 +45,7 @@ def judge_thesis_table(
     Prints median errors, absolute and normalised, and writes them and every outcome to --out; with --ambiguity also what the
     first touches from each side leave open, whoever reads them.
     """
+    from geomtact.contact_space.store import FORMAT
     from geomtact.evaluation.touches import FELT
     from geomtact.sensing.sensor import Sensor
 
@@ -55,7 +56,8 @@ def judge_thesis_table(
             "object_sha256": mesh.sha256,
             "sensor": gel.name,
             "sensor_sha256": gel.sha256,
-            "poses": _POSES,
+            "index_format": FORMAT,
+            "max_poses": _POSES,
             "sides": sides,
             "touches": touches,
             "noise": {"name": noise.value, **asdict(strength)},

@@ -265,13 +265,13 @@ SWEEPS = {
         lambda w, x: replace(w, mesh=knobbed(w.mesh, 1e-3 * x)),
     ),
     "rig_shift": Sweep(
-        "each of three sensors off by [mm rms]",
+        "two of three sensors off by [mm rms]",
         (0, 0.5, 1, 2, 5, 10),
         (0, 0.5),
         ask=partial(_rigs, np.array([0, 0, 0, 1, 1, 1]) * 1e-3 / np.sqrt(3)),
     ),
     "rig_turn": Sweep(
-        "each of three sensors turned by [deg rms]",
+        "two of three sensors turned by [deg rms]",
         (0, 0.5, 1, 2, 5, 10),
         (0, 0.5),
         ask=partial(_rigs, np.array([1, 1, 1, 0, 0, 0]) * np.radians(1) / np.sqrt(3)),

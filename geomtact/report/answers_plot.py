@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from geomtact.report.canvas import COLOURS, png
+from geomtact.report.canvas import coloured, png
 
 _BAND = 1.63  # of a Kolmogorov band that holds 99 % of curves, in 1 / sqrt(n)
 
@@ -21,7 +21,7 @@ def draw_answers(content: Mapping[str, Any]) -> bytes:
     figure = Figure(figsize=(12, 4.2), dpi=110, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
     regions, nearer, found = figure.subplots(1, 3)
-    for (name, part), colour in zip(content["parts"].items(), COLOURS, strict=False):
+    for (name, part), colour in coloured(content["parts"].items()):
         for axes, field in ((regions, "level"), (nearer, "tarp")):
             levels = np.sort([outcome[field] for outcome in part["outcomes"]])
             axes.step([0, *levels, 1], np.linspace(0, 1, len(levels) + 2), where="post", color=colour, label=name)

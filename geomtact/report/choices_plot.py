@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
-from geomtact.report.canvas import COLOURS, png
+from geomtact.report.canvas import COLOURS, coloured, png
 from geomtact.report.names import Named, write_names
 
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X")
@@ -81,7 +81,7 @@ def draw_modelled(content: Mapping[str, Any]) -> bytes:
     canvas = FigureCanvasAgg(figure)
     grid = figure.subplots(1, len(scenes), squeeze=False, sharey=True)[0]
     for axes, scene in zip(grid, scenes, strict=True):
-        for k, ((part, of), colour) in enumerate(zip(modelled.items(), cycle(COLOURS), strict=False)):
+        for k, ((part, of), colour) in enumerate(coloured(modelled.items())):
             told = of[scene]
             for i, name in enumerate(names):
                 if name in told:

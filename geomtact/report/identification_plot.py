@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from geomtact.report.canvas import COLOURS, png
+from geomtact.report.canvas import coloured, png
 
 _LINES = {
     "right": "the right part is the most probable",
@@ -26,7 +26,7 @@ def draw_identification(content: Mapping[str, Any]) -> bytes:
     left, right = figure.subplots(1, 2)
     figures = content["figures"]
     touches = [f["touches"] for f in figures]
-    for (key, label), colour in zip(_LINES.items(), COLOURS, strict=False):
+    for (key, label), colour in coloured(_LINES.items()):
         share, low, high = 100 * np.array([f[key] for f in figures]).T
         left.errorbar(touches, share, [share - low, high - share], fmt="o-", capsize=3, color=colour, label=label)
     left.axhline(100 / len(content["parts"]), color="0.5", ls=":", lw=1, label="chance")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from geomtact.report.canvas import COLOURS, png
+from geomtact.report.canvas import coloured, png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +32,7 @@ def draw_kitting(content: Mapping[str, Any]) -> bytes:
         canvas = FigureCanvasAgg(figure)
         left, right = figure.subplots(1, 2)
         ticks: list[tuple[float, str]] = []
-        for k, ((name, part), colour) in enumerate(zip(parts.items(), COLOURS, strict=False)):
+        for k, ((name, part), colour) in enumerate(coloured(parts.items())):
             some = [f for f in part["figures"] if f["touches"] == most and f["n"]]
             share = [100 * f["right"] / f["n"] for f in some]
             low, high = zip(*(f["interval"] for f in some), strict=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from geomtact.report.canvas import COLOURS, png
+from geomtact.report.canvas import coloured, png
 
 
 def draw_touches(content: Mapping[str, Any]) -> bytes:
@@ -16,7 +16,7 @@ def draw_touches(content: Mapping[str, Any]) -> bytes:
     figure = Figure(figsize=(10, 4), dpi=110, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
-    for (name, part), colour in zip(content["parts"].items(), COLOURS, strict=False):
+    for (name, part), colour in coloured(content["parts"].items()):
         figures = part["figures"]
         sensors = [f["sensors"] for f in figures]
         left.plot(sensors, [f["gain_mean"] for f in figures], "o-", color=colour, label=name)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from geomtact.report.canvas import COLOURS, png
+from geomtact.report.canvas import coloured, png
 
 LABELS = {"filter": "the filter", "frames": "independent frames", "thesis": "the thesis's filter"}
 
@@ -22,7 +22,7 @@ def draw_track(content: Mapping[str, Any]) -> bytes:
     left, right = figure.subplots(1, 2)
     least = content["figures"]["least_gain"]
     outcomes = [(name, o) for name, part in content["parts"].items() for o in part["outcomes"]]
-    for (method, label), colour in zip(LABELS.items(), COLOURS, strict=False):
+    for (method, label), colour in coloured(LABELS.items()):
         mean = np.mean([_gain(o, method, least) for _, o in outcomes], axis=0)
         left.plot(np.arange(1, len(mean) + 1), mean, color=colour, label=label)
     left.axhline(0, color="0.4", lw=0.8)
@@ -32,7 +32,7 @@ def draw_track(content: Mapping[str, Any]) -> bytes:
     left.legend(frameon=False)
     more = [(float(np.mean(_gain(o, "filter", least) - _gain(o, "frames", least))), name) for name, o in outcomes]
     place = 0
-    for name, colour in zip(content["parts"], COLOURS, strict=False):
+    for name, colour in coloured(content["parts"]):
         own = sorted(value for value, part in more if part == name)
         right.bar(np.arange(place, place + len(own)), own, color=colour, label=name)
         place += len(own) + 1
