@@ -14,7 +14,12 @@ def plot_study(
     study: Annotated[Path, typer.Argument(metavar="FILE.json", help="What a study wrote with --out.")],
     out: Annotated[Path, typer.Argument(metavar="FILE.png", help="Where the picture goes.")],
     picture: Annotated[
-        str | None, typer.Option("--picture", help="Which one, where a study has several.", show_default=False)
+        str | None,
+        typer.Option(
+            "--picture",
+            help="Which one, where a study has several: costs (the default) or modelled, of evaluate choices.",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
     """Draw the picture of a study from its JSON alone."""
