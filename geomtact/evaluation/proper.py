@@ -69,8 +69,10 @@ def energy_score(drawn: ArrayLike, T: ArrayLike, mesh: Mesh) -> float:
     """Energy score [m] of a distribution, of which poses (n, 4, 4) are ``drawn``, at the true pose ``T`` (4, 4).
 
     The mean distance of a pose drawn from the truth, less half of that between two drawn: proper, since the mean distance of
-    corresponding points is of negative type, and so is its mean over the images under the finite symmetries of ``mesh``. Of a
-    continuous symmetry those points count that it leaves in place: of each point the nearest on the axis, or the centre.
+    corresponding points is of negative type, and so is its mean over the images under the finite symmetries of ``mesh``, where
+    truth and drawn poses may be any of them. That mean is not 0 for the true pose itself, so that a part with such symmetries
+    scores more than nothing even if its pose is known for sure. Of a continuous symmetry those points count that it leaves in
+    place: of each point the nearest on the axis, or the centre.
     """
     drawn = np.asarray(drawn, float)
     half = len(drawn) // 2

@@ -31,7 +31,7 @@ def save(posterior: Posterior, path: str | Path) -> None:
 
     A posterior may be spread over a million poses. For other programs the most probable are written out, those that
     hold 99 % of the mass but at most 50,000, with log_prob normalised over them; ``row_log_prob`` holds all, for the runs
-    of ``row_length`` cells that begin at ``row_cell``.
+    of ``row_length`` cells that begin at ``row_cell``; it is empty where each is one cell.
     """
     p = np.exp(posterior.log_prob)
     order = np.argsort(-p, kind="stable")
@@ -61,8 +61,8 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "sensor_toml": np.array(posterior.sensor.to_toml()),
         "seed": np.array(posterior.seed),
         "row_cell": posterior.cells,
-        "row_length": np.ones(len(p), np.int64) if posterior.runs is None else posterior.runs,
-        "row_log_prob": posterior.log_prob.astype(np.float32),
+        "row_length": np.zeros(0, np.int64) if posterior.runs is None else posterior.runs,
+        "row_log_prob": posterior.log_prob,
         "index_poses": np.array(len(posterior.index)),
         "T_frame_sensor": posterior.T_frame_sensor,
         "symmetry_elements": symmetry.elements,
@@ -109,7 +109,7 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     try:
         mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"], symmetry=_symmetry(data, meta))
         sensor = Sensor.from_toml(str(data["sensor_toml"]), str(path))
-        cells, runs, log_prob = data["row_cell"], data["row_length"], data["row_log_prob"].astype(float)
+        cells, runs, log_prob = data["row_cell"], data["row_length"], data["row_log_prob"]
         poses = int(data["index_poses"])
         extra = meta["refined"]
         refined = {
@@ -128,13 +128,13 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     return Posterior(
         index,
         cells,
-        log_prob - np.log(np.exp(log_prob).sum() or 1.0),
+        log_prob,
         frame=str(data["frame"]),
         T_frame_sensor=data["T_frame_sensor"],
         contact=bool(meta["contact"]),
         log_evidence=float(meta["log_evidence"]),
         seed=int(data["seed"]),
-        runs=runs,
+        runs=runs if len(runs) else None,
         refined=refined,
         settings=settings,
         warnings=meta["warnings"],

@@ -206,7 +206,8 @@ class Posterior:
     def credible_level(self, T: ArrayLike) -> Any:
         """Smallest highest-density mass in [0, 1] whose region holds ``T`` (4, 4) or (n, 4, 4).
 
-        Poses of one cell tie: a share of their mass counts, drawn uniformly from T and the posterior's seed.
+        Poses of one cell tie: a share of their mass counts, drawn uniformly from T and the posterior's seed. Without contact all
+        poses that may not touch tie, whatever the prior makes of them.
         """
         T = check_transforms(T)
         density = np.atleast_1d(self.log_density(T)).ravel()
