@@ -54,6 +54,7 @@ def judge_samples(
 
     from geomtact.contact_space.space import ContactSpace
     from geomtact.evaluation.study import make_touches
+    from geomtact.evaluation.worlds import cut_off
     from geomtact.sensing.sensor import Sensor
 
     pressed, strength = Sensor.load(sensor), study_options.noise_named(noise)
@@ -66,7 +67,7 @@ def judge_samples(
             if not some:
                 continue
             areas = np.quantile([t.mask.sum() * pixel_mm2 for t in some], (0.1, 0.5, 0.9))
-            border = np.mean([np.pad(t.mask[1:-1, 1:-1], 1).sum() < t.mask.sum() for t in some])
+            border = np.mean([cut_off(t.mask) > 0 for t in some])
             depth = np.median([1e3 * t.penetration for t in some])
             row = [f"{depth:.2f}", *(f"{a:.1f}" for a in areas), f"{100 * border:.0f} %"]
             rows.append([mesh.name, name, str(len(some)), *row])

@@ -67,20 +67,13 @@ def judge_identification(
         keep(done)
         tell(f"{name}: done")
     told = {
-        name: [_told(each) for some in part["outcomes"] for each in some] for name, part in content["parts"].items()
+        name: [identification.Told(**study_file.numbers(each)) for some in part["outcomes"] for each in some]
+        for name, part in content["parts"].items()
     }
     content["figures"] = identification.summarise(told)
     study_file.save(out, content)
     _print(content["figures"])
     study_file.plot(content, plot)
-
-
-def _told(written: Mapping[str, Any]) -> Any:
-    """An outcome as written, null standing for a log that JSON has no number for."""
-    from geomtact.evaluation.identification import Told
-
-    logs = {name: -float("inf") if each is None else each for name, each in written["log_probability"].items()}
-    return Told(**{**written, "log_probability": logs})
 
 
 def _print(figures: Sequence[Mapping[str, Any]]) -> None:

@@ -57,7 +57,7 @@ def judge_next_touch(
         done = study_file.earlier(content["parts"].get(name), settings)
 
         def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
-            flat = [next_touch_study.Run(**_numbers(run)) for pair in outcomes for run in pair]
+            flat = [next_touch_study.Run(**study_file.numbers(run)) for pair in outcomes for run in pair]
             figures = next_touch_study.summarise(flat)
             study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=outcomes)
 
@@ -67,12 +67,6 @@ def judge_next_touch(
         tell(f"{name}: done")
     _print(content["parts"])
     study_file.plot(content, plot)
-
-
-def _numbers(run: Mapping[str, Any]) -> dict[str, Any]:
-    """A run as written, null standing for what JSON has no number for."""
-    error = float("inf") if run["mssd_mm"] is None else run["mssd_mm"]
-    return dict(run) | {"mssd_mm": error, "gains": [-float("inf") if g is None else g for g in run["gains"]]}
 
 
 def _print(parts: Mapping[str, Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -12,9 +12,6 @@ from geomtact.cli import study_file, study_options
 from geomtact.cli.options import CacheDir, Effort, Seed, Unit
 from geomtact.cli.shell import print_table, tell
 from geomtact.cli.simulate import NoiseName
-
-if TYPE_CHECKING:
-    from geomtact.evaluation.track_study import Followed
 
 SCHEMA = "geomtact/track/1"
 
@@ -50,7 +47,7 @@ def judge_track(
         }
         name = localizer.mesh.name
         found = content["parts"].get(name)
-        done = study_file.earlier(found, settings, _followed)
+        done = study_file.earlier(found, settings, track_study.Followed)
         timing = found["step_ms"] if found is not None and done else None
 
         def keep(outcomes: list, name: str = name, settings: Mapping = settings, timing: Any = None) -> None:
@@ -62,19 +59,11 @@ def judge_track(
             study_file.collect(done, more, trajectories, f"following {name}", keep)
         keep(done, timing=timing or track_study.time_steps(localizer, seed, track_study.FRAMES, strength, effort))
         tell(f"{name}: done")
-    everything = [o for part in content["parts"].values() for o in study_file.outcomes(part, _followed)]
+    everything = [o for part in content["parts"].values() for o in study_file.outcomes(part, track_study.Followed)]
     content["figures"] = plain(track_study.summarise(everything))
     study_file.save(out, content)
     _print(content)
     study_file.plot(content, plot)
-
-
-def _followed(**entry: Any) -> Followed:
-    """A trajectory as written; null stands for the log density of a truth without probability."""
-    from geomtact.evaluation.track_study import Followed
-
-    gain = {m: [-float("inf") if g is None else g for g in values] for m, values in entry["gain"].items()}
-    return Followed(**(entry | {"gain": gain}))
 
 
 def _rounded(value: Any) -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 from geomtact.cli.shell import progress_bar
 
 _SAVE_EVERY = 10  # touches
+_LOGS = ("gain", "gains", "log_probability")  # fields of outcomes that are logs of probabilities
 
 
 def load(out: Path | None, schema: str) -> dict[str, Any]:
@@ -78,9 +79,17 @@ def outcomes(entry: dict[str, Any], kind: Callable[..., Any]) -> list:
 
 
 def numbers(outcome: Mapping[str, Any]) -> dict[str, Any]:
-    """An outcome as written; null stands for what JSON has no number for: no contact was found, the pose is infinitely wrong."""
-    without = {"gain": -math.inf}
-    return {key: without.get(key, math.inf) if value is None else value for key, value in outcome.items()}
+    """An outcome as written; null stands for what JSON has no number for: the log of no probability, an infinitely wrong pose."""
+    return {key: _number(value, -math.inf if key in _LOGS else math.inf) for key, value in outcome.items()}
+
+
+def _number(value: Any, null: float) -> Any:
+    """A value as written, ``null`` in the place of each null in it."""
+    if isinstance(value, dict):
+        return {key: _number(each, null) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_number(each, null) for each in value]
+    return null if value is None else value
 
 
 def collect(done: list, more: Iterable, total: int, title: str, keep: Callable[[list], None]) -> list:
