@@ -239,8 +239,8 @@ def answers(content):
             yield [*cells(row, name, felt, **part["figures"][felt]), *inside(part["figures"][felt])]
 
 
-def sweeps(*contents):
-    for name, sweep in (each for content in contents for each in content["together"].items()):
+def sweeps(content):
+    for name, sweep in content["together"].items():
         levels, held = [at["level"] for at in sweep["levels"]], sweep["inside"]
         begin = f"{held[0]:g}" if held[0] != levels[0] else "down" if levels[0] > levels[-1] else "up"
         promised = "all" if held == levels else "0" if held == [0] else f"{begin} to {held[-1]:g}"
@@ -268,7 +268,7 @@ TABLES = [
     ("benchmark", "| score | pin", scores, "scores"),
     ("benchmark", "| contact |", kinds, "classes", "flat"),
     ("benchmark", "| part |", answers, "localize"),
-    ("stability", "| sweep |", sweeps, "stability", "halo"),
+    ("stability", "| sweep |", sweeps, "stability"),
     ("stability", "| part |", answers, "housing"),
 ]
 
@@ -347,7 +347,7 @@ def told_together(content):
 SENTENCES = [
     "From 16 to 2 mm² a touch tells {area[16][gain_mean]:.1f} to {area[2][gain_mean]:.1f} nats",
     "at 1 mm² {area[1][gain_mean]:.1f}, at 0.5 mm² {area[0.5][gain_mean]:.1f}, at 0.1 mm² nothing; it claims as little (",
-    "({area[1][claimed_mean]:.1f}, {area[0.5][claimed_mean]:.1f} and {area[0.1][claimed_mean]:.1f}), and a quarter",
+    "({area[1][claimed_mean]:.1f}, {area[0.5][claimed_mean]:.1f} and {area[0.1][claimed_mean]:.1f}), and a third",
     "{size[5][gain_mean]:.1f} nats are told where {size[5][claimed_mean]:.1f} are claimed, and {size[5][ninety][share]:.0%} of",
     "with pixels 10 % larger than said {pitch[10][ninety][share]:.0%}. No warning comes",
     "of flat ones {kind[1][ninety][share]:.0%} of {kind[1][n]}, of cylinders {kind[4][ninety][share]:.0%} (",

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from textwrap import fill
 from typing import Any
 
 from geomtact.report.canvas import COLOURS, png
 
 _ACROSS = 4
 _TOGETHER = "all parts"
+_LINE = 50  # letters under an axis
 _SEVENTH = "#8C564B"  # colour, of as many parts
 _IN_A_ROW = 6  # of the legend
 
@@ -91,4 +93,4 @@ def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -
     nats.set_ylabel("information [nats]")
     shares.set_ylabel("of all touches [%]")
     shares.set_ylim(-3, 103)
-    shares.set_xlabel(sweep["title"])
+    shares.set_xlabel(fill(sweep["title"], _LINE))
