@@ -63,11 +63,14 @@ def cache(
     if clear + (limit_gb is not None) + bool(remove) > 1:
         raise UsageError("--clear, --limit-gb and --remove exclude each other; give one of them")
     folder = cache_dir or store.default_cache_dir()
-    if clear or limit_gb is not None or remove:
-        if remove:
-            removed = store.remove_from_cache(remove, folder)
-        else:
-            removed = store.clear_cache(folder) if limit_gb is None else store.bound_cache(int(1e9 * limit_gb), folder)
+    removed = None
+    if clear:
+        removed = store.clear_cache(folder)
+    elif limit_gb is not None:
+        removed = store.bound_cache(int(1e9 * limit_gb), folder)
+    elif remove:
+        removed = store.remove_from_cache(remove, folder)
+    if removed is not None:
         tell(f"removed {_count(len(removed))}, {sum(e.size_bytes for e in removed) / 1e6:.0f} MB")
     entries = store.cache_entries(folder)
     rows = [

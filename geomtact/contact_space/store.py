@@ -142,14 +142,15 @@ def remove_from_cache(names: Sequence[str], cache_dir: str | Path | None = None)
         One of the names fits none; then nothing is removed.
     """
     entries = cache_entries(cache_dir)
-    meant = [(name, e) for e in entries for name in names if name in (e.object, e.key[: max(_KEY_AT_LEAST, len(name))])]
+
+    def meant(name: str, entry: CacheEntry) -> bool:
+        return name == entry.object or (len(name) >= _KEY_AT_LEAST and entry.key.startswith(name))
+
     for name in names:
-        if all(name != of for of, _ in meant):
-            raise UsageError(
-                f"cache: expected parts or keys that geomtact cache lists, got {name!r}"
-                + did_you_mean(name, {e.object for e in entries})
-            )
-    return _removed(list(dict.fromkeys(e for _, e in meant)))
+        if not any(meant(name, entry) for entry in entries):
+            near = did_you_mean(name, {entry.object for entry in entries})
+            raise UsageError(f"cache: expected parts or keys that geomtact cache lists, got {name!r}{near}")
+    return _removed([entry for entry in entries if any(meant(name, entry) for name in names)])
 
 
 def _removed(entries: list[CacheEntry]) -> list[CacheEntry]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from geomtact.errors import UsageError, nearest_name
 from geomtact.se3 import Array
 from geomtact.sensing.change import GRID, as_unit_rgb, background_of, change_from, check_size
-from geomtact.sensing.pixels import Mask, blurred, filled, opened, size_of, transformed
+from geomtact.sensing.pixels import Mask, blurred, filled, median_of, opened, size_of, transformed
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 from geomtact.sensing.slope import integrate, of_gradient, slope_field
 
@@ -222,14 +222,14 @@ def _inwards(height: Array, felt: Mask) -> float:
         inward = ((height[felt] - height[felt].mean()) * depth).sum()
     else:
         # a contact that fills the window: the dome's difference from the object is curved downwards over most of it
-        inward = -np.median(cv2.Laplacian(height, -1)[felt])
+        inward = -median_of(cv2.Laplacian(height, -1)[felt])
     return -1.0 if inward < 0 else 1.0
 
 
 def _indentation(height: Array, felt: Mask) -> Array:
     """``height`` (H, W) with its zero set: the gel rests where nothing is felt, pressed in elsewhere."""
     unfelt = float((~felt).mean())
-    rest = np.median(height[~felt]) if unfelt > 0.05 else np.quantile(height, 0.02)
+    rest = median_of(height[~felt]) if unfelt > 0.05 else np.quantile(height, 0.02)
     return np.maximum(height - rest, 0) * felt
 
 

@@ -28,7 +28,7 @@ def size_of(change: Array) -> Array:
     return np.sqrt(np.einsum("hwc,hwc->hw", change, change))
 
 
-def median_of(values: Array) -> float:
+def median_of(values: NDArray[Any]) -> float:
     """The median of ``values`` (n,), none of them NaN, as ``np.median`` tells it in several times the time."""
     below = (len(values) - 1) // 2
     parted = np.partition(values, below)
