@@ -111,6 +111,26 @@ def test_a_study_of_parts_apart_finds_what_it_finds_of_one_after_the_other(few_t
     assert {path.name for path in tmp_path.iterdir()} == {"apart.json", "one.json"}
 
 
+def test_scores_of_parts_apart_are_those_of_one_after_the_other(few_touches, tmp_path, cache_dir):
+    """With the score that the command line names among the parts."""
+
+    def judge(out: Path, *words: str) -> tuple[dict, dict]:
+        options = ["--touches", "3", "--max-poses", "3000", "--cache-dir", str(cache_dir), "--out", str(out)]
+        done = CliRunner().invoke(app, ["evaluate", "scores", *PARTS, "--scores", "l1", "iou", *options, *words])
+        assert done.exit_code == 0, done.output
+        content = json.loads(out.read_text())
+        told = {
+            (part, name, i): {key: value for key, value in outcome.items() if key not in ("ms", "score_ms")}
+            for part, entry in content["parts"].items()
+            for name, score in entry["scores"].items()
+            for i, outcome in enumerate(score["outcomes"])
+        }
+        return told, content["settings"]
+
+    found = judge(tmp_path / "apart.json", "--jobs", "1")
+    assert found == judge(tmp_path / "one.json") and len(found[0]) == 2 * 2 * 3
+
+
 def test_every_study_by_part_names_the_part_that_it_cannot_judge(tmp_path):
     (evaluate,) = app.registered_groups
     judged_apart = [
@@ -118,7 +138,7 @@ def test_every_study_by_part_names_the_part_that_it_cannot_judge(tmp_path):
         for study in evaluate.typer_instance.registered_commands
         if "ray" in inspect.signature(study.callback).parameters
     ]
-    assert len(judged_apart) >= 8
+    assert len(judged_apart) >= 10
     for study in judged_apart:
         out = tmp_path / f"{study}.json"
         done = CliRunner().invoke(app, ["evaluate", study, "pim", "--jobs", "1", "--out", str(out)])

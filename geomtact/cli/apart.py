@@ -81,17 +81,24 @@ def quietly(command: Command, options: Mapping[str, Any]) -> None:
         command(**options)
 
 
-def by_part(judge: Command) -> Command:
+def thesis_parts(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a study, with the parts that are meant where none is named."""
+    from geomtact.evaluation.study import THESIS_PARTS
+
+    return {**options, "parts": options["parts"] or list(THESIS_PARTS)}
+
+
+def by_part(judge: Command, meant: Callable[[Mapping[str, Any]], dict[str, Any]] = thesis_parts) -> Command:
     """The study ``judge``, which takes ``parts`` and ``out``, with the options --jobs and --ray.
 
-    Of each part a task makes a file of its own by the same options; what these hold goes into ``--out``, from where the study
-    goes on as one that was stopped after its last part.
+    Of each part a task makes a file of its own by the same options, with the parts that are ``meant`` by them; what the files
+    hold goes into ``--out``, from where the study goes on as one that was stopped after its last part.
     """
 
     @functools.wraps(judge)
     def run(jobs: int | None = None, ray: str | None = None, **options: Any) -> None:
         if jobs is not None or ray is not None:
-            _judge_apart(judge, options, jobs, ray)
+            _judge_apart(judge, meant(options), jobs, ray)
         judge(**options)
 
     parameters = dict(inspect.signature(judge, eval_str=True).parameters)
@@ -115,13 +122,12 @@ def _judge_apart(judge: Command, options: Mapping[str, Any], jobs: int | None, r
     """
     from geomtact.contact_space.store import default_cache_dir
     from geomtact.errors import UsageError
-    from geomtact.evaluation.study import THESIS_PARTS
 
     out: Path | None = options["out"]
     if out is None:
         raise UsageError("--jobs and --ray need --out, the file in which what is found of the parts comes together")
     schema = judge.__globals__["SCHEMA"]
-    content, parts = study_file.load(out, schema), [str(part) for part in options["parts"] or THESIS_PARTS]
+    content, parts = study_file.load(out, schema), [str(part) for part in options["parts"]]
     before = dict(content["parts"])
     folder = out.absolute().with_name(f"{out.stem}.parts")
     folder.mkdir(parents=True, exist_ok=True)

@@ -20,8 +20,8 @@ from geomtact.cli.evaluate_kitting import judge_kitting
 from geomtact.cli.evaluate_next_touch import judge_next_touch
 from geomtact.cli.evaluate_plot import plot_study
 from geomtact.cli.evaluate_readings import judge_readings
-from geomtact.cli.evaluate_registration import judge_registration
-from geomtact.cli.evaluate_scores import judge_scores
+from geomtact.cli.evaluate_registration import judge_registration, parts_meant
+from geomtact.cli.evaluate_scores import judge_scores, words_meant
 from geomtact.cli.evaluate_stability import judge_stability
 from geomtact.cli.evaluate_thesis import judge_thesis_table
 from geomtact.cli.evaluate_touches import judge_touches
@@ -166,8 +166,8 @@ def _print(figures: dict[tuple[str, str], dict[str, Any]]) -> None:
 evaluate = typer.Typer(no_args_is_help=True, help="Judge the answers on touches with known poses: one study a command.")
 evaluate.command("samples")(one_line_errors(judge_samples))
 evaluate.command("localize")(one_line_errors(by_part(judge_localize)))
-evaluate.command("scores")(one_line_errors(judge_scores))
-evaluate.command("registration")(one_line_errors(judge_registration))
+evaluate.command("scores")(one_line_errors(by_part(judge_scores, words_meant)))
+evaluate.command("registration")(one_line_errors(by_part(judge_registration, parts_meant)))
 evaluate.command("thesis")(one_line_errors(by_part(judge_thesis_table)))
 evaluate.command("touches")(one_line_errors(by_part(judge_touches)))
 evaluate.command("readings")(one_line_errors(judge_readings))

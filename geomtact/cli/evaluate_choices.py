@@ -57,7 +57,7 @@ def judge_choices(
     preparing is known too. Prints tables, and writes all answers to --out.
     """
     from geomtact.contact_space.store import FORMAT
-    from geomtact.evaluation import choices
+    from geomtact.evaluation import choices, study
     from geomtact.report.result import plain
     from geomtact.sensing.sensor import Sensor
 
@@ -65,11 +65,8 @@ def judge_choices(
     ways = choices.ways_of(weights or [], only or [])
     for mesh in study_options.meshes(parts, unit, gel):
         settings = plain(
-            {
-                "object": mesh.name,
-                "object_sha256": mesh.sha256,
-                "sensor": gel.name,
-                "sensor_sha256": gel.sha256,
+            study.whose(mesh, gel)
+            | {
                 "index_format": FORMAT,
                 "touches": touches,
                 "seed": seed,

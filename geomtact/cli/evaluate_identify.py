@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Annotated, Any
 
 import typer
 
 from geomtact.cli import study_file, study_options
 from geomtact.cli.options import CacheDir, Effort, MaxPoses, Seed, Unit
-from geomtact.cli.shell import print_table, tell
+from geomtact.cli.shell import print_table
 from geomtact.cli.simulate import NoiseName
 
 SCHEMA = "geomtact/identification/1"
@@ -54,22 +55,9 @@ def judge_identification(
             "effort": effort.value,
             "seed": seed,
         }
-        name = own.mesh.name
-        done = study_file.earlier(content["parts"].get(name), settings)
-
-        def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
-            study_file.keep(out, content, name, settings=settings, outcomes=outcomes)
-
-        if len(done) < scenes:
-            more = identification.identify_scenes(own, everyone, scenes, seed, strength, effort, first=len(done))
-            rows = ([asdict(told) for told in some] for some in more)
-            done = study_file.collect(done, rows, scenes, f"identifying {name}", keep)
-        keep(done)
-        tell(f"{name}: done")
-    told = {
-        name: [identification.Told(**study_file.numbers(each)) for some in part["outcomes"] for each in some]
-        for name, part in content["parts"].items()
-    }
+        more = partial(identification.identify_scenes, own, everyone, scenes, seed, strength, effort)
+        study_file.judged(out, content, settings, scenes, "identifying", more)
+    told = {name: study_file.outcomes(part, identification.Told) for name, part in content["parts"].items()}
     content["figures"] = identification.summarise(told)
     study_file.save(out, content)
     _print(content["figures"])

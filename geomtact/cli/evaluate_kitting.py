@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from typing import Annotated, Any
 
 import typer
 
 from geomtact.cli import study_file, study_options
 from geomtact.cli.options import CacheDir, Seed, Unit
-from geomtact.cli.shell import print_table, tell
+from geomtact.cli.shell import print_table
 from geomtact.cli.simulate import NoiseName
 
 SCHEMA = "geomtact/kitting/1"
@@ -46,19 +47,8 @@ def judge_kitting(
             "touches": kitting_study.TOUCHES,
             "seed": seed,
         }
-        name = localizer.mesh.name
-        done = study_file.earlier(content["parts"].get(name), settings, kitting_study.Outcome)
-
-        def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
-            figures = kitting_study.summarise(outcomes)
-            flat = [asdict(outcome) for outcome in outcomes]
-            study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=flat)
-
-        if len(done) < runs:
-            more = kitting_study.run_cell(localizer, runs, seed, strength, first=len(done))
-            done = study_file.collect(done, more, runs, f"kitting {name}", keep)
-        keep(done)
-        tell(f"{name}: done")
+        more = partial(kitting_study.run_cell, localizer, runs, seed, strength)
+        study_file.judged(out, content, settings, runs, "kitting", more, kitting_study.Outcome, kitting_study.summarise)
     _print(content["parts"])
     study_file.plot(content, plot)
 

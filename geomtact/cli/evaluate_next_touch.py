@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from geomtact.cli import study_file, study_options
 from geomtact.cli.options import CacheDir, Seed, Unit
-from geomtact.cli.shell import print_table, tell
+from geomtact.cli.shell import print_table
 from geomtact.cli.simulate import NoiseName
 
 if TYPE_CHECKING:
@@ -53,18 +54,10 @@ def judge_next_touch(
             "sure": next_touch_study.SURE,
             "most": next_touch_study.MOST,
         }
-        name = localizer.mesh.name
-        done = study_file.earlier(content["parts"].get(name), settings)
-
-        def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
-            flat = [next_touch_study.Run(**study_file.numbers(run)) for pair in outcomes for run in pair]
-            figures = next_touch_study.summarise(flat)
-            study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=outcomes)
-
-        more = next_touch_study.touch_until_sure(localizer, runs, seed, strength, first=len(done))
-        rows = ([asdict(run) for run in pair] for pair in more)
-        keep(study_file.collect(done, rows, runs, f"touching {name}", keep))
-        tell(f"{name}: done")
+        more = partial(next_touch_study.touch_until_sure, localizer, runs, seed, strength)
+        study_file.judged(
+            out, content, settings, runs, "touching", more, next_touch_study.Run, next_touch_study.summarise
+        )
     _print(content["parts"])
     study_file.plot(content, plot)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +10,7 @@ import typer
 
 from geomtact.cli import study_file, study_options
 from geomtact.cli.options import Seed, Unit
-from geomtact.cli.shell import print_table, tell
+from geomtact.cli.shell import print_table
 from geomtact.cli.simulate import NoiseName
 from geomtact.errors import InputError
 
@@ -47,7 +47,7 @@ def judge_registration(
     from geomtact.contact_space.build import choose_resolution
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.contact_space.space import ContactSpace
-    from geomtact.evaluation import registration
+    from geomtact.evaluation import registration, study
     from geomtact.evaluation.peers import peers
     from geomtact.evaluation.shapes import SHAPES
     from geomtact.evaluation.study import THESIS_PARTS
@@ -76,10 +76,7 @@ def judge_registration(
         ) -> dict[str, registration.Method]:
             return registration.own_methods(space, surface, spread) | peers(surface, spread)
 
-        settings = {
-            "object_sha256": mesh.sha256,
-            "sensor": pressed.name,
-            "sensor_sha256": pressed.sha256,
+        settings = study.whose(mesh, pressed) | {
             "touches": touches,
             "noise": {"name": noise.value, **asdict(strength)},
             "elastic": FELT[felt],
@@ -89,18 +86,14 @@ def judge_registration(
             "success_mm": registration.SUCCESS_MM,
             "peers": versions("small_gicp", "probreg"),
         }
-        done = study_file.earlier(content["parts"].get(mesh.name), settings)
 
-        def keep(outcomes: list, name: str = mesh.name, settings: Mapping[str, Any] = settings) -> None:
-            study_file.keep(out, content, name, settings=settings, outcomes=outcomes)
-
-        if len(done) < touches:
+        def more(
+            first: int, space: ContactSpace = space, methods: Any = methods, grid: registration.Grid = grid
+        ) -> Iterator[Any]:
             pressed_at = random_touches(space, touches, seed, FELT[felt], strength)
-            more = registration.trials(space, pressed_at, methods, grid, strength, seed, first=len(done))
-            outcomes = ([asdict(trial) for trial in some] for some in more)
-            done = study_file.collect(done, outcomes, touches, f"registering {mesh.name}", keep)
-        keep(done)
-        tell(f"{mesh.name}: done")
+            return registration.trials(space, pressed_at, methods, grid, strength, seed, first=first)
+
+        study_file.judged(out, content, settings, touches, "registering", more)
     trials = [registration.Trial(**t) for part in content["parts"].values() for some in part["outcomes"] for t in some]
     half_pixel = 0.5 * float(pressed.pixel_area(pressed.along(registration.MASK))) ** 0.5
     content["figures"] = plain(registration.summarise(trials, 1e3 * half_pixel))
@@ -108,6 +101,14 @@ def judge_registration(
     _print(content["figures"])
     if any(content["figures"]["success"].values()):
         study_file.plot(content, plot)
+
+
+def parts_meant(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options, with the parts and shapes that are meant where none is named."""
+    from geomtact.evaluation.shapes import SHAPES
+    from geomtact.evaluation.study import THESIS_PARTS
+
+    return {**options, "parts": options["parts"] or [*THESIS_PARTS, *SHAPES]}
 
 
 def _mesh(part: str, unit: str | None, sensor: Sensor) -> Mesh:

@@ -77,6 +77,12 @@ def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], 
     return parts or list(THESIS_PARTS), list(dict.fromkeys([*scores, *more])) or every
 
 
+def words_meant(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options, with the parts and the scores that :func:`sort_words` makes of them."""
+    parts, scores = sort_words(options["parts"] or [], options["scores"] or [])
+    return {**options, "parts": parts, "scores": scores}
+
+
 def _is_score(name: str, known: Sequence[str]) -> bool:
     return name in known or Path(name).suffix == ".safetensors"
 

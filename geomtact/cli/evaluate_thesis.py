@@ -46,16 +46,13 @@ def judge_thesis_table(
     first touches from each side leave open, whoever reads them.
     """
     from geomtact.contact_space.store import FORMAT
+    from geomtact.evaluation import study
     from geomtact.evaluation.touches import FELT
     from geomtact.sensing.sensor import Sensor
 
     content, gel, strength = study_file.load(out, SCHEMA), Sensor.load(sensor), study_options.noise_named(noise)
     for mesh in study_options.meshes(parts, unit, gel):
-        settings = {
-            "object": mesh.name,
-            "object_sha256": mesh.sha256,
-            "sensor": gel.name,
-            "sensor_sha256": gel.sha256,
+        settings = study.whose(mesh, gel) | {
             "index_format": FORMAT,
             "max_poses": _POSES,
             "sides": sides,

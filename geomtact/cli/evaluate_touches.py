@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from geomtact.cli import study_file, study_options
 from geomtact.cli.options import CacheDir, Effort, Seed, Unit
-from geomtact.cli.shell import print_table, tell
+from geomtact.cli.shell import print_table
 from geomtact.cli.simulate import NoiseName
+
+if TYPE_CHECKING:
+    from geomtact.inference.localizer import Localizer
 
 SCHEMA = "geomtact/touches/1"
 
@@ -47,22 +50,14 @@ def judge_touches(
             "effort": effort.value,
             "seed": seed,
         }
-        name = localizer.mesh.name
-        done = study_file.earlier(content["parts"].get(name), settings)
 
-        def keep(outcomes: list, name: str = name, settings: Mapping[str, Any] = settings) -> None:
-            flat = [sensors_study.FusedOutcome(**study_file.numbers(o)) for some in outcomes for o in some]
-            figures = sensors_study.summarise(flat)
-            study_file.keep(out, content, name, settings=settings, figures=figures, outcomes=outcomes)
-
-        if len(done) < scenes:
+        def more(first: int, localizer: Localizer = localizer) -> Iterator[Any]:
             made = sensors_study.make_scenes(localizer, scenes, seed, strength, FELT[felt])
-            more = sensors_study.fuse_scenes(localizer, made, effort, seed, first=len(done))
-            done = study_file.collect(
-                done, ([asdict(o) for o in some] for some in more), scenes, f"fusing {name}", keep
-            )
-        keep(done)
-        tell(f"{name}: done")
+            return sensors_study.fuse_scenes(localizer, made, effort, seed, first)
+
+        study_file.judged(
+            out, content, settings, scenes, "fusing", more, sensors_study.FusedOutcome, sensors_study.summarise
+        )
     _print(content["parts"])
     study_file.plot(content, plot)
 

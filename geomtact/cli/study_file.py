@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from geomtact.cli.shell import progress_bar
+from geomtact.cli.shell import progress_bar, tell
 
 _SAVE_EVERY = 10  # touches
 _LOGS = ("gain", "gains", "log_probability")  # fields of outcomes that are logs of probabilities
@@ -74,8 +75,9 @@ def _alike(held: Any, wanted: Any) -> bool:
 
 
 def outcomes(entry: dict[str, Any], kind: Callable[..., Any]) -> list:
-    """The outcomes of an entry, each a ``kind``."""
-    return [kind(**numbers(outcome)) for outcome in entry["outcomes"]]
+    """The outcomes of an entry, each a ``kind``, those that were made together one after the other."""
+    rows = (row if isinstance(row, list) else [row] for row in entry["outcomes"])
+    return [kind(**numbers(each)) for row in rows for each in row]
 
 
 def numbers(outcome: Mapping[str, Any]) -> dict[str, Any]:
@@ -101,6 +103,39 @@ def collect(done: list, more: Iterable, total: int, title: str, keep: Callable[[
             if len(done) % _SAVE_EVERY == 0:
                 keep(done)
     return done
+
+
+def judged(
+    out: Path | None,
+    content: dict[str, Any],
+    settings: Mapping[str, Any],
+    total: int,
+    doing: str,
+    more: Callable[[int], Iterable[Any]],
+    kind: Callable[..., Any] | None = None,
+    summarise: Callable[[list], Any] | None = None,
+) -> None:
+    """Bring the outcomes of the part that ``settings`` describe to ``total``, in ``content`` and in the file.
+
+    ``more`` makes those from a number on, each a dataclass ``kind`` or several of them; what ``summarise`` makes of all goes
+    beside them.
+    """
+    name = settings["object"]
+    done = earlier(content["parts"].get(name), dict(settings))
+
+    def put(rows: list) -> None:
+        figures = {"figures": summarise(outcomes({"outcomes": rows}, kind))} if kind and summarise else {}
+        keep(out, content, name, settings=settings, **figures, outcomes=rows)
+
+    if len(done) < total:
+        collect(done, map(_flat, more(len(done))), total, f"{doing} {name}", put)
+    put(done)
+    tell(f"{name}: done")
+
+
+def _flat(outcome: Any) -> Any:
+    """A dataclass as a mapping, each of several as one."""
+    return [_flat(each) for each in outcome] if isinstance(outcome, list | tuple) else asdict(outcome)
 
 
 def keep(out: Path | None, content: dict[str, Any], part: str, **entry: Any) -> None:

@@ -15,10 +15,12 @@ from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.evaluation.pose_error import coverage, mssd, random_add, share_with_interval
 from geomtact.evaluation.touches import Touch, random_touches
 from geomtact.geometry.distance import PoseDistance
+from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
+from geomtact.sensing.sensor import Sensor
 
 THESIS_PARTS = ("pin", "damping_pin", "head", "elbow_pipe")
 NOMINAL = (0.5, 0.8, 0.9, 0.95)
@@ -175,14 +177,20 @@ def expected_random_add(localizer: Localizer) -> float:
     return 1e3 * random_add(PoseDistance(localizer.mesh), localizer.space)
 
 
+def whose(mesh: Mesh, sensor: Sensor) -> dict[str, Any]:
+    """Whose touches they are: the part's and the sensor's names and hashes."""
+    return {
+        "object": mesh.name,
+        "object_sha256": mesh.sha256,
+        "sensor": sensor.name,
+        "sensor_sha256": sensor.sha256,
+    }
+
+
 def describe(localizer: Localizer) -> dict[str, Any]:
     """What the figures of a localizer depend on."""
     index, calibration = localizer.index, localizer.scorer.calibration
-    return {
-        "object": localizer.mesh.name,
-        "object_sha256": localizer.mesh.sha256,
-        "sensor": localizer.sensor.name,
-        "sensor_sha256": localizer.sensor.sha256,
+    return whose(localizer.mesh, localizer.sensor) | {
         "index": index.key,
         "poses": len(index),
         "grid": index.resolution.to_json(),

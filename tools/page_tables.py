@@ -1,0 +1,316 @@
+"""Fills the tables of the documentation from the files of the studies, in place:
+
+    python tools/page_tables.py
+
+A cell that no file holds, as a name in words, stays what it is, and what is bold stays bold.
+"""
+
+import json
+import re
+from functools import cache, partial
+from pathlib import Path
+
+from geomtact.cli.study_file import inside
+from geomtact.evaluation.shapes import SHAPES
+from geomtact.report.track_plot import LABELS
+
+DOCS = Path(__file__).parents[1] / "docs"
+KEPT = None  # a cell that stays what it is
+PARTS = {"pin": "pin", "damping_pin": "damping pin", "head": "head", "elbow_pipe": "elbow pipe"}
+
+
+@cache
+def study(name):
+    """What the file of a study holds."""
+    return json.loads((DOCS / "results" / f"{name}.json").read_text("utf-8"))
+
+
+def filled(text, *values, **fields):
+    """A page's text with what a study found in the place of its figures."""
+    return re.sub(" ?%", " %", text.format(*values, **fields))
+
+
+def cells(row, *values, **fields):
+    """Those of a row, :func:`filled`."""
+    return [cell.strip() for cell in filled(row, *values, **fields).split("|")]
+
+
+def cut(x, decimals=1, whole=10):
+    """A number with ``decimals``, from ``whole`` on with none."""
+    return f"{x:.{decimals if x < whole else 0}f}"
+
+
+def between(three, form=".2f"):
+    """A value and its interval."""
+    return "{:{form}} ({:{form}} to {:{form}})".format(*three, form=form)
+
+
+def regions(f):
+    """Percentages of truths inside the region of each mass."""
+    return " / ".join(f"{100 * c['share']:.0f}" for c in f["coverage"])
+
+
+def contacts(content):
+    row = "{} | {} | {} | {iou_median:.3f} ({iou_interval[0]:.3f} to {iou_interval[1]:.3f}) | {iou_least:.2f} | "
+    for key, name in {"fots": "FOTS", "objectfolder": "ObjectFolder", "gelslam": "GelSight Mini"}.items():
+        for way, f in content["parts"][key]["figures"].items():
+            factors = ", ".join(f"{factor:.2f}" for factor in f["factors"])
+            first = f"{name} ({f['n']})" * (way == "auto")
+            told = "auto, the default" if way == "auto" else way
+            yield cells(row + "{centre_median:.3f}", first, told, factors, **f)
+
+
+def balls(content):
+    row = "{} | {ball_mm:.3f} mm | {n} | {right:.0%} | {} | {whole} | {off_mm_median:.2f} mm | {:.0%} | "
+    for key, camera in {"parallel rays": "parallel rays", "camera at 20 mm": "at 20 mm"}.items():
+        for k, f in enumerate(content["parts"][f"balls, {key}"]["figures"]):
+            told = between(f["nats"], ".1f"), f["within_0.3_mm"]
+            yield cells(row + "{off_mm_largest:.2f} mm", camera * (k == 0), *told, **f)
+
+
+def modelled(part, content):
+    one, three, side = (scene["modelled"] for scene in content["parts"][part]["scenes"].values())
+    for name in one | side:
+        both = one.get(name), (three | side).get(name)
+        adds = [f and ("0.00" if not any(f["adds"]) else between(f["adds"], "+.2f")) for f in both]
+        times = [f and f"x {cut(f['time_ratio'])}" for f in both]
+        yield [name, *(told or "" for told in (adds[0], times[0], adds[1], times[1]))]
+
+
+def ways(part, content):
+    part, gain = content["parts"][part], "{gain_mean:.2f} ± {gain_standard_error:.2f}"
+    for way, f in part["scenes"]["one touch"]["figures"].items():
+        about, three = part["ways"][way], part["scenes"]["three sensors"]["figures"].get(way)
+        if about["choice"] == "calibration" or way == "encoder":  # the default by another name
+            continue
+        name = {"grid": f"{about['poses']:,} poses", "score": f"`{way}`"}.get(about["choice"], KEPT)
+        one = cells(gain + " | {}", cut(f["ms_quantiles"][1]), **f)
+        more = three and cells(gain + " | {mssd_mm_median:.1f} | {}", cut(three["ms_quantiles"][1]), **three)
+        ready = "" if about["prepare_s"] is None else f"{about['prepare_s']:.0f}"
+        yield [KEPT if way == "the thesis's network" else name, *one, *(more or ["", "", ""]), ready]
+
+
+def sides(content):
+    row = "{gain_mean:.2f} / {mssd_mm_median:.0f} / {ms_quantiles[1]:.0f}"
+    for way in ("balanced", "within 30 degrees", "this side alone", "this side, exact"):
+        scenes = [content["parts"][part]["scenes"]["known side"] for part in PARTS]
+        yield [KEPT, *(row.format(**scene["figures"][way]) for scene in scenes)]
+
+
+def touches(content):
+    row = "{} | {sensors} | {gain_mean:.1f} | {} | {claimed_mean:.1f} | {} % | {mssd_mm_median:.1f} mm | "
+    row += "{add_s_mm_median:.1f} mm | {add10_mm_median:.1f} mm | {probability_median:.0%}"
+    for name, part in content["parts"].items():
+        for f in part["figures"]:
+            yield cells(row, name, between(f["more"], "+.1f") if "more" in f else "", regions(f), **f)
+
+
+def followed(content):
+    more = "{more[0]:+.2f} ({more[1]:.2f} to {more[2]:.2f}) | {better:.0%}"
+    held = {"filter": (more + " of {n}", "{lost} of {stretches}"), "frames": ("|", "")}
+    for way, name in LABELS.items():
+        compared, lost = held.get(way, (more, held["filter"][1]))
+        row = f"{{}} | {{gain_mean:.2f}} | {compared} | {{claimed_mean:.2f}} | {{}} | {lost}"
+        yield cells(row, name, regions(content["figures"][way]), **content["figures"] | content["figures"][way])
+
+
+def until_sure(content):
+    row = "{} ({best[n]}{}) | {best[touches_mean]:.1f} | {random[touches_mean]:.1f} | {} | {:.0f} / {random[sure]:.0%}"
+    for name, part in content["parts"].items():
+        f = part["figures"]
+        told = name, " runs" * (name == "pin"), between(f["ratio"]), 100 * f["best"]["sure"]
+        yield cells(row + " | {best[wrong]:.0%} / {random[wrong]:.0%}", *told, **f)
+
+
+def placed(content):
+    for name, part in content["parts"].items():
+        at = {(f["clearance_mm"], f["touches"]): f for f in part["figures"]}
+        told = {k: "{right} / {wrong} / {refused}".format(**f) for k, f in at.items()}
+        everyone = [told[k] for k in ((1, 1), (1, 2), (1, 3), (1, 4), (2, 4), (4, 4))]
+        yield [name, str(at[1, 1]["n"]), *everyone, str(at[0.25, 4]["n"]), told[0.25, 4], told[0.5, 4]]
+
+
+def identified(content):
+    row = "{touches} | {} | {claimed:.0%} | {log_probability_mean:.2f} | {sure_and_wrong:.0%} | {} | {}"
+    for f in content["figures"]:
+        said = ([100 * x for x in f[key]] for key in ("right", "foreign", "alarmed"))
+        yield cells(row, *("{:.0f} % ({:.0f} to {:.0f})".format(*three) for three in said), **f)
+
+
+def from_everywhere(content):
+    for method, f in content["figures"]["methods"].items():
+        drift, believes = f["drift_mm_median"], "always" if f["converged"] > 0.99 else "{converged:.0%}"
+        rest = f"{cut(drift, 2 if drift < 1 else 1)} mm | {cut(f['ms_median'], 1, 100)} ms"
+        believes, rest = ("", "0 |") if method == "none" else (believes, rest)
+        yield [KEPT, *cells(f"{{success:.0%}} | {believes} | {cut(f['error_mm_median'], 2)} mm | {rest}", **f)]
+
+
+ERRORS = "{error_mm_median:.2f} mm | {of_start:.2f} | {worse:.0%}"
+STATED = "{coverage[0.9]:.0%} | {agreement:.0%}"
+
+
+def from_grid(content):
+    for method, f in content["figures"]["from_grid"].items():
+        if method not in ("none", "open3d point to plane", "probreg point to plane"):
+            yield [KEPT, *cells(f"{ERRORS} | {STATED if f['stated'] else '|'}", **f)]
+
+
+def by_contact(content):
+    held, drifts = content["figures"]["from_grid_by_contact"], content["figures"]["drift"]
+    for kind in sorted(held, key=lambda kind: kind not in SHAPES):
+        own, peer = (drifts[kind][method]["median_mm"] for method in ("filterreg", "small_gicp point to plane"))
+        row = f"{{}} | {{n}} | {ERRORS} | {{stated}} | {STATED} | {{:.2f}} mm | {{}} mm"
+        yield cells(row, kind, own, cut(peer), **held[kind]["filterreg"])
+
+
+def cost(content):
+    made, warm, start = content["prepare"], content["localize_warm"], content["start"]
+
+    def took(f, form, unit="ms"):
+        return between((f["median"], f["10 %"], f["90 %"]), form).replace(" (", f" {unit} (")
+
+    stages = (warm["ms"][f"balanced, {stage}"]["median"] for stage in ("score", "posterior", "refine"))
+    measured = [
+        f"{content['rays']['per_second_1_threads'] / 1e6:.1f} M",
+        f"{made['index_s']:.1f} s, {round(made['poses_per_second'], -3):,.0f} poses a second",
+        f"{made['calibration_s']:.0f} s",
+        f"{made['prepare_s']:.0f} s",
+        f"{made['peak_bytes'] / 1e9:.2f} GB",
+        f"{made['index_bytes_per_pose']:.0f} bytes a pose, and 64 of the network",
+        took(warm["ms"]["fast"], ".1f"),
+        took(warm["ms"]["balanced"], ".0f"),
+        "{:.0f} / {:.0f} / {:.0f} ms".format(*stages),
+        took(warm["ms"]["exact"], ".0f"),
+        took(warm["ms"]["the thesis's query"], ".0f"),
+        f"{warm['balanced_over_thesis_query']:.2f}",
+        took(warm["ms"]["balanced, modes after it"], ".0f"),
+        f"{start['import_geomtact_s']['median']:.2f} s",
+        f"{start['help_s']['median']:.2f} s",
+        took(start["localize_s"], ".1f", "s"),
+        took(start["localize_with_report_s"], ".1f", "s"),
+    ]
+    return [[KEPT, cell, KEPT] for cell in measured]
+
+
+def retrieval(content):
+    columns = ("largest", "geomtact, all", "range_search", "by search", "geomtact, ten", "Flat.*ten", "fp16", "8 bit")
+    for score, threads in ((score, threads) for score in ("encoder", "cosine", "l1") for threads in (1, 2)):
+        timed = [row for row in content["retrieval"] if (row["score"], row["threads"]) == (score, threads)]
+        told = []
+        for column in columns:
+            row = next((row for row in timed if re.search(column, row["method"])), None)
+            rate = " ({gb_per_s:.1f})" if column not in ("by search", "geomtact, ten") else ""
+            told.append(row and (cut(row["ms"]["median"], 1, 100) + rate).format(**row))
+        yield [f"`{score}`", str(threads), *(cell or "" for cell in told)]
+
+
+def simulation(content):
+    for wide, threads in ((wide, threads) for wide in (427, 32) for threads in (1, 2)):
+        some = [r for r in content["simulation"] if (r["pixels"][0], r["threads"]) == (wide, threads)]
+        told = [f"{r['ms_per_image']['median']:.2f} ({r['rays_per_s'] / 1e6:.1f})" for r in some]
+        yield ["{} x {}".format(*some[0]["pixels"]), str(threads), *told]
+
+
+def scores(content):
+    gain, parts = "{gain_mean:.2f} ± {gain_standard_error:.2f}", ("pin", "damping_pin", "elbow_pipe", "head")
+    mean = {name: entry["figures"]["all"] for name, entry in content["overall"].items()}
+    for name in sorted(mean, key=lambda name: (-mean[name]["gain_mean"], name)):
+        own = [gain.format(**content["parts"][part]["scores"][name]["figures"]["all"]) for part in parts]
+        size = content["overall"][name]["bytes_per_pose"]
+        yield [f"`{name}`", *own, *cells("{gain_mean:.2f} | {} | {:.0f}", regions(mean[name]), size, **mean[name])]
+
+
+def kinds(content, flat):
+    for kind, f in (content["classes"]["balanced"] | flat["classes"]["balanced"]).items():
+        yield [*cells("{} | {n} | {gain_mean:.2f}", kind, **f), *inside(f)]
+
+
+def answers(content):
+    row = "{} | {}, {n} | {gain_mean:.2f} ± {gain_standard_error:.2f} | {claimed_mean:.2f}"
+    for name, part in content["parts"].items():
+        for felt in ("geometric", "elastic", "all"):
+            yield [*cells(row, name, felt, **part["figures"][felt]), *inside(part["figures"][felt])]
+
+
+def sweeps(content):
+    for name, sweep in content["together"].items():
+        levels, held = [at["level"] for at in sweep["levels"]], sweep["inside"]
+        begin = f"{held[0]:g}" if held[0] != levels[0] else "down" if levels[0] > levels[-1] else "up"
+        promised = "all" if held == levels else "0" if held == [0] else f"{begin} to {held[-1]:g}"
+        told = f"{levels[0]:g} to {levels[-1]:g}" if name == "kind" else ", ".join(f"{level:g}" for level in levels)
+        yield [f"`{name}`", KEPT, told, promised]
+
+
+TABLES = [
+    ("readings", "| set |", contacts, "readings"),
+    ("readings", "| camera |", balls, "readings"),
+    *(("no-more-than-needed", f"The {PARTS[part]}:", partial(modelled, part), "choices") for part in PARTS),
+    *(("speed-accuracy", f"The {PARTS[part]}:", partial(ways, part), "choices") for part in PARTS),
+    ("speed-accuracy", "| gain [nats] /", sides, "choices"),
+    ("several-sensors", "| part |", touches, "touches"),
+    ("tracking", "| method |", followed, "track"),
+    ("next-touch", "| part |", until_sure, "next_touch"),
+    ("kitting", "| part |", placed, "kitting"),
+    ("which-part", "| touches |", identified, "identification"),
+    ("registration", "| method | success", from_everywhere, "registration"),
+    ("registration", "| method | error", from_grid, "registration"),
+    ("registration", "| contact |", by_contact, "registration"),
+    ("benchmark", "| what |", cost, "benchmark"),
+    ("benchmark", "| score | threads", retrieval, "peers"),
+    ("benchmark", "| pixels |", simulation, "peers"),
+    ("benchmark", "| score | pin", scores, "scores"),
+    ("benchmark", "| contact |", kinds, "classes", "flat"),
+    ("benchmark", "| part |", answers, "localize"),
+    ("stability", "| sweep |", sweeps, "stability"),
+    ("stability", "| part |", answers, "housing"),
+]
+
+
+def with_table(text, above, rows):
+    """A page's text with ``rows`` in the first table at or below the words ``above``."""
+    start = text.rindex("\n", 0, text.index(above)) + 1
+    found = re.compile(r"(?:^ *\|.*\n)+", re.MULTILINE).search(text, start)
+    heading, rule, *old = found[0].splitlines()
+    new = list(rows)
+    if len(new) != len(old) and any(KEPT in row for row in new):
+        raise SystemExit(
+            f"{above}: {len(new)} rows found, {len(old)} on the page; write those that begin with words by hand"
+        )
+    old = [*old, *[""] * len(new)][: len(new)]
+    indent = heading[: heading.index("|")]
+    lines = [heading, rule, *(_line(indent, *pair) for pair in zip(old, new, strict=True))]
+    return text[: found.start()] + "\n".join(lines) + "\n" + text[found.end() :]
+
+
+def _line(indent, old, row):
+    before = [cell.strip() for cell in old.strip()[1:-1].split("|")]
+    before += [""] * (len(row) - len(before))
+    told = (was if cell is KEPT else _like(was, cell) for was, cell in zip(before, row, strict=True))
+    return f"{indent}| {' | '.join(told)} |"
+
+
+def _like(was, cell):
+    """A cell in bold where it was, and where there is anything in it."""
+    return f"**{cell}**" if was.startswith("**") and cell else cell
+
+
+def with_tables(page, text):
+    """The text of a page, its tables as the studies have it."""
+    for name, above, table, *studies in TABLES:
+        if name == page:
+            text = with_table(text, above, table(*map(study, studies)))
+    return text
+
+
+def main():
+    for page in dict.fromkeys(name for name, *_ in TABLES):
+        path = DOCS / f"{page}.md"
+        before = path.read_text("utf-8")
+        after = with_tables(page, before)
+        if after != before:
+            path.write_text(after, "utf-8")
+        print(f"docs/{path.name}: {'as it was' if after == before else 'filled'}")
+
+
+if __name__ == "__main__":
+    main()
