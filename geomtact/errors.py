@@ -44,8 +44,15 @@ class CacheError(InputError):
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``"; did you mean 'x'?"`` for the known name nearest to ``name``, ``""`` if none is near."""
-    close = difflib.get_close_matches(name, sorted(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    close = nearest(name, known)
+    return f"; did you mean {close!r}?" if close else ""
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The known name nearest to ``name``, in upper or lower case; None if none is near."""
+    lower = {each.lower(): each for each in sorted(known, reverse=True)}
+    close = difflib.get_close_matches(name.lower(), sorted(lower), n=1)
+    return lower[close[0]] if close else None
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

@@ -383,7 +383,7 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
     args = ["localize", *paths, "--object", "connector_plug", "--sensor", "gelslim"]
     done = CliRunner().invoke(app, [*args, "--sensor-poses", str(poses), "--json", "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
-    assert "0.png: was made of gear, as its metadata says, and is localized on connector_plug" in done.stderr
+    assert "0.png was made of gear, as its metadata says, and is localized on connector_plug" in done.stderr
     content = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))
     assert content["frame"] == "world" and len(content["settings"]["T_world_sensor"]) == 2 and content["modes"]
     for text, words in [

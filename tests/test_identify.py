@@ -142,6 +142,8 @@ def test_a_part_that_no_pose_of_agrees_is_out(drawer, monkeypatch):
 def test_weights_that_do_not_fit_are_refused(drawer, weights):
     with pytest.raises(UsageError, match="identify: expected"):
         identify(drawer, touches(drawer[0])[0], weights, kind="mask", effort="fast")
+    with pytest.raises(UsageError, match="identify: expected a localizer for each part, got int"):
+        identify(3, None)
     with pytest.raises(UsageError, match="expected parts"):
         identify([], None)
 

@@ -548,3 +548,18 @@ def test_a_uniform_prior_of_another_grid_rules_nothing_out(plug, cache_dir):
     held = plug.index.possible
     assert np.isfinite(mass[held]).all()
     assert np.abs(mass - plug.index.log_weight)[held].max() < 0.01
+
+
+def test_a_prior_of_a_known_face_is_told_about_that_face_on_a_coarser_grid_and_back(plug, cache_dir, rng):
+    face = open_index(plug.mesh, plug.sensor, [((0, 0, 1), 0.0)], 6_000, cache_dir, None)
+    everywhere, there = (Posterior(each, each.possible, each.log_possible_weight) for each in (plug.index, face))
+    mass = np.exp(prior_log_mass(plug.index, there, np.eye(4), "sensor").astype(float))
+    T, depth = face.space.sample(300, rng)
+    assert (mass[plug.index.lookup(T, depth)] > 0).mean() > 0.9
+    turned = approach_of(plug.index.poses(np.arange(len(plug.index)))[:, :3, :3])[:, 2] < np.cos(0.6)
+    assert mass.sum() == pytest.approx(1, abs=1e-5) and turned.any() and mass[turned].sum() == 0
+    back = prior_log_mass(face, everywhere, np.eye(4), "sensor")
+    assert np.abs(back[face.possible] - face.log_weight[face.possible]).max() < 0.01
+    nothing = plug.localize(np.zeros(plug.sensor.image_size_px[::-1], bool))
+    with pytest.raises(InputError, match="does not touch the sensor"):
+        prior_log_mass(face, nothing, np.eye(4), "sensor")

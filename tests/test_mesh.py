@@ -138,13 +138,15 @@ def test_unit_is_never_guessed(tmp_path):
 
 def test_unknown_names_and_files(tmp_path):
     refused("did you mean 'elbow_pipe'", "elbow-pipe")
+    refused("did you mean 'pin'", "PIN")
     refused("no part named 'zzz'", "zzz")
     refused("no such file; give", tmp_path / "nothing.stl", "mm")
     save(box(), tmp_path / "part.stl")
     refused(r"prat.stl: no such file; did you mean 'part.stl'\?$", tmp_path / "prat.stl")
+    refused("no such file; give the path", tmp_path / "open.stl")
     (tmp_path / "a.step").write_text("ISO-10303-21;")
     refused("make a mesh of it with 'python tools/prep_mesh.py a.step'", tmp_path / "a.step", "mm")
-    refused("make a mesh of it", "part.stp", "mm")
+    refused("no such file; give", tmp_path / "b.stp", "mm")
     (tmp_path / "a.txt").write_text("x")
     refused("not a mesh format", tmp_path / "a.txt", "mm")
 
@@ -186,6 +188,21 @@ def test_points_nan_and_open_surfaces(tmp_path):
     refused("inside out", save(mesh, tmp_path / "inverted.stl"), "mm")
     sheet = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [0, 9, 0]], [[0, 1, 2], [0, 2, 1]], process=False)
     refused("no volume", save(sheet, tmp_path / "sheet.ply"), "mm")
+
+
+def test_a_file_that_was_cut_short_says_so(tmp_path):
+    whole = save(box(), tmp_path / "whole.stl").read_bytes()
+    cut = tmp_path / "cut.stl"
+    cut.write_bytes(whole[: 84 + 50 * 5])
+    refused(f"cut short: expected {len(whole)} bytes .*, found 334", cut, "mm")
+
+
+def test_inches_for_millimetres_are_refused(tmp_path):
+    sensor = Sensor.load("gelsight-mini")
+    part = save(box((60, 40, 30)), tmp_path / "part.stl")
+    assert load_mesh(part, "mm", sensor=sensor).diameter < 0.1
+    refused("unit is likely wrong", part, "inch", sensor=sensor)
+    refused("expected a geomtact.Sensor, got 'gelsight-mini'", part, "mm", sensor="gelsight-mini")
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

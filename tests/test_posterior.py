@@ -470,3 +470,10 @@ def test_a_cell_without_likelihood_keeps_its_mass(ball, a_touch):
     assert after.log_prob[rows[0]] == before.log_prob[rows[0]]
     p, q = (np.exp(each.log_prob[rows[1:]].astype(float)).sum() for each in (before, after))
     assert q == pytest.approx(p, rel=1e-5)
+
+
+def test_a_file_that_cannot_be_written_is_named_as_it_was_given(plug, posteriors, tmp_path):
+    for path in (tmp_path, tmp_path / "none" / "p.npz"):
+        with pytest.raises(InputError, match=f"^{path}: cannot be written"):
+            posteriors(plug).save(path)
+    assert list(tmp_path.iterdir()) == []

@@ -27,7 +27,7 @@ from geomtact.cli.evaluate_thesis import judge_thesis_table
 from geomtact.cli.evaluate_touches import judge_touches
 from geomtact.cli.evaluate_track import judge_track
 from geomtact.cli.evaluate_triplets import judge_triplets
-from geomtact.cli.options import CacheDir, Effort, Seed, Unit
+from geomtact.cli.options import CacheDir, Effort, MaxPoses, Seed, Unit
 from geomtact.cli.shell import one_line_errors, print_table, tell
 from geomtact.cli.simulate import NoiseName
 
@@ -83,6 +83,7 @@ def judge_localize(
     noise: study_options.NoiseLevel = NoiseName.moderate,
     effort: study_options.EffortLevel = Effort.balanced,
     seed: Seed = 1,
+    max_poses: MaxPoses = None,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
@@ -92,7 +93,7 @@ def judge_localize(
     Half of the touches are felt by a rigid threshold, half by an elastic gel. Prints the figures apart and together, and
     writes them and every outcome to --out.
     """
-    study_file.plot(judge(parts, unit, sensor, touches, noise, effort, seed, out, cache_dir), plot)
+    study_file.plot(judge(parts, unit, sensor, touches, noise, effort, seed, max_poses, out, cache_dir), plot)
 
 
 def judge(
@@ -103,6 +104,7 @@ def judge(
     noise: str,
     effort: str,
     seed: int,
+    max_poses: int | None = None,
     out: Path | None = None,
     cache_dir: Path | None = None,
     felt: Felt | None = None,
@@ -116,7 +118,7 @@ def judge(
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     all_figures: dict[tuple[str, str], dict[str, Any]] = {}
-    for localizer in study_options.localizers(parts, unit, sensor, cache_dir):
+    for localizer in study_options.localizers(parts, unit, sensor, cache_dir, max_poses):
         settings = study.describe(localizer) | {
             "touches": touches,
             "noise": {"name": str(noise), **asdict(strength)},

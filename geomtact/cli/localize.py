@@ -148,9 +148,9 @@ def localize(
         _follow(asked, camera)
         return
     made_of = metadata.get("geomtact:object")
-    if made_of and len(parts) == 1 and parts[0] and Path(made_of).stem != Path(parts[0]).stem:
-        tell(f"{images[0]}: was made of {made_of}, as its metadata says, and is localized on {parts[0]}")
     found, took = _identified(asked, parts, placed)
+    if made_of and len(parts) == 1 and parts[0] and Path(made_of).stem != Path(parts[0]).stem:
+        tell(f"warning: {images[0]} was made of {made_of}, as its metadata says, and is localized on {parts[0]}")
     if len(parts) > 1 and found.foreign:
         tell("warning: what is shown is unlike all of the parts: is it another one?")
     for warning in found.posterior.warnings:
@@ -289,9 +289,9 @@ def _give(
 def _without_contact(asked: _Asked, kind: str) -> str:
     """What is said where nothing is felt; ``kind`` of what was read."""
     where = "the image" if len(asked.images) == 1 else f"any of the {len(asked.images)} images"
-    advice = "give a --background, or say what it is with --kind"
+    advice = f"it was taken for a {kind}; give a --background, or say what it is with --kind"
     if kind == "mask":
-        advice = "a mask's contact is what is not 0"
+        advice = "a mask's contact is what is not 0; look whether it is the right file, and touch more firmly"
     elif asked.values["background"] is not None:
         advice = (
             "nothing stands out of the --background; look whether that is of the untouched gel, and touch more firmly"
@@ -307,7 +307,7 @@ def _check_images(images: list[Path], sensor_poses: Path | None) -> None:
     UsageError, InputError
     """
     if not images:
-        raise UsageError("expected an image, got none; give one, or --camera 0")
+        raise UsageError("expected an image, got none; give one, or a folder and --watch, or --camera 0")
     for image in images:
         if image.is_dir():
             raise InputError(

@@ -89,7 +89,11 @@ def build(
 
 
 def choose_resolution(
-    mesh: Mesh, sensor: Sensor, approach: Approach | None = None, max_poses: int = MAX_POSES
+    mesh: Mesh,
+    sensor: Sensor,
+    approach: Approach | None = None,
+    max_poses: int = MAX_POSES,
+    progress: Progress | None = None,
 ) -> Resolution:
     """The finest grid that ``max_poses`` affords for this object (see ``resolution.choose``)."""
     assert mesh.symmetry is not None
@@ -101,6 +105,8 @@ def choose_resolution(
         there = HeightMap.cast(caster, directions.vectors[k], mesh.centre, reach, 0.0, frame.pixel / 2)
         turn = 2.4 * k  # the golden angle, in short: every direction at another turn
         area += weight * allowed(there.turned(turn, frame), frame, sensor, [0.0]).sum() * frame.pixel**2
+        if progress:
+            progress((k + 1) / len(directions.weights), "choosing the grid")
     return res.choose(mesh, float(area), sensor, approach, max_poses)
 
 

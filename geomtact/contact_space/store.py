@@ -92,7 +92,7 @@ def open_index(
             index = _read(folder / key, mesh, sensor, approach)
             if index is None:
                 mesh = mesh.with_symmetry()
-                resolution = choose_resolution(mesh, sensor, approach, max_poses)
+                resolution = choose_resolution(mesh, sensor, approach, max_poses, progress)
                 arrays = build(mesh, sensor, approach, resolution, progress)
                 index = Index(mesh, sensor, approach, resolution, key, **arrays)
                 _write(folder, index)

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.errors import MeshError, did_you_mean, nearest_name
+from geomtact.errors import MeshError, nearest, nearest_name
 from geomtact.geometry.catalogue import catalogue
 from geomtact.geometry.symmetry import Symmetry, find_symmetry
 from geomtact.se3 import Array
@@ -177,7 +177,8 @@ def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _Se
     Raises
     ------
     MeshError
-        Unknown name, no or contradicting unit, unreadable, empty, not closed, inside out, or of an impossible size.
+        Unknown name, no or contradicting unit, unreadable, cut short, empty, not closed, inside out, or of an impossible size;
+        or the name of a sensor in place of one.
     """
     if isinstance(source, Mesh):
         mesh = source
@@ -187,6 +188,8 @@ def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _Se
         vertices, faces = _tidy(raw_vertices * UNITS[unit], raw_faces, path, unit)
         _check_closed(vertices, faces, path)
         mesh = Mesh(vertices, faces, name, unit, path, symmetry)
+    if isinstance(sensor, str | os.PathLike):
+        raise MeshError(f"sensor: expected a geomtact.Sensor, got {str(sensor)!r}; give geomtact.Sensor.load of it")
     if sensor is not None:
         _check_scale(mesh, sensor)
     return mesh
@@ -215,15 +218,20 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
             )
         return name, entry.file, entry.unit, entry.symmetry
     suffix = path.suffix.lower()
-    if suffix in PREPARED:
+    if suffix in PREPARED and path.is_file():
         raise MeshError(f"{text}: not read as it is; make a mesh of it with 'python tools/prep_mesh.py {path.name}'")
-    if suffix not in FORMATS:
+    if suffix not in (*FORMATS, *PREPARED):
         if path.exists():
             raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(FORMATS)}")
         raise MeshError(f"no part named {text!r}{nearest_name(text, parts)}; or give a mesh file ({' '.join(FORMATS)})")
     if not path.is_file():
-        beside = [p.name for p in path.parent.glob("*") if p.suffix.lower() in FORMATS]
-        hint = did_you_mean(path.name, beside) or f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
+        beside = {p.stem: p.name for p in path.parent.glob("*") if p.suffix.lower() in FORMATS}
+        near = nearest(path.stem, beside)
+        hint = (
+            f"; did you mean {beside[near]!r}?"
+            if near
+            else f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
+        )
         raise MeshError(f"{text}: no such file{hint}")
     if suffix in METRE_FORMATS:
         if unit not in (None, "m"):
@@ -253,6 +261,8 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
     except Exception as error:  # noqa: BLE001 -- a parser fails on bad bytes in more ways than can be listed
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise MeshError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); export the mesh again") from None
+    if len(faces) == 0 and (cut := _cut_short(path)):
+        raise MeshError(f"{path}: {cut}; copy or export it again")
     if len(faces) == 0:
         what = "only points or lines" if scene.geometry else "nothing"
         raise MeshError(f"{path}: expected a surface of triangles, found {what}; export the mesh with its faces")
@@ -261,6 +271,19 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(f"{path}: a face names a vertex that is not there (of {len(vertices)}); export the mesh again")
     return vertices, faces
+
+
+def _cut_short(path: Path) -> str:
+    """How much a binary STL file lacks of the triangles that it says it holds, "" where it is whole or none."""
+    with open(path, "rb") as file:
+        head = file.read(84)
+    if path.suffix.lower() != ".stl" or len(head) < 84:
+        return ""
+    wanted, size = 84 + 50 * int.from_bytes(head[80:], "little"), path.stat().st_size
+    ascii_like = head.lstrip().lower().startswith(b"solid")
+    if ascii_like or size >= wanted:
+        return ""
+    return f"is cut short: expected {wanted:,} bytes for the triangles that it says it holds, found {size:,}"
 
 
 def _tidy(vertices: Array, faces: NDArray, path: Path, unit: str) -> tuple[Array, NDArray[np.int32]]:
@@ -350,9 +373,9 @@ def _bounds(vertices: Array, body: NDArray, count: int, pick: Callable) -> Array
 
 
 def _check_scale(mesh: Mesh, sensor: _SensorLike) -> None:
-    """Refuse a part of less than ten pixels or more than a hundred windows: with real parts the unit is wrong then."""
+    """Refuse a part of less than ten pixels or more than fifty windows: with real parts the unit is wrong then."""
     smallest = 10 * min(sensor.pixel_pitch)
-    largest = 100 * 2 * float(np.hypot(*sensor.half_window))
+    largest = 50 * 2 * float(np.hypot(*sensor.half_window))
     if not smallest <= mesh.diameter <= largest:
         raise MeshError(
             f"{mesh.path or mesh.name}: {_mm(mesh.diameter)} across as read in {mesh.unit}, but sensor {sensor.name} "

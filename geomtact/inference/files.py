@@ -32,6 +32,11 @@ def save(posterior: Posterior, path: str | Path) -> None:
     A posterior may be spread over a million poses. For other programs the most probable are written out, those that
     hold 99 % of the mass but at most 50,000, with log_prob normalised over them; ``row_log_prob`` holds all, for the runs
     of ``row_length`` cells that begin at ``row_cell``; it is empty where each is one cell.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
     """
     p = np.exp(posterior.log_prob)
     order = np.argsort(-p, kind="stable")
@@ -80,7 +85,12 @@ def save(posterior: Posterior, path: str | Path) -> None:
         with open(temporary, "wb") as file:  # given a name, numpy would add .npz to it
             np.savez(file, allow_pickle=False, **arrays)
 
-    write_whole(Path(path), write)
+    try:
+        write_whole(Path(path), write)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror or error}); give a file in a folder that is there"
+        ) from None
 
 
 def heading(path: str | Path) -> tuple[str, str, str]:

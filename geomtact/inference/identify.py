@@ -76,7 +76,7 @@ def identify(
     Raises
     ------
     UsageError
-        There is no part, or not one weight for each; or none with a weight could show this.
+        There is no list of parts, or not one weight for each; or none with a weight could show this.
     NoPoseAgreesError
         Of no part.
     """
@@ -84,6 +84,10 @@ def identify(
     merits: list[float] = []
     best: tuple[float, Localizer, Posterior] | None = None
     known = None if weights is None else _log_weights(weights)
+    if not isinstance(localizers, Iterable):
+        raise UsageError(
+            f"identify: expected a localizer for each part, got {type(localizers).__name__}; give a list of them"
+        )
     for i, localizer in enumerate(localizers):
         if known is not None and i >= len(known):
             raise UsageError(f"identify: expected a weight for each part, got {len(known)} for more")

@@ -124,7 +124,7 @@ class Localizer:
         approach : [(direction (3,), half angle)]: only touches whose direction from the object towards the sensor, in
             the object frame, lies within the angle [rad] of one of these; 0 means exactly that face
         scorer : how contacts are compared, one of ``geomtact.scoring.catalogue.SCORERS``, or weights (.safetensors)
-        max_poses : about how many poses the grid may have, plane faces adding up to a quarter
+        max_poses : about how many poses the grid may have; plane faces add a quarter to three quarters
         cache_dir : folder of the index cache; by default ``$GEOMTACT_CACHE`` or the user's cache folder
         progress : called with the share done (0 to 1) and what is being done
 

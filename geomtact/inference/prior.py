@@ -273,17 +273,44 @@ def _pair(poses: Any, log_masses: Any) -> tuple[Array, Array]:
 
 def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: str) -> Array:
     check_same(_heading(prior), index.mesh, frame)
-    same_place = np.allclose(prior.T_frame_sensor, T_frame_sensor, atol=1e-9)
-    if prior.index.key == index.key and same_place:
-        if not prior.contact:
-            raise InputError(
-                "prior: it says that the object does not touch the sensor, but this image shows a contact; leave it out"
-            )
+    if not np.allclose(prior.T_frame_sensor, T_frame_sensor, atol=1e-9):
+        return _carried(index, prior, T_frame_sensor)
+    if not prior.contact:
+        raise InputError(
+            "prior: it says that the object does not touch the sensor, but this image shows a contact; leave it out"
+        )
+    if prior.index.key == index.key:
         return prior.cell_log_density(np.arange(len(index)))
-    if same_place:
-        # another grid: the prior's own sensor saw the object at some depth, and casting it there decides what was ruled out
-        return _by_chunks(index, lambda T: prior.log_density(T_frame_sensor @ T), settled=True)
-    return _carried(index, prior, T_frame_sensor)
+    return _on_another_grid(index, prior)
+
+
+def _on_another_grid(index: Index, prior: Posterior) -> Array:
+    """Log density (N,) in the cells of ``index`` of a prior that the same sensor told on another grid: at each cell's own pose;
+    or, where these miss half of what it holds because its cells are the finer ones, as much as lies in each."""
+    mass = prior.densities * np.exp(prior.index.log_weight)
+    looked_up, out = _home(index, np.arange(len(index)), prior.index), np.full(len(index), -np.inf)
+    found = np.flatnonzero(looked_up >= 0)
+    some = np.flatnonzero(mass > 0)
+    home = _home(prior.index, some, index)
+    inside = home >= 0
+    if mass[np.unique(looked_up[found])].sum() >= 0.5 * mass[some[inside]].sum():
+        out[found] = prior.cell_log_density(looked_up[found])
+        return out
+    there = np.bincount(home[inside], mass[some[inside]], len(index))
+    held = there > 0
+    out[held] = np.log(there[held]) - index.log_weight[held]
+    return out
+
+
+def _home(index: Index, ids: NDArray[np.int64], other: Index) -> NDArray[np.int64]:
+    """The cell (n,) of ``other`` that holds the pose of each of the cells ``ids`` (n,) of ``index``, at the penetration that they
+    stand for; -1 where its approach allows none."""
+    out, depths = np.full(len(ids), -1), np.array(index.resolution.penetrations)
+    for start in range(0, len(ids), _CHUNK):
+        T, depth = index.poses(ids[start : start + _CHUNK]), depths[ids[start : start + _CHUNK] // index.places]
+        ok = other.space.approaches(T)
+        out[start : start + _CHUNK][ok] = other.lookup(T[ok], depth[ok])
+    return out
 
 
 def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
@@ -365,23 +392,11 @@ def _mean_density(each: ArrayLike, counts: NDArray[np.bool_] | None = None) -> A
     return np.asarray(total - np.log(np.maximum(counts.sum(0), 1)))
 
 
-def _by_chunks(index: Index, density: LogDensity, settled: bool = False) -> Array:
-    """``density`` at the pose of every cell (N,).
-
-    With ``settled``, where it is -inf at a pose that lies a little off the contact pose space, that pose brought to the
-    penetration of its cell counts.
-    """
-    space, depths = index.space, np.array(index.resolution.penetrations)
-    out = np.zeros(len(index))
-    for start in range(0, len(index), _CHUNK):
-        ids = np.arange(start, min(start + _CHUNK, len(index)))
-        T = index.poses(ids)
-        out[ids] = density(T)
-        if settled:
-            off = np.flatnonzero(out[ids] == -np.inf)
-            if not len(off):
-                continue
-            off = off[~np.isfinite(space.penetration(T[off]))]
-            moved, ok = space.settle(T[off], depths[ids[off] // index.places])
-            out[ids[off[ok]]] = density(moved[ok])
-    return out
+def _by_chunks(index: Index, density: LogDensity) -> Array:
+    """``density`` at the pose of every cell (N,)."""
+    return np.concatenate(
+        [
+            density(index.poses(np.arange(start, min(start + _CHUNK, len(index)))))
+            for start in range(0, len(index), _CHUNK)
+        ]
+    )

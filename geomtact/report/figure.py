@@ -223,7 +223,7 @@ def _words(posterior: Posterior, summaries: Sequence[ModeSummary]) -> list[str]:
     for s in summaries[:1]:
         lines += caution(summaries) or [f"Mode 1 holds {percent(s.probability)}."]
         lines += [
-            "Part's centre: "
+            "Part's centre at mode 1: "
             + ", ".join(f"{a} = {v:.2f}" for a, v in zip("xyz", s.centre_mm + 0.0, strict=True))
             + " mm",
             f"Within the mode: standard deviation {s.centre_sd_mm:.2f} mm and {s.rotation_sd_deg:.1f}°.",
