@@ -22,13 +22,12 @@ from geomtact.sensing.reading import write_image
 
 
 @pytest.fixture(scope="module")
-def drawer(tmp_path_factory, few_touches):
+def drawer(cache_dir, few_touches):
     """Three parts unlike each other."""
-    folder = tmp_path_factory.mktemp("cache")
 
     def part(name, shape):
         mesh = Mesh(shape.vertices, shape.faces, name, "m")
-        return Localizer.prepare(mesh, sensor="gelslim", max_poses=4000, scorer="moments", cache_dir=folder)
+        return Localizer.prepare(mesh, sensor="gelslim", max_poses=4000, scorer="moments", cache_dir=cache_dir)
 
     return [
         part("rod", trimesh.creation.box((60e-3, 3e-3, 3e-3))),

@@ -24,11 +24,12 @@ from geomtact.errors import CacheError, UsageError, did_you_mean
 from geomtact.geometry.approach import Approach, check_approach
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
-from geomtact.progress import Progress
+from geomtact.progress import Progress, between
 from geomtact.sensing.sensor import Sensor
 
 FORMAT = 8  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
+_CHOOSING = 0.1  # share of the time that choosing the grid takes, about
 _KEY_LENGTH, _KEY_AT_LEAST = 32, 6  # hexadecimal digits of an entry's name, and by how many it may be named
 
 
@@ -92,8 +93,9 @@ def open_index(
             index = _read(folder / key, mesh, sensor, approach)
             if index is None:
                 mesh = mesh.with_symmetry()
-                resolution = choose_resolution(mesh, sensor, approach, max_poses, progress)
-                arrays = build(mesh, sensor, approach, resolution, progress)
+                chosen = between(progress, 0, _CHOOSING)
+                resolution = choose_resolution(mesh, sensor, approach, max_poses, chosen)
+                arrays = build(mesh, sensor, approach, resolution, between(progress, _CHOOSING, 1))
                 index = Index(mesh, sensor, approach, resolution, key, **arrays)
                 _write(folder, index)
                 if cache_dir is None:
