@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from pathlib import PurePath
 
 
 class GeomtactError(Exception):
@@ -44,15 +45,14 @@ class CacheError(InputError):
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``"; did you mean 'x'?"`` for the known name nearest to ``name``, ``""`` if none is near."""
-    close = nearest(name, known)
-    return f"; did you mean {close!r}?" if close else ""
+    stems = {_stem(each): each for each in sorted(known, reverse=True)}
+    close = difflib.get_close_matches(_stem(name), sorted(stems), n=1)
+    return f"; did you mean {stems[close[0]]!r}?" if close else ""
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The known name nearest to ``name``, in upper or lower case; None if none is near."""
-    lower = {each.lower(): each for each in sorted(known, reverse=True)}
-    close = difflib.get_close_matches(name.lower(), sorted(lower), n=1)
-    return lower[close[0]] if close else None
+def _stem(name: str) -> str:
+    """What tells one name from another: neither case nor a file's suffix."""
+    return PurePath(name).stem.lower()
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

@@ -49,8 +49,6 @@ def judge_registration(
     from geomtact.contact_space.space import ContactSpace
     from geomtact.evaluation import registration, study
     from geomtact.evaluation.peers import peers
-    from geomtact.evaluation.shapes import SHAPES
-    from geomtact.evaluation.study import THESIS_PARTS
     from geomtact.evaluation.touches import FELT, random_touches
     from geomtact.inference.refine import Refinery
     from geomtact.registration.observability import Spread
@@ -63,7 +61,7 @@ def judge_registration(
         raise InputError(f"{out}: holds figures alone, no outcomes to go on with; give another file with --out")
     content.pop("figures", None)
     pressed, strength = Sensor.load(sensor), study_options.noise_named(noise)
-    for mesh in [_mesh(part, unit, pressed).with_symmetry() for part in parts or [*THESIS_PARTS, *SHAPES]]:
+    for mesh in [_mesh(part, unit, pressed).with_symmetry() for part in _named(parts)]:
         space = ContactSpace(mesh, pressed)
         resolution = choose_resolution(mesh, pressed, None, MAX_POSES)
         assert mesh.symmetry is not None
@@ -105,10 +103,14 @@ def judge_registration(
 
 def parts_meant(options: Mapping[str, Any]) -> dict[str, Any]:
     """The options, with the parts and shapes that are meant where none is named."""
+    return {**options, "parts": _named(options["parts"])}
+
+
+def _named(parts: list[str] | None) -> list[str]:
     from geomtact.evaluation.shapes import SHAPES
     from geomtact.evaluation.study import THESIS_PARTS
 
-    return {**options, "parts": options["parts"] or [*THESIS_PARTS, *SHAPES]}
+    return parts or [*THESIS_PARTS, *SHAPES]
 
 
 def _mesh(part: str, unit: str | None, sensor: Sensor) -> Mesh:

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.errors import MeshError, nearest, nearest_name
+from geomtact.errors import MeshError, did_you_mean, nearest_name
 from geomtact.geometry.catalogue import catalogue
 from geomtact.geometry.symmetry import Symmetry, find_symmetry
 from geomtact.se3 import Array
@@ -225,13 +225,8 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
             raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(FORMATS)}")
         raise MeshError(f"no part named {text!r}{nearest_name(text, parts)}; or give a mesh file ({' '.join(FORMATS)})")
     if not path.is_file():
-        beside = {p.stem: p.name for p in path.parent.glob("*") if p.suffix.lower() in FORMATS}
-        near = nearest(path.stem, beside)
-        hint = (
-            f"; did you mean {beside[near]!r}?"
-            if near
-            else f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
-        )
+        beside = [p.name for p in path.parent.glob("*") if p.suffix.lower() in FORMATS]
+        hint = did_you_mean(path.name, beside) or f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
         raise MeshError(f"{text}: no such file{hint}")
     if suffix in METRE_FORMATS:
         if unit not in (None, "m"):
@@ -261,9 +256,9 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
     except Exception as error:  # noqa: BLE001 -- a parser fails on bad bytes in more ways than can be listed
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise MeshError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); export the mesh again") from None
-    if len(faces) == 0 and (cut := _cut_short(path)):
-        raise MeshError(f"{path}: {cut}; copy or export it again")
     if len(faces) == 0:
+        if cut := _cut_short(path):
+            raise MeshError(f"{path}: {cut}; copy or export it again")
         what = "only points or lines" if scene.geometry else "nothing"
         raise MeshError(f"{path}: expected a surface of triangles, found {what}; export the mesh with its faces")
     if not np.isfinite(vertices[faces[(faces >= 0) & (faces < len(vertices))]]).all():
@@ -280,8 +275,7 @@ def _cut_short(path: Path) -> str:
     if path.suffix.lower() != ".stl" or len(head) < 84:
         return ""
     wanted, size = 84 + 50 * int.from_bytes(head[80:], "little"), path.stat().st_size
-    ascii_like = head.lstrip().lower().startswith(b"solid")
-    if ascii_like or size >= wanted:
+    if size >= wanted or head.lstrip().lower().startswith(b"solid"):  # of which text begins
         return ""
     return f"is cut short: expected {wanted:,} bytes for the triangles that it says it holds, found {size:,}"
 

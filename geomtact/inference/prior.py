@@ -290,15 +290,16 @@ def _on_another_grid(index: Index, prior: Posterior) -> Array:
     mass = prior.densities * np.exp(prior.index.log_weight)
     looked_up, out = _home(index, np.arange(len(index)), prior.index), np.full(len(index), -np.inf)
     found = np.flatnonzero(looked_up >= 0)
-    some = np.flatnonzero(mass > 0)
-    home = _home(prior.index, some, index)
-    inside = home >= 0
-    if mass[np.unique(looked_up[found])].sum() >= 0.5 * mass[some[inside]].sum():
-        out[found] = prior.cell_log_density(looked_up[found])
-        return out
-    there = np.bincount(home[inside], mass[some[inside]], len(index))
-    held = there > 0
-    out[held] = np.log(there[held]) - index.log_weight[held]
+    covered = mass[np.unique(looked_up[found])].sum()
+    if covered < 0.5:
+        some = np.flatnonzero(mass > 0)
+        home = _home(prior.index, some, index)
+        there = np.bincount(home[home >= 0], mass[some[home >= 0]], len(index))
+        if covered < 0.5 * there.sum():
+            held = there > 0
+            out[held] = np.log(there[held]) - index.log_weight[held]
+            return out
+    out[found] = prior.cell_log_density(looked_up[found])
     return out
 
 
