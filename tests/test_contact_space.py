@@ -476,9 +476,10 @@ def test_a_killed_build_leaves_no_entry_and_no_lock(tmp_path):
 
 def test_the_cache_is_listed_bounded_and_cleared(tmp_path):
     first = tiny_index(tmp_path)
-    second = open_index(load_mesh("ball"), TINY, None, 3000, tmp_path)
+    side = [((0, 0, 2), 0.5)]
+    second = open_index(load_mesh("ball"), TINY, side, 3000, tmp_path)
     entries = cache_entries(tmp_path)
-    assert {e.key for e in entries} == {first.key, second.key}
+    assert {e.key: e.approach for e in entries} == {first.key: None, second.key: [[[0, 0, 1], 0.5]]}
     assert {e.poses for e in entries} == {len(first), len(second)}
     assert all(e.object == "ball" and e.sensor == "tiny" and e.size_bytes > 1000 for e in entries)
     newest = entries[0].key
@@ -489,7 +490,7 @@ def test_the_cache_is_listed_bounded_and_cleared(tmp_path):
     assert newest in {e.key for e in cache_entries(tmp_path)}, "nothing is removed where one name fits none"
     assert [e.key for e in remove_from_cache([newest[:12], newest], tmp_path)] == [newest]
     tiny_index(tmp_path)
-    open_index(load_mesh("ball"), TINY, None, 3000, tmp_path)
+    open_index(load_mesh("ball"), TINY, side, 3000, tmp_path)
     removed = bound_cache(entries[0].size_bytes, tmp_path)
     assert newest in {e.key for e in cache_entries(tmp_path)} and not {first.key, second.key} <= {
         e.key for e in cache_entries(tmp_path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -73,12 +75,20 @@ def cache(
     if removed is not None:
         tell(f"removed {_count(len(removed))}, {sum(e.size_bytes for e in removed) / 1e6:.0f} MB")
     entries = store.cache_entries(folder)
-    rows = [
-        [e.key[:12], e.object, e.sensor, f"{e.poses:,}", f"{e.size_bytes / 1e6:.0f}", _when(time.time() - e.last_used)]
-        for e in entries
-    ]
-    print_table(["key", "part", "sensor", "poses", "MB", "last used"], rows, right=["poses", "MB"])
+    rows = []
+    for e in entries:
+        size, used = f"{e.size_bytes / 1e6:.0f}", _when(time.time() - e.last_used)
+        rows.append([e.key[:12], e.object, e.sensor, _sides(e.approach), f"{e.poses:,}", size, used])
+    print_table(["key", "part", "sensor", "approach", "poses", "MB", "last used"], rows, right=["poses", "MB"])
     typer.echo(f"{_count(len(entries))}, {sum(e.size_bytes for e in entries) / 1e6:.0f} MB in {folder}")
+
+
+def _sides(approach: Sequence[tuple[Sequence[float], float]] | None) -> str:
+    """An approach as ``--approach`` takes it."""
+    return " ".join(
+        ",".join(f"{x + 0.0:.2g}" for x in direction) + (f":{math.degrees(angle):.3g}" if angle else "")
+        for direction, angle in approach or []
+    )
 
 
 def _when(seconds: float) -> str:

@@ -35,12 +35,16 @@ _KEY_LENGTH, _KEY_AT_LEAST = 32, 6  # hexadecimal digits of an entry's name, and
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """One cached index: what it is for, its size, and when it was last read (seconds since 1970)."""
+    """One cached index: what it is for, its size, and when it was last read (seconds since 1970).
+
+    ``approach`` is None where any side may be touched, and where it was written before that was noted.
+    """
 
     key: str
     object: str
     sensor: str
     poses: int
+    approach: list[tuple[list[float], float]] | None
     size_bytes: int
     last_used: float
     folder: Path
@@ -118,9 +122,9 @@ def cache_entries(cache_dir: str | Path | None = None) -> list[CacheEntry]:
             size, used = sum(f.st_size for f in files), max((f.st_mtime for f in files), default=0.0)
             try:
                 meta = json.loads((path / "meta.json").read_text("utf-8"))
-                what = meta["object"], meta["sensor"], meta["poses"]
+                what = meta["object"], meta["sensor"], meta["poses"], meta.get("approach")
             except (OSError, ValueError, KeyError):
-                what = "damaged", "?", 0
+                what = "damaged", "?", 0, None
             entries.append(CacheEntry(path.name, *what, size, used, path))
     return sorted(entries, key=lambda e: -e.last_used)
 
@@ -179,14 +183,18 @@ def clear_cache(cache_dir: str | Path | None = None) -> list[CacheEntry]:
 
 
 def _key(mesh: Mesh, sensor: Sensor, approach: Approach | None, max_poses: int) -> str:
-    cones = check_approach(approach)
-    approach_text = None if cones is None else [(v.tolist(), angle) for v, angle in cones]
     s = mesh.symmetry
     symmetry = (
         None if s is None else (s.kind, s.elements.round(9).tolist(), None if s.axis is None else s.axis.tolist())
     )
-    text = json.dumps([FORMAT, mesh.sha256, symmetry, sensor.sha256, approach_text, max_poses])
+    text = json.dumps([FORMAT, mesh.sha256, symmetry, sensor.sha256, _plain(approach), max_poses])
     return hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
+
+
+def _plain(approach: Approach | None) -> list[tuple[list[float], float]] | None:
+    """An approach as it stands in JSON."""
+    cones = check_approach(approach)
+    return None if cones is None else [(v.tolist(), angle) for v, angle in cones]
 
 
 def _write(folder: Path, index: Index) -> None:
@@ -198,6 +206,7 @@ def _write(folder: Path, index: Index) -> None:
         "object_sha256": index.mesh.sha256,
         "sensor": index.sensor.name,
         "poses": len(index),
+        "approach": _plain(index.approach),
         "resolution": index.resolution.to_json(),
         "symmetry": {
             "kind": symmetry.kind,
