@@ -105,6 +105,21 @@ def touches(content):
             yield cells(row, name, between(f["more"], "+.1f") if "more" in f else "", regions(f), **f)
 
 
+def elsewhere_simulated(content):
+    def spread(f, key, form=cut):
+        low, middle, high = map(form, f[f"{key}_quartiles"])
+        return f"{middle} ({low} to {high})"
+
+    row = "{shown} | {touches} | {} | {} | {} | {compatible:.0%} | {touched:.0%} | {} | {} | "
+    for f in content["figures"]:
+        lengths = spread(f, "position_mm"), cut(f["position_mm_mean"]), spread(f, "add_s_mm")
+        nats = spread(f, "gain"), spread(f, "claimed")
+        told = "{gain_mean:.1f} / {claimed_mean:.1f} | {}"
+        if not f["touches"]:
+            nats, told = ("0", "0"), "0 / 0 |"
+        yield cells(row + told, *lengths, *nats, regions(f), **f)
+
+
 def followed(content):
     more = "{more[0]:+.2f} ({more[1]:.2f} to {more[2]:.2f}) | {better:.0%}"
     held = {"filter": (more + " of {n}", "{lost} of {stretches}"), "frames": ("|", "")}
@@ -248,6 +263,7 @@ TABLES = [
     *(("speed-accuracy", f"The {PARTS[part]}:", partial(ways, part), "choices") for part in PARTS),
     ("speed-accuracy", "| gain [nats] /", sides, "choices"),
     ("several-sensors", "| part |", touches, "touches"),
+    ("several-sensors", "| shown |", elsewhere_simulated, "triplets"),
     ("tracking", "| method |", followed, "track"),
     ("next-touch", "| part |", until_sure, "next_touch"),
     ("kitting", "| part |", placed, "kitting"),
