@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from geomtact.contact_space.resolution import Resolution
 from geomtact.contact_space.space import ContactSpace
@@ -19,7 +20,7 @@ from geomtact.geometry.approach import NO_TILT, Approach, approach_of
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.rotations import Directions
-from geomtact.se3 import Array, exp, hat, transform
+from geomtact.se3 import Array, hat, transform
 from geomtact.sensing.sensor import Sensor
 
 _TURNED = 8  # rotations of a cell that stand for all of it
@@ -149,42 +150,46 @@ class Index:
         return x, y
 
     def cell_covariance(self, T: ArrayLike) -> Array:
-        """Spread (6, 6) of the poses in the cell around ``T`` (4, 4): covariance of xi in T exp(xi^), radians and metres.
+        """Spread (..., 6, 6) of the poses in the cell around each ``T`` (..., 4, 4): covariance of xi in T exp(xi^), radians and
+        metres.
 
         A cell is as wide in tilt, turn, x and y as the grid is fine; but where its poses touch, at one penetration, they lie as
         high as the object's surface lets them: by what the cells round about say, a plane and what is left of it.
         """
-        R = np.asarray(T, float)[:3, :3]
-        up = R[2]
+        T = np.asarray(T, float)
+        R, t = T.reshape(-1, 4, 4)[:, :3, :3], T.reshape(-1, 4, 4)[:, :3, 3]
+        up = R[:, 2]
         cones = self.directions.cones
         turn, step = self.angle_step, self.resolution.step
         # the cells of disks leave less tilt, and an approach no more than its cones are wide
-        tilt = min(turn, self.directions.disk_step(approach_of(R)))
-        tilt = tilt if cones is None else min(tilt, max(NO_TILT, 2 * max(half for _, half in cones)))
-        sideways = np.linalg.svd(up[None])[2][1:]
-        turned = np.stack([tilt * sideways[0], tilt * sideways[1], turn * up, np.zeros(3), np.zeros(3)])
-        moved = np.zeros((5, 3))
-        moved[3, 0] = moved[4, 1] = step
+        tilt = np.array([min(turn, self.directions.disk_step(a)) for a in approach_of(R)])
+        if cones is not None:
+            tilt = np.minimum(tilt, max(NO_TILT, 2 * max(half for _, half in cones)))
+        turned, moved = np.zeros((2, len(R), 5, 3))
+        turned[:, :2] = tilt[:, None, None] * np.linalg.svd(up[:, None])[2][:, 1:]
+        turned[:, 2] = turn * up
+        moved[:, 3, 0] = moved[:, 4, 1] = step
 
-        centre = R @ self.mesh.centre + np.asarray(T, float)[:3, 3]
-        around = R @ exp(np.pad(_AROUND @ turned, ((0, 0), (0, 3))))[:, :3, :3]
-        poses = transform(around, centre + _AROUND @ moved - around @ self.mesh.centre)
+        centre = R @ self.mesh.centre + t
+        rotvec = _AROUND @ turned
+        around = R[:, None] @ Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix().reshape(*rotvec.shape, 3)
+        poses = transform(around, centre[:, None] + _AROUND @ moved - around @ self.mesh.centre).reshape(-1, 4, 4)
         level = len(self.height) // 2
         place = self.lookup(poses, np.full(len(poses), 0.5 * self.sensor.max_penetration)) % self.places
-        height = self.height[level, place].astype(float)
-        height -= height.mean()
-        lean = np.linalg.lstsq(_AROUND, height, rcond=None)[0]
-        moved[:, 2] = lean
+        height = self.height[level, place].astype(float).reshape(-1, len(_AROUND))
+        height -= height.mean(1, keepdims=True)
+        lean = np.linalg.lstsq(_AROUND, height.T, rcond=None)[0].T
+        moved[:, :, 2] = lean
         depth = self.sensor.max_penetration / len(self.height)
-        left = np.square(height - _AROUND @ lean).mean() + depth**2 / 12
+        left = np.square(height - lean @ _AROUND.T).mean(1) + depth**2 / 12
 
-        way = np.concatenate([turned, moved @ R], 1)
-        about_centre = way.T @ way / 12
-        about_centre[3:, 3:] += left * np.outer(up, up)
+        way = np.concatenate([turned, moved @ R], -1)
+        about_centre = np.swapaxes(way, 1, 2) @ way / 12
+        about_centre[:, 3:, 3:] += left[:, None, None] * up[:, :, None] * up[:, None]
         # a rotation about the object's centre is one about its origin and a shift
         J = np.eye(6)
         J[3:, :3] = hat(self.mesh.centre)
-        return J @ about_centre @ J.T
+        return (J @ about_centre @ J.T).reshape(*T.shape[:-2], 6, 6)
 
     def lookup(self, T: ArrayLike, penetration: ArrayLike) -> NDArray[np.int64]:
         """The pose id (n,) whose cell holds each ``T`` (n, 4, 4), which presses ``penetration`` (n,) [m] deep.

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array, apply, hat, transform
 
 _BATCH = 2048
@@ -42,8 +43,8 @@ class PoseDistance:
         """Whether each of ``others`` (m, 4, 4) lies within ``radius`` [m] of ``T`` in mean point distance."""
         T, others = np.asarray(T, float), np.asarray(others, float)
         # the mean of the points moves no further than the points do in the mean
-        moved = np.linalg.norm(apply(others, self.anchor[None])[:, 0] - apply(T, self.anchor[None])[0], axis=1)
-        near = np.flatnonzero(moved <= radius + self.slack)
+        moved = (others[:, :3] - T[:3]) @ np.append(self.anchor, 1.0)
+        near = np.flatnonzero((moved**2).sum(1) <= (radius + self.slack) ** 2)
         out = np.zeros(len(others), bool)
         out[near] = self.mean(T, others[near]) <= radius
         return out
@@ -61,7 +62,7 @@ class PoseDistance:
             mean = symmetry.centre + (mean - symmetry.centre) @ symmetry.axis * symmetry.axis
         return mean
 
-    @property
+    @cached_property
     def slack(self) -> float:
         """How much further [m] than the mean point distance the anchor may move between two poses."""
         return 2 * float(np.linalg.norm(self.points.mean(0) - self.anchor))
@@ -73,23 +74,14 @@ class PoseDistance:
     def turned(self, R: ArrayLike, others: ArrayLike) -> Array:
         """Root mean square point distance (m,) [m] that the rotation alone makes, from ``R`` (3, 3) to ``others``
         (m, 3, 3), about :attr:`anchor`, modulo the object's symmetry."""
-        symmetry, others = self.mesh.symmetry, np.asarray(others, float).reshape(-1, 9)
+        symmetry, others = self.mesh.symmetry, np.asarray(others, float).reshape(-1, 3, 3)
         if symmetry is not None and symmetry.kind == "sphere":
             return np.zeros(len(others))
         about = self.points - self.anchor
         C = about.T @ about / len(about)
-        elements = np.eye(3)[None] if symmetry is None else symmetry.elements[:, :3, :3]
-
-        def overlap(part: Array) -> Array:
-            """tr(R^T R' S C) (m, G) for ``part`` of a turn before every element."""
-            kernel = np.swapaxes(part @ elements @ C @ np.asarray(R, float).T, 1, 2)
-            return others @ kernel.reshape(-1, 9).T
-
-        if symmetry is not None and symmetry.axis is not None:
-            along = np.outer(symmetry.axis, symmetry.axis)
-            nearest = overlap(along) + np.hypot(overlap(np.eye(3) - along), overlap(hat(symmetry.axis)))
-        else:
-            nearest = overlap(np.eye(3))
+        Q = (np.asarray(R, float).T @ others).reshape(-1, 9)
+        overlap = [Q @ kernel for kernel in _kernels(symmetry, C)]
+        nearest = overlap[0] + np.hypot(*overlap[1:]) if len(overlap) > 1 else overlap[0]
         return np.sqrt(np.maximum(2 * (np.trace(C) - nearest.max(1)), 0))
 
     def _distances(self, T: ArrayLike, others: ArrayLike, over: str) -> Array:
@@ -115,24 +107,38 @@ class PoseDistance:
             where = apply(others, symmetry.centre[None])[:, 0]
             return transform(T[:3, :3], where - T[:3, :3] @ symmetry.centre)
         # E |T p - T' S p|^2 is least where tr(R^T R' S C) is largest, C = E p p^T about the centre
-        C = self._centred.T @ self._centred / len(self._centred)
-        Q = T[:3, :3].T @ others[:, :3, :3]
-        elements = symmetry.elements[:, :3, :3]
+        Q = (T[:3, :3].T @ others[:, :3, :3]).reshape(-1, 9)
+        gains = [Q @ kernel for kernel in self._overlap]
         if symmetry.kind == "discrete":
-            gain = np.einsum("mij,gji->mg", Q, elements @ C)
-            return others @ symmetry.elements[gain.argmax(1)]
-        a = symmetry.axis
-        assert a is not None
-        along = np.outer(a, a)
-        fixed, cosine, sine = (
-            np.einsum("mij,gji->mg", Q, part @ elements @ C) for part in (along, np.eye(3) - along, hat(a))
-        )
+            return others @ symmetry.elements[gains[0].argmax(1)]
+        fixed, cosine, sine = gains
         best = (fixed + np.hypot(cosine, sine)).argmax(1)
         row = np.arange(len(others))
         angle = np.arctan2(sine[row, best], cosine[row, best])[:, None, None]
-        S = along + np.cos(angle) * (np.eye(3) - along) + np.sin(angle) * hat(a)
-        S = S @ elements[best]
+        along, across, ahead = _about_axis(symmetry)
+        S = along + np.cos(angle) * across + np.sin(angle) * ahead
+        S = S @ symmetry.elements[best, :3, :3]
         return others @ transform(S, symmetry.centre - S @ symmetry.centre)
+
+    @cached_property
+    def _overlap(self) -> list[Array]:
+        """:func:`_kernels` of the points about the object's centre."""
+        return _kernels(self.mesh.symmetry, self._centred.T @ self._centred / len(self._centred))
+
+
+def _kernels(symmetry: Symmetry | None, C: Array) -> list[Array]:
+    """What the nine numbers of R^T R' are multiplied by (9, G) for tr(R^T R' S C) with each element S, of every part of a turn
+    about the symmetry's axis before it, or of none; ``C`` (3, 3) = E p p^T."""
+    elements = np.eye(3)[None] if symmetry is None else symmetry.elements[:, :3, :3]
+    parts = (np.eye(3),) if symmetry is None or symmetry.axis is None else _about_axis(symmetry)
+    return [np.ascontiguousarray(np.swapaxes(part @ elements @ C, 1, 2).reshape(-1, 9).T) for part in parts]
+
+
+def _about_axis(symmetry: Symmetry) -> tuple[Array, Array, Array]:
+    """What a turn by an angle about the axis leaves, multiplies by its cosine and by its sine: (3, 3) each."""
+    assert symmetry.axis is not None
+    along = np.outer(symmetry.axis, symmetry.axis)
+    return along, np.eye(3) - along, hat(symmetry.axis)
 
 
 def mode_radius(mesh: Mesh) -> float:

@@ -100,7 +100,7 @@ def _share_out(posterior: Posterior, members: list[tuple[int, NDArray[np.int64]]
             break
         out.append((int(cell), float(mass.sum())))
         for _, inside, left in todo:
-            left[np.isin(inside, taken)] = 0
+            left[taken[np.searchsorted(taken, inside).clip(max=len(taken) - 1)] == inside] = 0
     return out
 
 

@@ -162,10 +162,11 @@ class Posterior:
             return self
         held = np.logaddexp.reduce(had)
         gets += held - np.logaddexp.reduce(gets)
+        # all that counts, of what is left elsewhere: 1 where that counts in full
+        total = np.log(elsewhere + (1 - elsewhere) * np.exp(held))
         with np.errstate(divide="ignore"):
-            log_prob = self.log_prob + self.log_prob.dtype.type(np.log(elsewhere))
-            log_prob[row] = np.logaddexp(gets + np.log1p(-doubt), had + np.log(doubt))
-        log_prob -= np.log(elsewhere + (1 - elsewhere) * np.exp(held))
+            log_prob = self.log_prob + self.log_prob.dtype.type(np.log(elsewhere) - total)
+            log_prob[row] = np.logaddexp(gets + np.log1p(-doubt), had + np.log(doubt)) - total
         return replace(self, log_prob=log_prob)
 
     def log_density(self, T: ArrayLike) -> Any:
@@ -318,12 +319,13 @@ class Posterior:
     def _top_rows(self, n: int = _SEEDS) -> NDArray[np.int64]:
         """The ``n`` rows (m,) with the most mass a cell, where there are as many."""
         p = self._log_mass_of_a_cell
-        rows = np.arange(len(p))
+        rows = np.zeros(0, np.int64)
         if len(p) > 100 * n:
             # the quantile of every fiftieth row leaves few to look at; for a small n, by chance, too few
             some, few = p[::50], max(1, n // 5)
-            above = np.flatnonzero(p >= np.partition(some, -few)[-few])
-            rows = above if len(above) >= n else rows
+            rows = np.flatnonzero(p >= np.partition(some, -few)[-few])
+        if len(rows) < n:
+            rows = np.arange(len(p))
         if len(rows) > n:
             rows = rows[np.argpartition(p[rows], -n)[-n:]]
         return rows[p[rows] > -np.inf]

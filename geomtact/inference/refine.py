@@ -72,16 +72,17 @@ class Refinery:
         refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index, thorough)]
         poses = np.stack([*candidates, *(r.T for r in refinements)])
         winner, likelihood = self._best(mask, poses)
-        refined = {}
-        for i, cell in enumerate(cells):
-            best = int(winner[i])
-            T = poses[best, i]
-            if best >= len(candidates):
-                found = refinements[best - len(candidates)]
-                covariance, observable = found.covariance[i], found.observable[i]
-            else:
-                covariance, observable = index.cell_covariance(T), np.zeros((0, 6))
-            refined[int(cell)] = Refined(T, covariance, observable, problem.length, best > 0)
+        T = poses[winner, np.arange(len(cells))]
+        covariance, observable = np.zeros((len(cells), 6, 6)), [np.zeros((0, 6))] * len(cells)
+        told = winner >= len(candidates)
+        covariance[~told] = index.cell_covariance(T[~told])
+        for i in np.flatnonzero(told):
+            found = refinements[winner[i] - len(candidates)]
+            covariance[i], observable[i] = found.covariance[i], found.observable[i]
+        refined = {
+            int(cell): Refined(T[i], covariance[i], observable[i], problem.length, bool(winner[i] > 0))
+            for i, cell in enumerate(cells)
+        }
         return replace(posterior.shared_anew(cells, TRUST * likelihood), refined=refined)
 
     def _best(self, mask: NDArray[np.bool_], poses: Array) -> tuple[NDArray[np.int64], Array]:

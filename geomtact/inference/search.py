@@ -266,11 +266,10 @@ class Search:
         leading = np.argsort(-posterior.cell_log_density(cells), kind="stable")[: _TOLD * k]
         cells, T = cells[leading], T[leading]
         found = self.filterreg.refine(self.problem, T)
-        out = {}
-        for i, cell in enumerate(cells):
-            if found.converged[i]:
-                covariance, observable = found.covariance[i], found.observable[i]
-            else:
-                covariance, observable = self.index.cell_covariance(T[i]), np.zeros((0, 6))
-            out[int(cell)] = Refined(T[i], covariance, observable, self.problem.length, True)
-        return out
+        covariance, observable = self.index.cell_covariance(T), [np.zeros((0, 6))] * len(cells)
+        for i in np.flatnonzero(found.converged):
+            covariance[i], observable[i] = found.covariance[i], found.observable[i]
+        return {
+            int(cell): Refined(T[i], covariance[i], observable[i], self.problem.length, True)
+            for i, cell in enumerate(cells)
+        }

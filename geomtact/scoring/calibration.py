@@ -211,12 +211,17 @@ def posterior_log_prob(
             np.log(likely, out=joint)
         joint[tiny] = kept
 
-    parts = [slice(i, i + _CHUNK) for i in range(0, len(out), _CHUNK)]
-    with ThreadPoolExecutor(2 if len(parts) > 1 else 1) as pool:
+    parts = chunks(len(out))
+    with ThreadPoolExecutor(2) as pool:
         tops, sums = zip(*pool.map(weigh, parts), strict=True)
         total = float(np.logaddexp.reduce(sums))
         list(pool.map(mix, parts, tops))
     return out
+
+
+def chunks(n: int) -> list[slice]:
+    """``n`` rows in parts that are worth a thread's time."""
+    return [slice(start, start + _CHUNK) for start in range(0, n, _CHUNK)]
 
 
 def normalised(log_mass: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -101,7 +101,8 @@ class FittedScorer:
             prior = log_prior[cells]
         shares, shown = ways(mask, index.sensor)
         scores = [_deeper(scorer.score(index, each), index, above).reshape(-1) for each in shown]
-        score = mixed(shares, scores, index.log_weight, calibration.temperature)[cells]
+        score = mixed(shares, scores, index.log_weight, calibration.temperature)
+        score = score if len(cells) == len(score) else score[cells]
         return Rows(cells, None, score, prior, calibration, scorer.name)
 
 

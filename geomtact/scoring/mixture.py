@@ -9,10 +9,13 @@ is one of its patches alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.scoring.calibration import chunks
 from geomtact.sensing.contact import Shown
 from geomtact.sensing.patches import patches
 from geomtact.sensing.sensor import Sensor
@@ -46,17 +49,32 @@ def mixed(
     if len(scores) == 1:
         return scores[0]
     inverse = np.float32(1 / temperature)
-    parts = [score * inverse for score in scores]
-    for share, likely in zip(shares, parts, strict=True):
-        mass = likely + log_weight
+    out = np.empty_like(scores[0])
+
+    def weigh(score: NDArray[np.float32], part: slice) -> float:
+        mass = score[part] * inverse
+        mass += log_weight[part]
         top = mass.max()
+        if top == -np.inf:
+            return -np.inf
         mass -= top
-        likely += np.float32(np.log(share) - top - np.log(np.exp(mass, out=mass).sum(dtype=float)))
-    # the largest part and what the others add to it: numpy's own logaddexp takes four times as long
-    out = np.maximum.reduce(parts)
-    least = np.maximum(out, np.finfo(np.float32).min)  # rows that no part has any likelihood for stay at -inf
-    added = sum(np.exp(np.subtract(likely, least, out=likely), out=likely) for likely in parts)
-    with np.errstate(divide="ignore"):
-        out += np.log(added)
-    out *= np.float32(temperature)
+        return float(top) + float(np.log(np.exp(mass, out=mass).sum()))
+
+    def mix(part: slice) -> None:
+        likely = [score[part] * inverse + added for score, added in zip(scores, constant, strict=True)]
+        # the largest and what the others add to it: numpy's own logaddexp takes four times as long
+        largest = np.maximum.reduce(likely)
+        least = np.maximum(largest, np.finfo(np.float32).min)  # rows without any likelihood stay at -inf
+        for each in likely:
+            each -= least
+            np.exp(each, out=each)
+        with np.errstate(divide="ignore"):
+            largest += np.log(np.add.reduce(likely))
+        np.multiply(largest, np.float32(temperature), out=out[part])
+
+    parts = chunks(len(out))
+    with ThreadPoolExecutor(2) as pool:
+        evidence = [np.logaddexp.reduce(list(pool.map(partial(weigh, score), parts))) for score in scores]
+        constant = (np.log(shares) - evidence).astype(np.float32)
+        list(pool.map(mix, parts))
     return out

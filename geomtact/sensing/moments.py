@@ -68,5 +68,7 @@ def without_specks(mask: NDArray[Any], pixel_area: float) -> NDArray[Any]:
     labels, count = labelled(mask)
     areas = count * pixel_area
     dust = areas < min(_SPECK, areas[1:].max(initial=0) / 10)
+    if not dust[1:].any():
+        return mask
     dust[0] = True
-    return ~np.take(dust, labels) if len(count) > 1 else mask
+    return ~np.take(dust, labels)
