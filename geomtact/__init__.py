@@ -22,7 +22,8 @@ from geomtact.errors import (
 
 if TYPE_CHECKING:
     from geomtact.contact_space.carry import RigStd
-    from geomtact.geometry.mesh import Mesh, load_mesh
+    from geomtact.geometry.mesh import Mesh
+    from geomtact.geometry.mesh_file import load_mesh
     from geomtact.inference.identify import identify
     from geomtact.inference.localizer import Effort, Localizer
     from geomtact.inference.modes import Mode
@@ -57,7 +58,7 @@ _MODULE_OF = {
     "contact_height": "geomtact.sensing.height",
     "contact_mask": "geomtact.sensing.local_shape",
     "identify": "geomtact.inference.identify",
-    "load_mesh": "geomtact.geometry.mesh",
+    "load_mesh": "geomtact.geometry.mesh_file",
 }
 
 __all__ = [

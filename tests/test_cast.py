@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.se3 import apply, random_rotations, transform, unit
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor

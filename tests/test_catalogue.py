@@ -10,7 +10,7 @@ import trimesh
 
 from geomtact.geometry import catalogue as module
 from geomtact.geometry.catalogue import catalogue, meshes_folder
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.geometry.symmetry import find_symmetry
 
 X, Y, Z = np.eye(3)

@@ -18,7 +18,8 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import bound_cache, cache_entries, clear_cache, open_index, remove_from_cache
 from geomtact.errors import CacheError, MeshError, UsageError
 from geomtact.geometry.approach import allowed, approach_of
-from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.se3 import inverse, log, random_rotations, transform
 from geomtact.sensing.sensor import Sensor
 

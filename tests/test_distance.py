@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.se3 import apply, exp, random_rotations, transform
 
 PARTS = ["connector_plug", "hex_nut", "gear", "damping_pin", "ball"]

@@ -11,7 +11,8 @@ from geomtact.contact_space.build import choose_resolution
 from geomtact.contact_space.resolution import disks_about_faces
 from geomtact.geometry.cells import within_any
 from geomtact.geometry.faces import plane_faces
-from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.geometry.orbits import images_of
 from geomtact.sensing.sensor import Sensor
 

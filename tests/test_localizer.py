@@ -11,7 +11,8 @@ from geomtact.contact_space.store import open_index
 from geomtact.evaluation.touches import random_touches
 from geomtact.geometry.approach import approach_of
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import GaussianPrior, prior_log_mass
 from geomtact.registration.rim import SINK

@@ -6,7 +6,8 @@ import trimesh
 
 from geomtact.errors import MeshError
 from geomtact.geometry.catalogue import catalogue
-from geomtact.geometry.mesh import UNITS, Mesh, load_mesh
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh_file import UNITS, load_mesh
 from geomtact.se3 import apply, random_rotations, transform
 from geomtact.sensing.sensor import Sensor
 

@@ -15,7 +15,8 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError, InputError, PoseError, UsageError
 from geomtact.evaluation import next_touch_study
 from geomtact.evaluation.fixture import upwards
-from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.planning.actions import Probe, Touch
 from geomtact.planning.belief import draw_cells
 from geomtact.planning.grid import grid_of_touches

@@ -21,7 +21,7 @@ from geomtact import se3
 from geomtact.cli import app
 from geomtact.evaluation.touches import random_touches
 from geomtact.files import write_whole
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
 from geomtact.report.result import plain, result, to_text
 from geomtact.report.shown import Shown, shown_of

@@ -10,7 +10,8 @@ from scipy.stats import multivariate_t
 
 from geomtact.contact_space.index import pack
 from geomtact.errors import MeshError, UsageError
-from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.scoring.calibration import (
     FLOORS,
     Calibration,

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from trimesh.creation import box, capsule, cone, cylinder, icosahedron, icosphere, torus
 
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.geometry.symmetry import Symmetry, about, find_symmetry, group_of
 from geomtact.se3 import apply, random_rotations, transform
 

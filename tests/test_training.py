@@ -7,7 +7,7 @@ from safetensors.numpy import load_file, save_file
 
 from geomtact.contact_space.touch import LEAST_CONTACT
 from geomtact.errors import GeomtactError, InputError
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.scoring.catalogue import descriptor_of
 from geomtact.scoring.encoder import BASIS, SHAPE, Tower, load_weights, moment_features, vector
 from geomtact.scoring.network import Encoder, run

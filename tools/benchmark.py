@@ -74,7 +74,7 @@ def machine() -> dict[str, Any]:
 def rays(part: str, sensor_name: str) -> dict[str, Any]:
     """Camera rays per second against the part, one thread and two."""
     from geomtact.contact_space.space import ContactSpace
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
     from geomtact.sensing.cast import Caster
     from geomtact.sensing.sensor import Sensor
 
@@ -99,7 +99,7 @@ def _prepare(part: str, sensor: str, cache: str) -> dict[str, Any]:
     import resource
 
     from geomtact.contact_space.store import open_index
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
     from geomtact.inference.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 

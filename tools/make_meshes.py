@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 
-from geomtact.geometry.mesh import load_mesh
+from geomtact.geometry.mesh_file import load_mesh
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from meshprep.adding import catalogue_entry

@@ -113,7 +113,7 @@ def prepare(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[s
     from meshprep.writing import write
 
     from geomtact.errors import GeomtactError
-    from geomtact.geometry.mesh import UNITS
+    from geomtact.geometry.mesh_file import UNITS
     from geomtact.sensing.sensor import Sensor
 
     result: dict[str, Any] = {"file": str(file), "name": name, "outcome": "refused", "reason": None}
@@ -145,7 +145,7 @@ def _draw_ambiguity(result: dict[str, Any], out: Path, sensor: str) -> None:
     from meshprep.ambiguity import draw_ambiguity
 
     from geomtact.files import write_bytes
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
 
     for part in result["parts"]:
         drawn = draw_ambiguity(load_mesh(out / f"{part}.ply", result["unit"]), sensor)

@@ -115,7 +115,7 @@ def _named(parts: list[str] | None) -> list[str]:
 
 def _mesh(part: str, unit: str | None, sensor: Sensor) -> Mesh:
     from geomtact.evaluation.shapes import SHAPES, shape
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
 
     return shape(part) if part in SHAPES else load_mesh(part, unit, sensor=sensor)
 

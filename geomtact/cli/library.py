@@ -33,7 +33,7 @@ def objects() -> None:
     import numpy as np
 
     from geomtact.geometry.catalogue import catalogue
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
 
     rows = []
     for name, entry in catalogue().items():

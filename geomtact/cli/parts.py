@@ -16,7 +16,7 @@ def parts_of(object_name: str | None) -> list[str | None]:
         A folder without meshes, or a part named twice.
     """
     from geomtact.geometry.catalogue import catalogue
-    from geomtact.geometry.mesh import FORMATS
+    from geomtact.geometry.mesh_file import FORMATS
 
     if object_name is None or object_name in catalogue():
         return [object_name]

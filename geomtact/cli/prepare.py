@@ -106,7 +106,7 @@ def _doubt_unit_of_first(parts: list[str], unit: str | None, sensor: Sensor) -> 
     """As :func:`_doubt_unit`, of the first mesh file: all have the unit that is given."""
     from geomtact.errors import GeomtactError
     from geomtact.geometry.catalogue import catalogue
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
 
     first = next((part for part in parts if part not in catalogue()), None)
     if first is not None:
@@ -151,7 +151,7 @@ def open_localizer(
         tell(f"{key}: {values[key]} (from {source})")
 
     from geomtact.contact_space.resolution import MAX_POSES
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
     from geomtact.inference.files import heading
     from geomtact.inference.localizer import Localizer
     from geomtact.inference.prior import check_same

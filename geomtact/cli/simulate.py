@@ -57,7 +57,7 @@ def simulate(
     from geomtact.cli.project import require, resolve
     from geomtact.contact_space.space import ContactSpace
     from geomtact.geometry.catalogue import catalogue
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
     from geomtact.sensing import noise as noises
     from geomtact.sensing.sensor import Sensor, bundled_sensors
 

@@ -63,7 +63,7 @@ def noise_named(name: str) -> Noise:
 def meshes(parts: Sequence[str | Path] | None, unit: str | None, sensor: Sensor) -> list[Mesh]:
     """The meshes of the parts, the thesis's four by default: a wrong name is told before any work is done."""
     from geomtact.evaluation.study import THESIS_PARTS
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
 
     return [load_mesh(part, unit, sensor=sensor) for part in parts or THESIS_PARTS]
 

@@ -121,7 +121,7 @@ def train(
             }
         else:
             from geomtact.contact_space.resolution import MAX_POSES
-            from geomtact.geometry.mesh import load_mesh
+            from geomtact.geometry.mesh_file import load_mesh
             from geomtact.sensing.sensor import Sensor
 
             gel = Sensor.load(sensor)
@@ -211,7 +211,7 @@ def _train_thesis(
 ) -> None:
     """The thesis's network for one part."""
     from geomtact.contact_space.space import ContactSpace
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
     from geomtact.scoring.encoder import THESIS
     from geomtact.sensing.sensor import Sensor
     from geomtact.training.state import claim

@@ -60,7 +60,7 @@ class Sweep:
 
 def _other(mesh: Mesh, number: float) -> Mesh:
     """Another bundled part, or ``mesh`` itself for 0."""
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
 
     return load_mesh(_OTHERS[int(number) - 1]) if number else mesh
 

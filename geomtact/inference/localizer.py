@@ -20,7 +20,8 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import default_cache_dir, open_index
 from geomtact.errors import UsageError, nearest_name
 from geomtact.geometry.approach import Approach
-from geomtact.geometry.mesh import Mesh, load_mesh
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.evidence import counted_once, digest
 from geomtact.inference.fusion import fused_posterior
 from geomtact.inference.posterior import Posterior

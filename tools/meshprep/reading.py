@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geomtact.geometry.mesh import FORMATS as READ
-from geomtact.geometry.mesh import METRE_FORMATS, PREPARED, UNITS
+from geomtact.geometry.mesh_file import FORMATS as READ
+from geomtact.geometry.mesh_file import METRE_FORMATS, PREPARED, UNITS
 from geomtact.sensing.sensor import Sensor
 from meshprep import Refused
 from meshprep.surface import Surface

@@ -12,7 +12,8 @@ import numpy as np
 
 from geomtact.errors import MeshError
 from geomtact.files import write_bytes
-from geomtact.geometry.mesh import UNITS, Mesh, load_mesh
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh_file import UNITS, load_mesh
 from geomtact.versions import versions
 from meshprep import Refused
 from meshprep.adding import add

@@ -22,7 +22,7 @@ FIRST_SAMPLE = np.array([-0.125, 0.375])  # px off a pixel's centre: of its four
 
 def simulation(given: argparse.Namespace) -> list[dict[str, Any]]:
     from geomtact.contact_space.space import ContactSpace
-    from geomtact.geometry.mesh import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh
     from geomtact.sensing.cast import Caster
     from geomtact.sensing.sensor import Sensor
 

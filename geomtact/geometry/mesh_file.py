@@ -1,0 +1,273 @@
+"""A part's mesh from its file, checked before anything is computed from it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.errors import MeshError, did_you_mean, nearest_name
+from geomtact.geometry.catalogue import catalogue
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.symmetry import Symmetry
+from geomtact.se3 import Array
+
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
+UNITLESS_FORMATS = (".stl", ".obj", ".ply", ".off")
+METRE_FORMATS = (".glb", ".gltf")
+FORMATS = UNITLESS_FORMATS + METRE_FORMATS
+PREPARED = (".step", ".stp", ".3mf")  # that tools/prep_mesh.py makes meshes of
+_REEXPORT = "; if its numbers are {unit}, re-export it in metres, or save it as STL or PLY and give --unit {unit}"
+
+# Beyond these no tactile sensor is meant; they also keep squares and cubes of lengths far from overflow.
+_SMALLEST, _LARGEST = 1e-4, 1e3
+
+
+class _SensorLike(Protocol):
+    """What the scale check needs to know of a sensor, which is a later stage."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def half_window(self) -> Array: ...
+    @property
+    def pixel_pitch(self) -> tuple[float, float]: ...
+
+
+def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _SensorLike | None = None) -> Mesh:
+    """Load a part by catalogue name or from an STL, OBJ, PLY, OFF, GLB or glTF file. The object frame is the file's.
+
+    Parameters
+    ----------
+    source : name in ``meshes/catalogue.toml``, path of a file, or a Mesh (checked against the sensor only)
+    unit : "mm", "cm", "m" or "inch" in upper or lower case; needed for formats without units, not for catalogue parts
+        and glTF (metres)
+    sensor : if given, the part's size is checked against its window
+
+    Returns
+    -------
+    Mesh
+        Vertices are rounded to single precision in metres (below 4 nm up to 125 mm, as mesh files hold them), vertices closer
+        than 1e-7 of the size are welded, and vertices and faces are put in a canonical order: the same
+        surface has the same ``sha256`` whatever the order, the format or the unit it was stored in.
+
+    Raises
+    ------
+    MeshError
+        Unknown name, no or contradicting unit, unreadable, cut short, empty, not closed, inside out, or of an impossible size;
+        or the name of a sensor in place of one.
+    """
+    if isinstance(source, Mesh):
+        mesh = source
+    else:
+        name, path, unit, symmetry = _resolve(source, unit)
+        raw_vertices, raw_faces = _read(path)
+        vertices, faces = _tidy(raw_vertices * UNITS[unit], raw_faces, path, unit)
+        _check_closed(vertices, faces, path)
+        mesh = Mesh(vertices, faces, name, unit, path, symmetry)
+    if isinstance(sensor, str | os.PathLike):
+        raise MeshError(f"sensor: expected a geomtact.Sensor, got {str(sensor)!r}; give geomtact.Sensor.load of it")
+    if sensor is not None:
+        _check_scale(mesh, sensor)
+    return mesh
+
+
+def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symmetry | None]:
+    """Name, file, unit and known symmetry of a catalogue name or a path."""
+    if not isinstance(source, str | os.PathLike):
+        raise MeshError(
+            f"expected a part's name, the path of a mesh file or a geomtact.Mesh, got {type(source).__name__}; make one by "
+            'geomtact.Mesh(vertices, faces, "name", "m")'
+        )
+    text = str(source)
+    parts = catalogue()
+    path = Path(text)
+    name = text if text in parts else next((n for n, e in parts.items() if e.file == path.resolve()), None)
+    if unit is not None:
+        given, unit = unit, str(unit).lower()
+        if unit not in UNITS:
+            raise MeshError(f"{text}: unknown unit {given!r}; give unit= (--unit) one of {', '.join(UNITS)}")
+    if name is not None:
+        entry = parts[name]
+        if unit is not None and unit != entry.unit:
+            raise MeshError(
+                f"{text}: the catalogue says {entry.unit}, but the unit {unit} was given; leave the unit out"
+            )
+        return name, entry.file, entry.unit, entry.symmetry
+    suffix = path.suffix.lower()
+    if suffix in PREPARED and path.is_file():
+        raise MeshError(f"{text}: not read as it is; make a mesh of it with 'python tools/prep_mesh.py {path.name}'")
+    if suffix not in (*FORMATS, *PREPARED):
+        if path.exists():
+            raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(FORMATS)}")
+        raise MeshError(f"no part named {text!r}{nearest_name(text, parts)}; or give a mesh file ({' '.join(FORMATS)})")
+    if not path.is_file():
+        beside = [p.name for p in path.parent.glob("*") if p.suffix.lower() in FORMATS]
+        hint = did_you_mean(path.name, beside) or f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
+        raise MeshError(f"{text}: no such file{hint}")
+    if suffix in METRE_FORMATS:
+        if unit not in (None, "m"):
+            raise MeshError(
+                f"{text}: glTF is in metres by definition, but the unit {unit} was given; leave the unit out"
+                f"{_REEXPORT.format(unit=unit)}"
+            )
+        unit = "m"
+    if unit is None:
+        raise MeshError(f"{text}: {suffix} files do not say their unit; give unit= (--unit) one of {', '.join(UNITS)}")
+    return path.stem, path, unit, None
+
+
+def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (V, 3) in the file's unit and triangles (F, 3); a scene's bodies are placed and concatenated."""
+    import trimesh
+
+    if path.stat().st_size == 0:
+        raise MeshError(f"{path}: the file is empty (0 bytes); export the mesh again")
+    try:
+        # process=False: trimesh would merge, drop and reorder by rules of its own.
+        scene = trimesh.load_scene(str(path), process=False)
+        mesh = scene.to_mesh()
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+        if vertices.shape[1] != 3:
+            raise ValueError(f"vertices of {vertices.shape[1]} numbers")
+    except Exception as error:  # noqa: BLE001 -- a parser fails on bad bytes in more ways than can be listed
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise MeshError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); export the mesh again") from None
+    if len(faces) == 0:
+        if cut := _cut_short(path):
+            raise MeshError(f"{path}: {cut}; copy or export it again")
+        what = "only points or lines" if scene.geometry else "nothing"
+        raise MeshError(f"{path}: expected a surface of triangles, found {what}; export the mesh with its faces")
+    if not np.isfinite(vertices[faces[(faces >= 0) & (faces < len(vertices))]]).all():
+        raise MeshError(f"{path}: vertices hold NaN or infinity; export the mesh again")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(f"{path}: a face names a vertex that is not there (of {len(vertices)}); export the mesh again")
+    return vertices, faces
+
+
+def _cut_short(path: Path) -> str:
+    """How much a binary STL file lacks of the triangles that it says it holds, "" where it is whole or none."""
+    with open(path, "rb") as file:
+        head = file.read(84)
+    if path.suffix.lower() != ".stl" or len(head) < 84:
+        return ""
+    wanted, size = 84 + 50 * int.from_bytes(head[80:], "little"), path.stat().st_size
+    if size >= wanted or head.lstrip().lower().startswith(b"solid"):  # of which text begins
+        return ""
+    return f"is cut short: expected {wanted:,} bytes for the triangles that it says it holds, found {size:,}"
+
+
+def _tidy(vertices: Array, faces: NDArray, path: Path, unit: str) -> tuple[Array, NDArray[np.int32]]:
+    """Weld and order: the same surface gives the same arrays, whatever file it came from."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    used = vertices[np.unique(faces)]
+    with np.errstate(over="ignore"):
+        size = float(np.linalg.norm(used.max(0) - used.min(0)))
+        reach = float(np.abs(used).max())
+    if not _SMALLEST <= size <= _LARGEST or reach > 1e3 * size:
+        raise MeshError(
+            f"{path}: {_mm(size)} across and up to {_mm(reach)} from the origin as read in {unit}, expected "
+            f"{_mm(_SMALLEST)} to {_mm(_LARGEST)} near the origin; {_wrong_unit(path)}"
+        )
+    vertices = vertices.astype(np.float32).astype(np.float64) + 0.0  # + 0.0 turns -0 into 0
+    vertices, index = np.unique(vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[faces]
+    # CAD exports repeat a vertex with the last bit different, which would leave hairline cracks.
+    pairs = cKDTree(vertices).query_pairs(1e-7 * size, output_type="ndarray")
+    if len(pairs):
+        near = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(vertices),) * 2)
+        _, label = connected_components(near, directed=False)
+        _, first = np.unique(label, return_index=True)
+        faces = first[label][faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    if len(faces) == 0:
+        raise MeshError(f"{path}: every face has shrunk to a line; export the mesh again")
+    kept, faces = np.unique(faces, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    start = faces.argmin(1)[:, None]
+    faces = np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    return vertices[kept], faces.astype(np.int32)
+
+
+def _check_closed(vertices: Array, faces: NDArray[np.int32], path: Path) -> None:
+    """Every edge is walked as often one way as the other, and the surface's outside is outside.
+
+    This allows bodies that touch along an edge, which casts of rays do not mind.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    _, index, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    excess = np.bincount(index.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    bare = int((uses % 2 == 1).sum())
+    if bare:
+        raise MeshError(
+            f"{path}: not watertight, {bare} of {len(uses)} edges are open; "
+            "close the surface with tools/prep_mesh.py or a mesh editor"
+        )
+    turned = int((excess != 0).sum())
+    if turned:
+        raise MeshError(
+            f"{path}: neighbouring faces disagree about the outside at {turned} of {len(uses)} edges; "
+            "make them agree in a mesh editor and export it again"
+        )
+    join = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
+    count, body_of_vertex = connected_components(join, directed=False)
+    body = body_of_vertex[faces[:, 0]]
+    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(0), 1, 0)
+    volume = np.bincount(body, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, minlength=count)
+    low, high = (
+        _bounds(vertices, body_of_vertex, count, np.minimum),
+        _bounds(vertices, body_of_vertex, count, np.maximum),
+    )
+    # An inverted body is a cavity if it lies in an upright one; otherwise it is inside out.
+    solid = volume > 0
+    for k in np.flatnonzero(volume < 0):
+        if not ((low[solid] <= low[k]) & (high[solid] >= high[k])).all(1).any():
+            raise MeshError(
+                f"{path}: the surface is inside out (its faces look inwards); flip its faces in a mesh editor and export it again"
+            )
+    size = np.linalg.norm(high - low, axis=1).max()
+    if volume.sum() < 1e-6 * size**3:
+        raise MeshError(f"{path}: the surface encloses no volume; give a solid part")
+
+
+def _bounds(vertices: Array, body: NDArray, count: int, pick: Callable) -> Array:
+    out = np.full((count, 3), np.inf if pick is np.minimum else -np.inf)
+    pick.at(out, body, vertices)  # type: ignore[attr-defined]
+    return out
+
+
+def _check_scale(mesh: Mesh, sensor: _SensorLike) -> None:
+    """Refuse a part of less than ten pixels or more than fifty windows: with real parts the unit is wrong then."""
+    smallest = 10 * min(sensor.pixel_pitch)
+    largest = 50 * 2 * float(np.hypot(*sensor.half_window))
+    if not smallest <= mesh.diameter <= largest:
+        raise MeshError(
+            f"{mesh.path or mesh.name}: {_mm(mesh.diameter)} across as read in {mesh.unit}, but sensor {sensor.name} "
+            f"suits {_mm(smallest)} to {_mm(largest)}; {_wrong_unit(mesh.path)}"
+        )
+
+
+def _wrong_unit(path: Path | None) -> str:
+    metres = path is not None and path.suffix.lower() in METRE_FORMATS
+    return "the unit is likely wrong" + (_REEXPORT.format(unit="mm") if metres else f"; give one of {', '.join(UNITS)}")
+
+
+def _mm(metres: float) -> str:
+    """A length in millimetres with three digits, written without an exponent."""
+    mm = 1e3 * metres
+    if mm < 1e-3:
+        return "less than 0.001 mm"
+    if mm > 1e9:
+        return "more than 1,000,000,000 mm"
+    return f"{mm:,.0f} mm" if mm >= 100 else f"{mm:.3g} mm"
