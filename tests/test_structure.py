@@ -2,6 +2,7 @@
 
 import ast
 import configparser
+import importlib.util
 import json
 import re
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "geomtact"
 MODULES = sorted(PACKAGE.rglob("*.py"))
+SCRIPTS = [path for folder in ("tools", "docs/examples", "meshes") for path in sorted((ROOT / folder).rglob("*.py"))]
 
 # A module imports only from its own stage and from stages above it in this list; one line, one height.
 STAGES = [
@@ -66,6 +68,17 @@ def test_imports_go_one_way(path):
         assert allowed or {own, parts[1]} == {"errors", "se3"}, (
             f"{path}:{line}: {own} imports from {parts[1]}, a later stage"
         )
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_what_scripts_import_is_there(path):
+    """Inside functions, too: most scripts run for too long to be run here."""
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "geomtact":
+            module = importlib.import_module(node.module)
+            for alias in node.names:
+                there = hasattr(module, alias.name) or importlib.util.find_spec(f"{node.module}.{alias.name}")
+                assert there, f"{path}:{node.lineno}: no {alias.name} in {node.module}"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))

@@ -23,7 +23,7 @@ from geomtact import Localizer, Sensor, load_mesh
 from geomtact.contact_space.heightmap import NOTHING, HeightMap, Window
 from geomtact.contact_space.index import unpack
 from geomtact.report.marginals import marginals
-from geomtact.report.view import Viewer
+from geomtact.report.view import Painter
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.cast import Caster
 
@@ -190,7 +190,7 @@ def first_result() -> Figure:
     chosen = [0, 2, 4]
     figure = Figure(figsize=(11, 5.4), layout="constrained")
     grid = figure.subplots(2, 4, height_ratios=[1, 1.1])
-    sensor, viewer = posterior.sensor, Viewer(posterior.mesh, posterior.sensor)
+    sensor, painter = posterior.sensor, Painter(posterior.mesh, posterior.sensor)
     mask = posterior.observation.contact.mask
     _in_window(grid[0, 0], sensor, np.repeat(mask[..., None], 3, 2).astype(float), "The touch: a contact mask")
     grid[0, 0].set_ylabel("y [mm], downwards")
@@ -202,7 +202,7 @@ def first_result() -> Figure:
         _in_window(axes, sensor, picture, f"mode {k + 1}: {100 * modes[k].probability:.1f} %")
         x, y = (1e3 * c for c in sensor.pixel_centres())
         axes.contour(x, y, mask.astype(float), [0.5], colors=ORANGE, linewidths=1.3)
-        view = viewer.view(T)
+        view = painter.paint(T)
         below = grid[1, column]
         below.imshow(view.image, extent=view.extent)
         seen = np.argwhere((view.image < 0.995).any(-1))
