@@ -34,7 +34,7 @@ MaxPoses = Annotated[
     typer.Option(
         "--max-poses",
         min=1000,
-        help="About how many poses; plane faces add a quarter to three quarters. 1.2 million by default.",
+        help="About how many poses; plane faces add up to a quarter, on plates three quarters. 1.2 million by default.",
         show_default=False,
     ),
 ]

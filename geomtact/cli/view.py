@@ -57,7 +57,7 @@ def view(
     """Follow a part as 'geomtact track' does, and show in the browser where it may be, live.
 
     The page shows the sensor, the contact, the part at its most probable pose and, faintly, at poses drawn from the posterior.
-    It needs viser: pip install 'geomtact[viz]'. Exit status as of 'geomtact track'.
+    It needs viser: pip install 'geomtact\\[viz]'. Exit status as of 'geomtact track'.
     """
     from geomtact.report.viewer import Viewer, check_viewer
 

@@ -125,7 +125,7 @@ class Localizer:
         approach : [(direction (3,), half angle)]: only touches whose direction from the object towards the sensor, in
             the object frame, lies within the angle [rad] of one of these; 0 means exactly that face
         scorer : how contacts are compared, one of ``geomtact.scoring.catalogue.SCORERS``, or weights (.safetensors)
-        max_poses : about how many poses the grid may have; plane faces add a quarter to three quarters
+        max_poses : about how many poses the grid may have; plane faces add up to a quarter, on plates three quarters
         cache_dir : folder of the index cache; by default ``$GEOMTACT_CACHE`` or the user's cache folder
         progress : called with the share done (0 to 1) and what is being done
 
@@ -183,6 +183,10 @@ class Localizer:
         Raises
         ------
         ImageError, PoseError, UsageError, InputError
+        NoPoseAgreesError
+            Of several sensors: there is no pose at which the part touches all that show contact.
+        CacheError
+            The index of a prior's file cannot be opened or built.
         """
         how = _effort(effort)
         images, frame, T_frame_sensor = views_of(image, T_world_sensor)
@@ -290,19 +294,33 @@ class Localizer:
         return replace(posterior, warnings=warnings, settings=posterior.settings | {"odd": odd}), log_prior
 
     def simulate(self, T_sensor_object: Any) -> Contact:
-        """What the sensor would see at a pose (4, 4), without noise (thesis 6.1.3)."""
+        """What the sensor would see at a pose (4, 4), object to sensor in metres, without noise (thesis 6.1.3): mask and heights
+        at the sensor's own resolution.
+
+        Raises
+        ------
+        PoseError
+            Not a rigid pose.
+        """
         return self.space.caster.contact(self.sensor, check_pose(T_sensor_object, "T_sensor_object"))
 
     def track(
         self, frames: Iterable[Any], T_world_sensor: Any = None, motion: Any = None, **options: Any
     ) -> Iterator[Posterior]:
-        """A Posterior for each of a sequence of frames (thesis 8.1); options as of ``inference.sequence.track``."""
+        """A Posterior for each of a sequence of frames, given all frames up to it (thesis 8.1).
+
+        All parameters and options (``effort``, ``prior``, ``most``, ``kind``, ``background``, ``counts``, ``fresh``,
+        ``on_error``, ``seed``) are those of :func:`geomtact.inference.sequence.track`.
+        """
         from geomtact.inference.sequence import track
 
         return track(self, frames, T_world_sensor, motion, **options)
 
     def next_touch(self, posterior: Posterior, actions: Any = None, seed: int = 0) -> list[Action]:
-        """Touches and probes by what they are expected to tell for their cost (thesis 8.2); see ``planning.next_touch``."""
+        """Touches and probes by what they are expected to tell for their cost, the best first (thesis 8.2).
+
+        Parameters are those of :func:`geomtact.planning.next_touch.next_touch`.
+        """
         return next_touch(posterior, actions, seed=seed)
 
     def __repr__(self) -> str:

@@ -172,8 +172,8 @@ class Posterior:
     def log_density(self, T: ArrayLike) -> Any:
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
 
-        -inf outside the contact pose space; inside it finite, unless the prior ruled T out. Without contact, -inf where T
-        would touch, however deep, and elsewhere the prior's, 0 without one.
+        -inf outside the contact pose space; inside it finite, unless the prior ruled T out, or T misses another sensor that shows
+        contact. Without contact, -inf where T would touch, however deep, and elsewhere the prior's, 0 without one.
         """
         T = check_transforms(T)
         inside = inverse(self.T_frame_sensor) @ T.reshape(-1, 4, 4)
@@ -242,14 +242,27 @@ class Posterior:
         return self.T_frame_sensor @ draw_within(self.index, self.space, cells, rng)[0]
 
     def save(self, path: Any) -> None:
-        """Write ``posterior.npz`` (no pickles); see :func:`geomtact.inference.files.load`."""
+        """Write it to the file ``path``, such as posterior.npz (no pickles).
+
+        Raises
+        ------
+        InputError
+            It cannot be written there.
+        """
         from geomtact.inference.files import save
 
         save(self, path)
 
     @staticmethod
     def load(path: Any, cache_dir: Any = None) -> Posterior:
-        """Read what :meth:`save` wrote."""
+        """Read what :meth:`save` wrote: the file ``path``, or the posterior.npz in that folder. Its index is opened from
+        ``cache_dir``, by default ``$GEOMTACT_CACHE`` or the user's cache folder, or built anew where it is no longer there.
+
+        Raises
+        ------
+        InputError
+            The file cannot be read, or is no posterior.
+        """
         from geomtact.inference.files import load
 
         return load(path, cache_dir)

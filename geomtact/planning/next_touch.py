@@ -48,7 +48,8 @@ class Action:
     contact : probability that it touches
     number : among the actions given, from 1
     of : the action itself
-    roughly : whether it was tried at some of the poses alone, as one of many that tell less
+    roughly : whether it was tried at some of the poses alone, as one of many that tell less: its ``expected_discarded`` is then
+        not to be compared with others'
     """
 
     T_world_sensor: Array

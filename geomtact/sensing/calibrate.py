@@ -70,7 +70,7 @@ def calibrate(
     ----------
     presses : images (H, W, 3) RGB, or their paths, of one ball pressed in at several places, three at least; a dozen are better
     ball_diameter : metres
-    background : the same sensor without contact
+    background : the same sensor without contact: an image (H, W, 3) RGB, or its path
     pixel_pitch : of the images [m], or along x and along y; that of ``sensor`` by default
     sensor : whose geometry to keep, by name, file or itself; by default an orthographic, flat one of the images' size
     name : of the new sensor
@@ -78,9 +78,12 @@ def calibrate(
     Raises
     ------
     UsageError
-        Neither a pitch nor a sensor was given: presses of unknown depth do not tell the pitch. The largest possible is named.
+        Fewer than three images were given; the diameter or the pitch is not in metres; or neither a pitch nor a sensor was given:
+        presses of unknown depth do not tell the pitch. The largest possible is named.
     InputError
         Fewer than three images show the whole round imprint of a ball that may be so large; or what they show is contradictory.
+    ImageError, SensorError
+        An image, or the sensor, cannot be read.
     """
     return calibrated(presses, ball_diameter, background, pixel_pitch, sensor, name).sensor
 
