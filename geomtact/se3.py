@@ -23,7 +23,10 @@ def check_transforms(T: ArrayLike, name: str = "T") -> Array:
     PoseError
         Wrong shape, not finite, or not a rotation within 1e-6; says which.
     """
-    out = np.asarray(T, dtype=np.float64)
+    try:
+        out = np.asarray(T, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise PoseError(f"{name}: expected numbers, 4x4 matrices of one shape, got {type(T).__name__}") from None
     if out.ndim < 2 or out.shape[-2:] != (4, 4):
         raise PoseError(f"{name}: expected rigid transforms of shape (..., 4, 4), got {out.shape}; give 4x4 matrices")
     if not np.isfinite(out).all():

@@ -151,6 +151,11 @@ def test_a_study_apart_keeps_what_it_could_judge_and_names_the_rest(few_touches,
     done = CliRunner().invoke(app, [*words, "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)])
     assert done.exit_code == 3 and "1 of 2 parts are not judged" in done.output and "pim: not judged" in done.output
     assert list(json.loads(out.read_text())["parts"]) == [PARTS[0]]
+    (kept := tmp_path / "study.parts" / "mine.txt").write_text("mine")
+    again = [*words[:3], *words[4:], "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)]
+    assert CliRunner().invoke(app, again).exit_code == 0 and kept.read_text() == "mine"
+    twice = CliRunner().invoke(app, [*again[:3], f"elsewhere/{PARTS[0]}.stl", *again[3:]])
+    assert twice.exit_code == 2 and f"two parts are named '{PARTS[0]}'" in twice.output
     without = CliRunner().invoke(app, [*words, "--jobs", "2"])
     assert without.exit_code == 2 and "--out" in without.output
 

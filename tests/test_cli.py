@@ -279,8 +279,16 @@ def test_geomtact_toml_serves_before_the_metadata(tmp_path):
     assert project.resolve(nothing, {}, below)[0] == {"object": None, "unit": None, "sensor": "gelsight-mini"}
 
 
+def test_a_file_does_not_stand_before_what_is_bundled(tmp_path):
+    (tmp_path / "ball").mkdir()
+    (tmp_path / "digit").write_text("")
+    (tmp_path / "geomtact.toml").write_text('object = "ball"\nsensor = "digit"\n')
+    assert project.read(tmp_path / "geomtact.toml") == {"object": "ball", "sensor": "digit"}
+
+
 @pytest.mark.parametrize(
-    "text, expected", [("sensr = 'x'", "'sensor'"), ("unit = 3", "text in quotes"), ("= =", "TOML")]
+    "text, expected",
+    [("sensr = 'x'", "'sensor'"), ("unit = 3", "text in quotes"), ("= =", "TOML"), ("object = ''", "object is empty")],
 )
 def test_a_wrong_geomtact_toml_is_named(tmp_path, text, expected):
     (tmp_path / "geomtact.toml").write_text(text)

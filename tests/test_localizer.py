@@ -1,5 +1,7 @@
 """Laws of localization: priors multiply, frames and files make no difference, and probabilities come true."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -364,6 +366,13 @@ def test_a_prior_that_makes_no_sense_is_refused(ball, a_touch, prior, error, mes
     assert "\n" not in str(caught.value)
 
 
+def test_what_a_mode_tells_is_a_prior(localizer, a_touch):
+    """Of a ball, too, whose turns tell nothing."""
+    mode = localizer.localize(a_touch(localizer)[1]).modes(1)[0]
+    prior = GaussianPrior(mode.T, mode.covariance)
+    assert localizer.localize(a_touch(localizer)[1], prior=prior, effort="fast").log_density(mode.T) > 0
+
+
 def test_a_prior_of_another_object_or_frame_is_refused(ball, flat_nut, a_touch):
     mask = a_touch(ball)[1]
     other = flat_nut.localize(a_touch(flat_nut)[1], effort="fast")
@@ -372,6 +381,12 @@ def test_a_prior_of_another_object_or_frame_is_refused(ball, flat_nut, a_touch):
     world = ball.localize(mask, T_world_sensor=T_WORLD, effort="fast")
     with pytest.raises(InputError, match="its frame is 'world' but this posterior's is 'sensor'"):
         ball.localize(mask, prior=world)
+    held = ball.localize(mask, effort="fast")
+    elsewhere = replace(
+        held, index=replace(held.index, sensor=replace(ball.sensor, camera_distance=0.03, name="other"))
+    )
+    with pytest.raises(InputError, match="in the frame of the sensor 'other', not of 'gelsight-mini'"):
+        ball.localize(mask, prior=elsewhere)
     nothing = ball.localize(np.zeros_like(mask))
     with pytest.raises(InputError, match="does not touch the sensor"):
         ball.localize(mask, prior=nothing)
@@ -435,8 +450,6 @@ def test_millimetre_stl_and_metre_glb_give_one_posterior(make_localizer, tmp_pat
 
 
 def test_the_order_of_vertices_and_faces_does_not_matter(make_localizer, rng):
-    from dataclasses import replace
-
     mesh = load_mesh("hex_nut")
     order = rng.permutation(len(mesh.vertices))
     where = np.argsort(order)

@@ -399,6 +399,30 @@ def test_the_file_holds_what_is_promised_and_no_pickles(plug, posteriors, tmp_pa
     assert str(data["frame"]) == "sensor" and str(data["object_sha256"]) == plug.mesh.sha256
 
 
+@pytest.mark.parametrize(
+    ("name", "spoil", "expected"),
+    [
+        ("T_frame_sensor", lambda T: 2 * T, "no rotation"),
+        ("T_frame_sensor", lambda T: T * np.nan, "finite"),
+        ("row_log_prob", lambda p: p + 5, "probabilities that add up to 148"),
+        ("row_log_prob", lambda p: p[:-1], "rows of unlike length"),
+        ("row_cell", lambda cells: cells + 10**9, "cells that are not of its grid"),
+        ("row_cell", lambda cells: cells[::-1], "cells that are not of its grid"),
+        ("vertices", lambda vertices: 1.5 * vertices, "not the one that it says it is of"),
+        ("frame", lambda frame: np.array("camera"), "frame 'camera'"),
+    ],
+)
+def test_a_file_whose_numbers_make_no_posterior_is_refused(
+    plug, posteriors, tmp_path, cache_dir, name, spoil, expected
+):
+    posteriors(plug).save(tmp_path / "p.npz")
+    with np.load(tmp_path / "p.npz", allow_pickle=False) as file:
+        data = {k: file[k] for k in file.files}
+    np.savez(tmp_path / "spoilt.npz", **data | {name: spoil(data[name])})
+    with pytest.raises(InputError, match=f"spoilt.npz: not a posterior that geomtact saved .*{expected}"):
+        Posterior.load(tmp_path / "spoilt.npz", cache_dir)
+
+
 def test_no_contact_survives_the_disk(plug, tmp_path, cache_dir):
     plug.localize(np.zeros(plug.sensor.image_size_px[::-1], bool)).save(tmp_path / "p.npz")
     again = Posterior.load(tmp_path / "p.npz", cache_dir)

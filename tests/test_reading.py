@@ -147,6 +147,18 @@ def test_sixteen_bit_grey_is_height_in_micrometres(tmp_path):
     assert np.abs(seen.contact.height - HEIGHT).max() < 0.51e-6
 
 
+def test_heights_of_less_than_a_micrometre_have_a_wrong_unit():
+    with pytest.raises(ImageError, match=r"expected heights in metres .* divided by 1000 once too often"):
+        read_observation(HEIGHT * 1e-4, MINI)
+
+
+def test_the_order_of_bytes_does_not_matter():
+    micrometres = np.round(HEIGHT * 1e6).astype(np.uint16)
+    for array in (micrometres, HEIGHT):
+        seen, swapped = (read_observation(array.astype(array.dtype.newbyteorder(order)), MINI) for order in "<>")
+        assert seen.kind == swapped.kind and np.array_equal(seen.contact.height, swapped.contact.height)
+
+
 def test_three_channels_are_a_reading_in_rgb_order(tmp_path, background, rng):
     image = press(background, 120, 100, 40, rng)
     path = write(tmp_path / "reading.png", image)
@@ -387,6 +399,9 @@ def test_a_mask_that_hardly_is_a_touch_is_told_of(rng):
     knurl = (rows % 16 < 6) & (columns % 16 < 6)  # 300 tips of 0.38 mm, 1 mm apart
     noise, mostly, dirt = (rng.random(SHAPE) < share for share in (0.3, 0.9, 0.003))
     told = [("as dust does", dot), ("if that is where nothing touches, invert it", ~MASK)]
+    small, at_the_border = np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
+    small[100:110, 100:120] = at_the_border[:30, 40:70] = True
+    told += [("if that is where nothing touches, invert it", ~mask) for mask in (small, at_the_border)]
     told += [("specks and holes as small as dust", mask) for mask in (noise, mostly, MASK | dirt)]
     for said, mask in told:
         (warning,) = read_observation(mask, MINI).warnings

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import os
@@ -126,12 +127,15 @@ def _judge_apart(judge: Command, options: Mapping[str, Any], jobs: int | None, r
     out: Path | None = options["out"]
     if out is None:
         raise UsageError("--jobs and --ray need --out, the file in which what is found of the parts comes together")
-    schema = judge.__globals__["SCHEMA"]
-    content, parts = study_file.load(out, schema), [str(part) for part in options["parts"]]
+    schema, parts = judge.__globals__["SCHEMA"], [str(part) for part in options["parts"]]
+    names = [Path(part).stem for part in parts]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise UsageError(f"two parts are named {twice!r}, and a study keeps what it finds by name; rename one's file")
+    content = study_file.load(out, schema)
     before = dict(content["parts"])
     folder = out.absolute().with_name(f"{out.stem}.parts")
     folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / f"{Path(part).stem}.json" for part in parts]
+    files = [folder / f"{name}.json" for name in names]
     for file in files:
         if before and not file.exists():
             shutil.copyfile(out, file)
@@ -150,4 +154,7 @@ def _judge_apart(judge: Command, options: Mapping[str, Any], jobs: int | None, r
             found = study_file.load(file, schema)["parts"]
             content["parts"] |= {name: entry for name, entry in found.items() if entry != before.get(name)}
         study_file.save(out, content)
-    shutil.rmtree(folder)
+    for file in files:
+        file.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # what else lies there is not ours
+        folder.rmdir()

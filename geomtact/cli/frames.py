@@ -67,7 +67,7 @@ def listed(folder: Path) -> list[Path]:
     """The images in a folder by name, numbers in it by value: 2 before 10."""
     images = (path for path in folder.iterdir() if path.suffix.lower() in _IMAGES and not path.name.startswith("."))
     return sorted(
-        images, key=lambda path: [(not s.isdigit(), int(s) if s.isdigit() else 0, s) for s in _parts(path.name)]
+        images, key=lambda path: [(not s.isdecimal(), int(s) if s.isdecimal() else 0, s) for s in _parts(path.name)]
     )
 
 

@@ -69,7 +69,7 @@ def cache(
     if clear:
         removed = store.clear_cache(folder)
     elif limit_gb is not None:
-        removed = store.bound_cache(int(1e9 * limit_gb), folder)
+        removed = store.bound_cache(int(min(1e9 * limit_gb, 2**62)), folder)
     elif remove:
         removed = store.remove_from_cache(remove, folder)
     if removed is not None:

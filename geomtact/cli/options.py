@@ -60,7 +60,7 @@ EffortName = Annotated[
         show_default=False,
     ),
 ]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of all randomness.")]
 CacheDir = Annotated[
     Path | None,
     typer.Option(

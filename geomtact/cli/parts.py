@@ -20,6 +20,8 @@ def parts_of(object_name: str | None) -> list[str | None]:
 
     if object_name is None or object_name in catalogue():
         return [object_name]
+    if not object_name.strip():
+        raise InputError("--object: expected a part's name or a mesh file, got nothing; is a variable empty?")
     folder = Path(object_name)
     if not folder.is_dir():
         names = [name.strip() for name in object_name.split(",")] if not folder.exists() else [object_name]

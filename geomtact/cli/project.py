@@ -106,7 +106,17 @@ def read(path: Path) -> dict[str, str]:
             raise InputError(f"{path}: unknown key {key!r}{nearest_name(key, KEYS)}")
         if not isinstance(value, str):
             raise InputError(f"{path}: {key} must be text in quotes, got {value!r}")
+        if not value.strip():
+            raise InputError(f"{path}: {key} is empty; give it, or leave the line out")
         beside = path.parent / value
         if key in ("object", "sensor", "background") and (beside.is_file() or (key == "object" and beside.is_dir())):
-            entries[key] = str(beside)
+            entries[key] = value if is_bundled(key, value) else str(beside)
     return entries
+
+
+def is_bundled(key: str, name: str) -> bool:
+    """Whether ``name`` is that of a bundled object or sensor, which ``key`` says: a file of the same name stands behind it."""
+    from geomtact.geometry.catalogue import catalogue
+    from geomtact.sensing.sensor import bundled_sensors
+
+    return name in catalogue() if key == "object" else key == "sensor" and name in bundled_sensors()

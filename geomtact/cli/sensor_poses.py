@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from geomtact.cli.project import is_bundled
 from geomtact.contact_space.carry import RigStd
 from geomtact.errors import InputError, nearest_name
 from geomtact.files import read_json
@@ -90,4 +91,5 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
 
 def _beside(path: Path, name: Any) -> str:
     """A sensor's TOML file named relative to ``path``, or a bundled sensor's name."""
-    return str(path.parent / str(name)) if (path.parent / str(name)).is_file() else str(name)
+    name = str(name)
+    return str(path.parent / name) if (path.parent / name).is_file() and not is_bundled("sensor", name) else name

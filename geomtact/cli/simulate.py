@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -109,10 +108,9 @@ def simulate(
         }
         _write(out / stem, shown[k - 1] if reading else touch.mask, truth, metadata)
         typer.echo(f"{out / stem}.png: {100 * touch.mask.mean():.1f} % of the window in contact")
-        if not isfinite(touch.penetration):
-            tell(
-                "warning: the part does not touch there: the pose is T_sensor_object, in metres, the membrane at z = 0"
-            )
+        if not 0 < touch.penetration <= pressed.max_penetration:
+            what = "is too deep" if touch.penetration > 0 else "does not touch"
+            tell(f"warning: the part {what} there: the pose is T_sensor_object, in metres, the membrane at z = 0")
     if reading:
         typer.echo(f"{out / 'background.png'}: without contact, for --background")
 

@@ -160,7 +160,7 @@ class Index:
         R, t = T.reshape(-1, 4, 4)[:, :3, :3], T.reshape(-1, 4, 4)[:, :3, 3]
         up = R[:, 2]
         cones = self.directions.cones
-        turn, step = self.angle_step, self.resolution.step
+        turn, step = max(self.angle_step, NO_TILT), self.resolution.step
         # the cells of disks leave less tilt, and an approach no more than its cones are wide
         tilt = np.array([min(turn, self.directions.disk_step(a)) for a in approach_of(R)])
         if cones is not None:

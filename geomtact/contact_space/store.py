@@ -9,8 +9,8 @@ import contextlib
 import hashlib
 import json
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -162,7 +162,7 @@ def remove_from_cache(names: Sequence[str], cache_dir: str | Path | None = None)
 def _removed(entries: list[CacheEntry]) -> list[CacheEntry]:
     for entry in entries:
         shutil.rmtree(entry.folder, ignore_errors=True)
-    return entries
+    return [entry for entry in entries if not entry.folder.exists()]
 
 
 def clear_cache(cache_dir: str | Path | None = None) -> list[CacheEntry]:
@@ -215,7 +215,10 @@ def _write(folder: Path, index: Index) -> None:
             "centre": symmetry.centre.tolist(),
         },
     }
-    building = Path(tempfile.mkdtemp(prefix=f"building-{index.key}-", dir=folder))
+    for left in folder.glob(f"building-{index.key}-*"):  # by a run that was killed: the lock is ours
+        shutil.rmtree(left, ignore_errors=True)
+    building = folder / f"building-{index.key}-{secrets.token_hex(4)}"
+    building.mkdir()
     try:
         for name in Index.ARRAYS:
             np.save(building / f"{name}.npy", getattr(index, name), allow_pickle=False)

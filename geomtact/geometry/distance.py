@@ -1,8 +1,9 @@
 """How far apart two poses of an object are, in the motion of its points, modulo its symmetry.
 
 Mean point distance is ADD (Hinterstoisser et al. 2012), the thesis's pose error; the largest point distance is MSSD
-(Hodan et al. 2020). Both are taken at the image under the object's symmetry that is nearest in mean square: between poses
-far apart they may be a little above their least over the symmetry group, between near ones they are that.
+(Hodan et al. 2020). Both are taken at the image under the object's symmetry that is nearest in mean square, the object's centre
+put on itself: between poses far apart they may be a little above their least over the symmetry group, between near ones they
+are that.
 """
 
 from __future__ import annotations
@@ -98,7 +99,8 @@ class PoseDistance:
         return out
 
     def aligned(self, T: ArrayLike, others: ArrayLike) -> Array:
-        """The images (m, 4, 4) of ``others`` under the object's symmetry that lie nearest to ``T``, in mean square."""
+        """The images (m, 4, 4) of ``others`` under the object's symmetry whose rotations are nearest to that of ``T``, by how far
+        they move points about the object's centre, in mean square."""
         T, others = np.asarray(T, float), np.asarray(others, float)
         symmetry = self.mesh.symmetry
         if symmetry is None or symmetry.kind == "none":

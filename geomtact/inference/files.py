@@ -9,18 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.store import open_index
-from geomtact.errors import InputError
+from geomtact.errors import GeomtactError, InputError
 from geomtact.files import write_whole
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.modes import Refined
 from geomtact.inference.posterior import Posterior
+from geomtact.se3 import check_pose
 from geomtact.sensing.sensor import Sensor
 
 _KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many
+_OFF = 1e-3  # that probabilities may add up to beside 1
 _FORMAT = "geomtact/posterior/2"
 _BROKEN = (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError)
 
@@ -120,7 +123,16 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"], symmetry=_symmetry(data, meta))
         sensor = Sensor.from_toml(str(data["sensor_toml"]), str(path))
         cells, runs, log_prob = data["row_cell"], data["row_length"], data["row_log_prob"]
-        poses = int(data["index_poses"])
+        poses, frame, seed, evidence = (
+            int(data["index_poses"]),
+            str(data["frame"]),
+            int(data["seed"]),
+            float(meta["log_evidence"]),
+        )
+        _check(mesh.sha256 == str(data["object_sha256"]), "its mesh is not the one that it says it is of")
+        _check(frame in ("sensor", "world"), f"frame {frame!r}")
+        _check_rows(cells, runs, log_prob, poses)
+        T_frame_sensor = check_pose(data["T_frame_sensor"], "T_frame_sensor")
         extra = meta["refined"]
         refined = {
             int(k): Refined(T, C, np.array(rows).reshape(-1, 6), length, moved)
@@ -128,9 +140,9 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
                 data["refined_cells"], data["refined_T"], data["refined_covariance"], extra, strict=True
             )
         }
-    except _BROKEN as error:
+    except (*_BROKEN, GeomtactError) as error:
         raise _not_saved(path, error) from None
-    settings = meta["settings"]
+    settings = meta["settings"] or {}
     max_poses, key = settings.get("max_poses", MAX_POSES), str(data["index_key"])
     index = open_index(mesh, sensor, meta["approach"], max_poses, cache_dir, key=key)
     if poses != len(index):
@@ -139,11 +151,11 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         index,
         cells,
         log_prob,
-        frame=str(data["frame"]),
-        T_frame_sensor=data["T_frame_sensor"],
+        frame=frame,
+        T_frame_sensor=T_frame_sensor,
         contact=bool(meta["contact"]),
-        log_evidence=float(meta["log_evidence"]),
-        seed=int(data["seed"]),
+        log_evidence=evidence,
+        seed=seed,
         runs=runs if len(runs) else None,
         refined=refined,
         settings=settings,
@@ -174,10 +186,27 @@ def _read(path: Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any
             data = {name: file[name] for name in names or file.files}
         meta = json.loads(str(data["meta"]))
         if meta["format"] != _FORMAT:
-            raise ValueError(f"format {meta['format']!r}")
+            raise ValueError(f"format {meta['format']!r}, not {_FORMAT!r}: localize again")
     except _BROKEN as error:
         raise _not_saved(path, error) from None
     return data, meta
+
+
+def _check_rows(cells: NDArray[Any], runs: NDArray[Any], log_prob: NDArray[Any], poses: int) -> None:
+    """ValueError where runs of cells are none of a grid of so many ``poses``, or no distribution over it."""
+    _check(cells.ndim == 1 and cells.dtype.kind in "iu" and log_prob.shape == cells.shape, "rows of unlike length")
+    _check(len(runs) in (0, len(cells)), "rows of unlike length")
+    if len(cells):
+        ends = cells + (runs if len(runs) else 1)
+        inside = cells[0] >= 0 and ends[-1] <= poses and (ends > cells).all() and (ends[:-1] <= cells[1:]).all()
+        _check(bool(inside), "cells that are not of its grid")
+        total = float(np.exp(log_prob.astype(float)).sum())
+        _check(abs(total - 1) < _OFF, f"probabilities that add up to {total:.3g}")
+
+
+def _check(holds: bool, wrong: str) -> None:
+    if not holds:
+        raise ValueError(wrong)
 
 
 def _not_saved(path: str | Path, error: Exception) -> InputError:

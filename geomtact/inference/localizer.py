@@ -369,6 +369,8 @@ def _calibrated_as(localizer: Localizer, sensor: Sensor) -> Localizer:
 def _effort(effort: str | Effort) -> Effort:
     if isinstance(effort, Effort):
         return effort
+    if not isinstance(effort, str):
+        raise UsageError(f"effort: expected one of {', '.join(EFFORTS)}, or an Effort, got {type(effort).__name__}")
     if effort not in EFFORTS:
         raise UsageError(f"no effort named {effort!r}{nearest_name(effort, EFFORTS)}")
     return EFFORTS[effort]

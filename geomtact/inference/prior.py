@@ -273,6 +273,11 @@ def _pair(poses: Any, log_masses: Any) -> tuple[Array, Array]:
 
 def _of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array, frame: str) -> Array:
     check_same(_heading(prior), index.mesh, frame)
+    if frame == "sensor" and prior.sensor.sha256 != index.sensor.sha256:
+        raise InputError(
+            f"prior: it is in the frame of the sensor {prior.sensor.name!r}, not of {index.sensor.name!r}; give both sensors' "
+            "poses in the world (--sensor-poses, T_world_sensor in Python)"
+        )
     if not np.allclose(prior.T_frame_sensor, T_frame_sensor, atol=1e-9):
         return _carried(index, prior, T_frame_sensor)
     if not prior.contact:

@@ -11,7 +11,7 @@ from geomtact.contact_space.carry import RigStd
 from geomtact.errors import InputError, UsageError
 from geomtact.se3 import Array, adjoint, check_transforms, inverse
 
-_HALL = 100.0  # m from the origin from which a translation is taken to be in millimetres
+_HALL = 30.0  # m from the origin from which a translation is taken to be in millimetres
 _ROOM = 10.0  # m between two sensors from which translations are taken to be in millimetres
 
 

@@ -24,7 +24,9 @@ __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observ
 KINDS = ("auto", "mask", "height", "reading")
 _DUST = 0.1e-6  # m^2 of contact, under which a touch tells nothing (docs/stability.md)
 _SPECKS = 100  # pieces and holes no larger than dust, that a mask of one touch has at most
-_NEGATIVE = (0.5, 0.95)  # share in contact of a mask that may be a negative, if all of its border is
+# share in contact of a mask that may be a negative, if all of its border is, or most of it
+_NEGATIVE, _NEGATIVE_MOST, _BORDER = 0.5, 0.85, 0.8
+_THOUSANDTH = 1e-6  # m that no indentation is as shallow as, so that its unit is wrong
 
 
 @dataclass(frozen=True)
@@ -97,13 +99,13 @@ def read_observation(
     share, area = float(contact.mask.mean()), float(contact.mask.sum() * sensor.pixel_area(contact.mask.shape))
     if share == 1:
         warnings.append(f"{name}: every pixel is in contact: the contact fills the image, so its outline is not seen")
-    elif kind == "mask" and _NEGATIVE[0] < share < _NEGATIVE[1] and _framed(contact.mask):
-        warnings.append(
-            f"{name}: {100 * share:.0f} % of the mask is contact; if that is where nothing touches, invert it"
-        )
     elif kind == "mask" and (specks := _specks(contact.mask, sensor)) > _SPECKS:
         warnings.append(
             f"{name}: the mask has {specks} specks and holes as small as dust, as noise has; smooth it, or give the reading"
+        )
+    elif kind == "mask" and _perhaps_negative(contact.mask, share):
+        warnings.append(
+            f"{name}: {100 * share:.0f} % of the mask is contact; if that is where nothing touches, invert it"
         )
     elif 0 < area < _DUST:
         warnings.append(f"{name}: the contact covers {1e6 * area:.2g} mm2, as dust does: it tells next to nothing")
@@ -118,6 +120,7 @@ def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any
         name, array = role, np.asarray(source)
     if array.dtype.kind not in "buif":
         raise ImageError(f"{name}: expected numbers, got an array of {array.dtype}; give bool, integers or floats")
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[..., 0]
     if array.size == 0 or array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] > 4):
@@ -166,9 +169,10 @@ def _specks(mask: NDArray[np.bool_], sensor: Sensor) -> int:
     return int((pixels * sensor.pixel_area(mask.shape) <= _DUST).sum())
 
 
-def _framed(mask: NDArray[np.bool_]) -> bool:
-    """Whether all pixels along the image's border are set."""
-    return bool(mask[[0, -1]].all() and mask[:, [0, -1]].all())
+def _perhaps_negative(mask: NDArray[np.bool_], share: float) -> bool:
+    """Whether a mask of which a ``share`` is set may show where nothing touches: its border is set, too."""
+    border = float(np.concatenate([mask[[0, -1]].ravel(), mask[1:-1, [0, -1]].ravel()]).mean())
+    return border >= (_BORDER if share > _NEGATIVE_MOST else 1.0) and share > _NEGATIVE
 
 
 def _decide(array: NDArray[Any], name: str, beside_background: bool, warnings: list[str]) -> str:
@@ -238,6 +242,11 @@ def _height(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str])
         raise ImageError(
             f"{name}: expected heights in metres up to about {sensor.max_penetration:g}, the largest is {highest:.4g}; "
             "these look like millimetres: divide by 1000 (16-bit grey counts micrometres); or a camera's image: --kind reading"
+        )
+    if 0 < highest < _THOUSANDTH:
+        raise ImageError(
+            f"{name}: expected heights in metres up to about {sensor.max_penetration:g}, the largest is {highest:.4g}; these "
+            "look divided by 1000 once too often (16-bit grey counts micrometres)"
         )
     if highest > 1.5 * sensor.max_penetration:
         warnings.append(f"{name}: heights up to {1e3 * highest:.2f} mm exceed the sensor's max_penetration_mm")
