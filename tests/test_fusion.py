@@ -375,7 +375,7 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
     paths = []
     for i, touch in enumerate(touches):
         paths.append(str(tmp_path / f"{i}.png"))
-        write_image(paths[-1], touch.mask, {"object": "gear"} if i == 0 else None)
+        write_image(paths[-1], touch.mask, ({"object": "gear"}, {"sensor": "digit"})[i])
     poses = tmp_path / "poses.json"
     # with a byte order mark, as some editors write it
     poses.write_text(json.dumps({"T_world_sensor": sensors.tolist(), "std_mm": 0.5}), "utf-8-sig")
@@ -384,6 +384,7 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
     done = CliRunner().invoke(app, [*args, "--sensor-poses", str(poses), "--json", "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     assert "0.png was made of gear, as its metadata says, and is localized on connector_plug" in done.stderr
+    assert "1.png was made with digit, as its metadata says, and is localized on gelslim" in done.stderr
     content = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))
     assert content["frame"] == "world" and len(content["settings"]["T_world_sensor"]) == 2 and content["modes"]
     for text, words in [

@@ -487,7 +487,9 @@ def test_track_tells_what_is_wrong_in_one_line(command, folder):
     assert "expected a folder to watch" in command("-", "--follow", status=2).stderr
     assert "frames: expected at least one image" in command("-", input="\n", status=3).stderr
     (folder / "f_3.png").write_bytes(b"broken")
-    assert "frame 2: " in command(folder, status=3).stderr
+    assert "frame 2: " in command(folder, "--tum", "some.txt", status=3).stderr
+    assert len((folder.parent / "some.txt").read_text().splitlines()) == 1, "what was known before it is kept"
+    assert "expected a file in a folder that is there" in command(folder, "--tum", "no/x.txt", status=2).stderr
     lines = [json.loads(s) for s in command(folder, "--skip-broken").stdout.splitlines()]
     assert [bool(line["warnings"]) for line in lines] == [False, True, False, False]
     write_image(folder / "f_2.png", np.zeros((240, 320), bool))

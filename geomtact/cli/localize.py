@@ -147,10 +147,11 @@ def localize(
     if live:
         _follow(asked, camera)
         return
-    made_of = metadata.get("geomtact:object")
     found, took = _identified(asked, parts, placed)
-    if made_of and len(parts) == 1 and parts[0] and Path(made_of).stem != Path(parts[0]).stem:
-        tell(f"warning: {images[0]} was made of {made_of}, as its metadata says, and is localized on {parts[0]}")
+    named = placed.sensor if placed is not None else None
+    of_each: Sequence[str | None] = named or [values["sensor"]] * len(images)
+    for image, used in zip(images, of_each, strict=True):
+        _doubt(image, parts[0] if len(parts) == 1 else None, used)
     if len(parts) > 1 and found.foreign:
         tell("warning: what is shown is unlike all of the parts: is it another one?")
     for warning in found.posterior.warnings:
@@ -159,6 +160,16 @@ def localize(
     if not found.posterior.contact:
         tell(_without_contact(asked, found.posterior.observation.kind))
         raise typer.Exit(NO_CONTACT)
+
+
+def _doubt(image: Path, part: str | None, sensor: str | None) -> None:
+    """Say where an image's metadata name another part or sensor than it is localized with."""
+    from geomtact.sensing.reading import read_metadata
+
+    told = read_metadata(image)
+    for word, made, used in (("of", told.get("geomtact:object"), part), ("with", told.get("geomtact:sensor"), sensor)):
+        if made and used and Path(made).stem != Path(used).stem:
+            tell(f"warning: {image} was made {word} {made}, as its metadata says, and is localized on {used}")
 
 
 @dataclass(frozen=True)

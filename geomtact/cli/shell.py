@@ -50,6 +50,17 @@ def check_folder(out: Path | None) -> None:
         raise UsageError(f"--out {out}: is a file; give a folder")
 
 
+def check_file(path: Path | None, option: str) -> None:
+    """Refuse a file that cannot be written where it is named, before any work is done.
+
+    Raises
+    ------
+    UsageError
+    """
+    if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
+        raise UsageError(f"{option} {path}: expected a file in a folder that is there")
+
+
 def posterior_file(path: Path, option: str = "") -> Path:
     """``path``, or the posterior.npz in it where it is a folder that ``localize --out`` wrote.
 

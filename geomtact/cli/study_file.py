@@ -24,7 +24,9 @@ def load(out: Path | None, schema: str) -> dict[str, Any]:
     try:
         content = read_json(out)
         held = content["schema"]
-    except (ValueError, KeyError, TypeError):
+        if any(not isinstance(part, dict) for part in content["parts"].values()):
+            raise TypeError("a part that is no mapping")
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(f"{out}: is there, but is no study of geomtact; give another file with --out") from None
     if held != schema:
         raise InputError(f"{out}: expected a study of the schema {schema}, got {held}; give another file with --out")
@@ -53,7 +55,7 @@ def begun(entry: dict[str, Any] | None, settings: dict[str, Any]) -> bool:
 
     if entry is None:
         return False
-    held, wanted = entry["settings"], json.loads(json.dumps(plain(settings)))
+    held, wanted = entry.get("settings", {}), json.loads(json.dumps(plain(settings)))
     other = [key for key in {**held, **wanted} if not _alike(held.get(key), wanted.get(key))]
     if other:
         raise InputError(

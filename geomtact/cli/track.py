@@ -27,7 +27,7 @@ from geomtact.cli.options import (
 )
 from geomtact.cli.prepare import open_localizer
 from geomtact.cli.project import given_of, resolve
-from geomtact.cli.shell import NO_CONTACT, posterior_file, tell
+from geomtact.cli.shell import NO_CONTACT, check_file, posterior_file, tell
 from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text
 
@@ -45,7 +45,7 @@ Source = Annotated[
 ]
 ObjectName = Annotated[str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")]
 MotionMm = Annotated[
-    float, typer.Option(min=0.001, help="How far the part moves between frames at most, mean over its points.")
+    float, typer.Option(min=0.001, max=1000, help="How far the part moves between frames at most, mean over its points.")
 ]
 Follow = Annotated[bool, typer.Option("--follow", help="Wait for more images in the folder, until Ctrl-C.")]
 SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Go on after an image that cannot be read.")]
@@ -85,6 +85,8 @@ def track(
     What is not given is taken from the nearest geomtact.toml (this folder or above), then from the first image's metadata.
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in any image.
     """
+    check_file(tum, "--tum")
+    check_file(report, "--report")
     given = given_of(object_name, unit, sensor, background, effort)
     options: dict[str, Any] = {"kind": kind, "prior": prior, "most": most, "skip_broken": skip_broken, "seed": seed}
     localizer, posteriors = open_track(source, given, follow, motion_mm, scorer, max_poses, cache_dir, **options)
@@ -93,7 +95,7 @@ def track(
 
     lines: list[str] = []
     shown: list[dict[str, Any]] = []
-    touched = False
+    touched = whole = False
     try:
         for n, (at, posterior) in enumerate(posteriors, 1):
             line = line_of(n, posterior) | {"surprise_nats": posterior.settings["surprise_nats"]}
@@ -105,14 +107,16 @@ def track(
                 from geomtact.report.sequence_page import sequence_frame
 
                 shown.append(sequence_frame(posterior, line, localizer.simulate))
+        whole = True
     except KeyboardInterrupt:
         tell("stopped")
-    if tum is not None:
-        write_text(tum, "".join(lines))
-    if report is not None and shown:
-        from geomtact.report.sequence_page import sequence_page
+    finally:  # what is known before a frame that cannot be read is kept
+        if tum is not None and (lines or whole):
+            write_text(tum, "".join(lines))
+        if report is not None and shown:
+            from geomtact.report.sequence_page import sequence_page
 
-        write_text(report, sequence_page(localizer.mesh.name, localizer.sensor.name, shown))
+            write_text(report, sequence_page(localizer.mesh.name, localizer.sensor.name, shown))
     if not touched:
         tell(UNTOUCHED)
         raise typer.Exit(NO_CONTACT)
