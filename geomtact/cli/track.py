@@ -45,7 +45,8 @@ Source = Annotated[
 ]
 ObjectName = Annotated[str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")]
 MotionMm = Annotated[
-    float, typer.Option(min=0.001, max=1000, help="How far the part moves between frames at most, mean over its points.")
+    float,
+    typer.Option(min=0.001, max=1000, help="How far the part moves between frames at most, mean over its points."),
 ]
 Follow = Annotated[bool, typer.Option("--follow", help="Wait for more images in the folder, until Ctrl-C.")]
 SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Go on after an image that cannot be read.")]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import zipfile
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -142,9 +143,26 @@ def fitted_scorer(
         path = None if folder is None else folder / f"{descriptor.name}-{fingerprint(descriptor)}.npy"
         known[vectors_name(name)] = compared(descriptor, describe_index(index, descriptor, path, progress))
     path = None if folder is None else folder / f"{label}.json"
+    fitted = _fitted_before(name, path, known, index)
+    if fitted is not None:
+        return fitted
+    with _by_itself(folder):
+        return _fitted_before(name, path, known, index) or _fitted_now(name, path, known, index, progress)
+
+
+def _fitted_before(name: str, path: Path | None, known: dict[str, Scorer], index: Index) -> FittedScorer | None:
+    """What stands in ``path``; None where nothing does, or nothing that can be used."""
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             return _from_json(name, json.loads(path.read_text("utf-8")), known, index)
+    return None
+
+
+def _fitted_now(
+    name: str, path: Path | None, known: dict[str, Scorer], index: Index, progress: Progress | None
+) -> FittedScorer:
+    """Fitted on simulated touches, and written to ``path``."""
+    folder = None if path is None else path.parent
     touches = _simulated(index, None if folder is None else folder / f"touches-{FORMAT}-{TOUCHES}.npz", progress)
     if len(touches.ids) < 40:
         raise MeshError(
@@ -160,6 +178,25 @@ def fitted_scorer(
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
             write_text(path, json.dumps(data))
     return _from_json(name, data, known, index)
+
+
+@contextlib.contextmanager
+def _by_itself(folder: Path | None) -> Iterator[None]:
+    """Of two processes that would fit a score in the same ``folder``, the second waits for the first; unless no lock can be
+    written beside it, as in a read-only cache."""
+    import filelock
+
+    lock = None if folder is None else filelock.FileLock(folder.with_name(f"{folder.name}.lock"))
+    held = False
+    if lock is not None:
+        with contextlib.suppress(OSError):
+            lock.acquire()
+            held = True
+    try:
+        yield
+    finally:
+        if lock is not None and held:
+            lock.release()
 
 
 def _simulated(index: Index, path: Path | None, progress: Progress | None) -> Touches:
