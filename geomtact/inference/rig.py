@@ -57,7 +57,8 @@ def check_rig(T_world_sensor: Array, name: str = "T_world_sensor") -> None:
     far = np.linalg.norm(T[:, :3, 3], axis=1)
     if far.max() > _HALL:
         raise InputError(
-            f"{name}: sensor {int(far.argmax()) + 1} is {far.max():.3g} m from the origin; give translations in metres"
+            f"{name}: sensor {int(far.argmax()) + 1} is {far.max():.3g} m from the origin; give translations in metres, in a "
+            "frame of the same hall"
         )
     for i, j in combinations(range(len(T)), 2):
         apart = float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]))
