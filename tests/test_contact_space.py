@@ -503,6 +503,15 @@ def test_the_cache_is_listed_bounded_and_cleared(tmp_path):
     assert cache_entries(tmp_path) == [] and not list(tmp_path.iterdir())
 
 
+def test_others_may_read_what_one_has_cached_and_killed_builds_are_cleared_away(tmp_path):
+    key = tiny_index(tmp_path).key
+    (like := tmp_path / "made").mkdir()
+    assert (tmp_path / key).stat().st_mode == like.stat().st_mode
+    clear_cache(tmp_path)
+    (left := tmp_path / f"building-{key}-abc").mkdir()
+    assert tiny_index(tmp_path).key == key and not left.exists()
+
+
 def test_progress_goes_from_0_to_1(tmp_path):
     seen = []
     open_index(load_mesh("hex_nut"), TINY, None, 2000, tmp_path, lambda share, what: seen.append((share, what)))
