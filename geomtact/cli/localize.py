@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -127,8 +127,8 @@ def localize(
     else:
         _check_images(images, sensor_poses)
     placed = read_sensor_poses(sensor_poses, len(images)) if sensor_poses is not None else None
-    metadata = {} if live else read_metadata(images[0])
-    values, sources = resolve(given_of(object_name, unit, sensor, background, effort), metadata)
+    metadata = [] if live else [read_metadata(image) for image in images]
+    values, sources = resolve(given_of(object_name, unit, sensor, background, effort), metadata[0] if metadata else {})
     values["effort"] = chosen = values["effort"] or Effort.balanced.value
     check_name("kind", kind, Kind)
     check_name("effort", chosen, Effort, sources.get("effort"))
@@ -150,8 +150,8 @@ def localize(
     found, took = _identified(asked, parts, placed)
     named = placed.sensor if placed is not None else None
     of_each: Sequence[str | None] = named or [values["sensor"]] * len(images)
-    for image, used in zip(images, of_each, strict=True):
-        _doubt(image, parts[0] if len(parts) == 1 else None, used)
+    for image, told, used in zip(images, metadata, of_each, strict=True):
+        _doubt(image, told, parts[0] if len(parts) == 1 else None, used)
     if len(parts) > 1 and found.foreign:
         tell("warning: what is shown is unlike all of the parts: is it another one?")
     for warning in found.posterior.warnings:
@@ -162,11 +162,8 @@ def localize(
         raise typer.Exit(NO_CONTACT)
 
 
-def _doubt(image: Path, part: str | None, sensor: str | None) -> None:
+def _doubt(image: Path, told: Mapping[str, Any], part: str | None, sensor: str | None) -> None:
     """Say where an image's metadata name another part or sensor than it is localized with."""
-    from geomtact.sensing.reading import read_metadata
-
-    told = read_metadata(image)
     for word, made, used in (("of", told.get("geomtact:object"), part), ("with", told.get("geomtact:sensor"), sensor)):
         if made and used and Path(made).stem != Path(used).stem:
             tell(f"warning: {image} was made {word} {made}, as its metadata says, and is localized on {used}")

@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,11 +22,14 @@ from geomtact.contact_space.build import build, choose_resolution
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.resolution import MAX_POSES, Resolution
 from geomtact.errors import CacheError, UsageError, did_you_mean
-from geomtact.geometry.approach import Approach, check_approach
+from geomtact.geometry.approach import Approach, check_approach, to_json
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.progress import Progress, between
 from geomtact.sensing.sensor import Sensor
+
+if TYPE_CHECKING:
+    import filelock
 
 FORMAT = 8  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
@@ -59,6 +63,13 @@ def default_cache_dir() -> Path:
     return Path(platformdirs.user_cache_dir("geomtact"))
 
 
+def lock_of(entry: Path) -> filelock.BaseFileLock:
+    """The lock that who makes something of an ``entry``'s folder holds."""
+    import filelock
+
+    return filelock.FileLock(entry.with_name(f"{entry.name}.lock"))
+
+
 def open_index(
     mesh: Mesh,
     sensor: Sensor,
@@ -82,8 +93,6 @@ def open_index(
     CacheError
         The cache folder cannot be written, or the disk is full.
     """
-    import filelock
-
     folder = Path(cache_dir) if cache_dir is not None else default_cache_dir()
     index = _read(folder / key, mesh, sensor, approach) if key else None
     key = _key(mesh, sensor, approach, max_poses)
@@ -92,8 +101,7 @@ def open_index(
         return index
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(folder / f"{key}.lock")
-        with lock:
+        with lock_of(folder / key):
             index = _read(folder / key, mesh, sensor, approach)
             if index is None:
                 mesh = mesh.with_symmetry()
@@ -177,9 +185,14 @@ def clear_cache(cache_dir: str | Path | None = None) -> list[CacheEntry]:
     for path in folder.glob("*.lock"):
         with contextlib.suppress(filelock.Timeout, OSError), filelock.FileLock(path, timeout=0):
             path.unlink(missing_ok=True)
-            for left in folder.glob(f"building-{path.stem}-*"):
-                shutil.rmtree(left, ignore_errors=True)
+            _clear_left(folder, path.stem)
     return removed
+
+
+def _clear_left(folder: Path, key: str) -> None:
+    """Remove what a killed run has left half built of an entry, whose lock is held."""
+    for left in folder.glob(f"building-{key}-*"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _key(mesh: Mesh, sensor: Sensor, approach: Approach | None, max_poses: int) -> str:
@@ -187,14 +200,8 @@ def _key(mesh: Mesh, sensor: Sensor, approach: Approach | None, max_poses: int) 
     symmetry = (
         None if s is None else (s.kind, s.elements.round(9).tolist(), None if s.axis is None else s.axis.tolist())
     )
-    text = json.dumps([FORMAT, mesh.sha256, symmetry, sensor.sha256, _plain(approach), max_poses])
+    text = json.dumps([FORMAT, mesh.sha256, symmetry, sensor.sha256, to_json(check_approach(approach)), max_poses])
     return hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
-
-
-def _plain(approach: Approach | None) -> list[tuple[list[float], float]] | None:
-    """An approach as it stands in JSON."""
-    cones = check_approach(approach)
-    return None if cones is None else [(v.tolist(), angle) for v, angle in cones]
 
 
 def _write(folder: Path, index: Index) -> None:
@@ -206,7 +213,7 @@ def _write(folder: Path, index: Index) -> None:
         "object_sha256": index.mesh.sha256,
         "sensor": index.sensor.name,
         "poses": len(index),
-        "approach": _plain(index.approach),
+        "approach": to_json(check_approach(index.approach)),
         "resolution": index.resolution.to_json(),
         "symmetry": {
             "kind": symmetry.kind,
@@ -215,8 +222,7 @@ def _write(folder: Path, index: Index) -> None:
             "centre": symmetry.centre.tolist(),
         },
     }
-    for left in folder.glob(f"building-{index.key}-*"):  # by a run that was killed: the lock is ours
-        shutil.rmtree(left, ignore_errors=True)
+    _clear_left(folder, index.key)
     building = folder / f"building-{index.key}-{secrets.token_hex(4)}"
     building.mkdir()
     try:

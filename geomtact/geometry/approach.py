@@ -66,6 +66,11 @@ def check_approach(approach: Approach | None) -> list[tuple[Array, float]] | Non
     return cones
 
 
+def to_json(approach: Approach | None) -> list[tuple[list[float], float]] | None:
+    """An approach as it stands in JSON: directions and half angles [rad]."""
+    return None if approach is None else [(np.asarray(v, float).tolist(), float(angle)) for v, angle in approach]
+
+
 def allowed(a: ArrayLike, cones: list[tuple[Array, float]] | None) -> NDArray[np.bool_]:
     """Whether approach directions ``a`` (..., 3) lie within one of the cones."""
     a = np.asarray(a, float)

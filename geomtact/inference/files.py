@@ -15,6 +15,7 @@ from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.store import open_index
 from geomtact.errors import GeomtactError, InputError
 from geomtact.files import write_whole
+from geomtact.geometry.approach import to_json
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.modes import Refined
@@ -52,9 +53,7 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "object": posterior.mesh.name,
         "unit": posterior.mesh.unit,
         "symmetry": symmetry.kind,
-        "approach": None
-        if posterior.index.approach is None
-        else [(np.asarray(v, float).tolist(), float(a)) for v, a in posterior.index.approach],
+        "approach": to_json(posterior.index.approach),
         "contact": posterior.contact,
         "log_evidence": posterior.log_evidence,
         "settings": posterior.settings,
@@ -123,12 +122,8 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"], symmetry=_symmetry(data, meta))
         sensor = Sensor.from_toml(str(data["sensor_toml"]), str(path))
         cells, runs, log_prob = data["row_cell"], data["row_length"], data["row_log_prob"]
-        poses, frame, seed, evidence = (
-            int(data["index_poses"]),
-            str(data["frame"]),
-            int(data["seed"]),
-            float(meta["log_evidence"]),
-        )
+        poses, seed = int(data["index_poses"]), int(data["seed"])
+        frame, evidence = str(data["frame"]), float(meta["log_evidence"])
         _check(mesh.sha256 == str(data["object_sha256"]), "its mesh is not the one that it says it is of")
         _check(frame in ("sensor", "world"), f"frame {frame!r}")
         _check_rows(cells, runs, log_prob, poses)

@@ -19,7 +19,7 @@ from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import default_cache_dir, open_index
 from geomtact.errors import UsageError, nearest_name
-from geomtact.geometry.approach import Approach
+from geomtact.geometry.approach import Approach, to_json
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.evidence import counted_once, digest
@@ -352,9 +352,7 @@ class Localizer:
             "max_poses": self.max_poses,
             "poses": len(self.index),
             "grid": self.index.resolution.to_json(),
-            "approach": None
-            if self.index.approach is None
-            else [(np.asarray(v, float).tolist(), float(a)) for v, a in self.index.approach],
+            "approach": to_json(self.index.approach),
         }
 
 

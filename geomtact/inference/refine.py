@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,7 +16,7 @@ from geomtact.inference.posterior import Posterior
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread
-from geomtact.registration.protocol import Refiner, Surface
+from geomtact.registration.protocol import Refinement, Refiner, Surface
 from geomtact.registration.rim import make_problem
 from geomtact.scoring.likelihood import cast_log_likelihood
 from geomtact.scoring.overlap import to_grid
@@ -72,17 +73,8 @@ class Refinery:
         refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index, thorough)]
         poses = np.stack([*candidates, *(r.T for r in refinements)])
         winner, likelihood = self._best(mask, poses)
-        T = poses[winner, np.arange(len(cells))]
-        covariance, observable = np.zeros((len(cells), 6, 6)), [np.zeros((0, 6))] * len(cells)
-        told = winner >= len(candidates)
-        covariance[~told] = index.cell_covariance(T[~told])
-        for i in np.flatnonzero(told):
-            found = refinements[winner[i] - len(candidates)]
-            covariance[i], observable[i] = found.covariance[i], found.observable[i]
-        refined = {
-            int(cell): Refined(T[i], covariance[i], observable[i], problem.length, bool(winner[i] > 0))
-            for i, cell in enumerate(cells)
-        }
+        by = [refinements[best - len(candidates)] if best >= len(candidates) else None for best in winner]
+        refined = refined_at(index, cells, poses[winner, np.arange(len(cells))], by, problem.length, winner > 0)
         return replace(posterior.shared_anew(cells, TRUST * likelihood), refined=refined)
 
     def _best(self, mask: NDArray[np.bool_], poses: Array) -> tuple[NDArray[np.int64], Array]:
@@ -119,3 +111,24 @@ class Refinery:
         deepest = self.space.caster.depths(sensor, out, self._shape).max((1, 2))
         out[:, 2, 3] += np.where(np.isfinite(deepest), deepest - wanted, 0.0)
         return out
+
+
+def refined_at(
+    index: Index,
+    cells: NDArray[np.int64],
+    T: Array,
+    by: Sequence[Refinement | None],
+    length: float,
+    moved: NDArray[np.bool_],
+) -> dict[int, Refined]:
+    """What is known, by the cell, at poses ``T`` (n, 4, 4) in ``cells`` (n,): what the refinement told that found each; where
+    none did, how poses spread over a cell."""
+    covariance, observable = np.zeros((len(cells), 6, 6)), [np.zeros((0, 6))] * len(cells)
+    for i, found in enumerate(by):
+        if found is not None:
+            covariance[i], observable[i] = found.covariance[i], found.observable[i]
+    alone = np.array([found is None for found in by], bool)
+    covariance[alone] = index.cell_covariance(T[alone])
+    return {
+        int(cell): Refined(T[i], covariance[i], observable[i], length, bool(moved[i])) for i, cell in enumerate(cells)
+    }

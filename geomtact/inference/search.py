@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from geomtact.contact_space.carry import UNFELT
 from geomtact.inference.modes import Refined
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.refine import Refinery
+from geomtact.inference.refine import Refinery, refined_at
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread, moved
@@ -266,10 +266,5 @@ class Search:
         leading = np.argsort(-posterior.cell_log_density(cells), kind="stable")[: _TOLD * k]
         cells, T = cells[leading], T[leading]
         found = self.filterreg.refine(self.problem, T)
-        covariance, observable = self.index.cell_covariance(T), [np.zeros((0, 6))] * len(cells)
-        for i in np.flatnonzero(found.converged):
-            covariance[i], observable[i] = found.covariance[i], found.observable[i]
-        return {
-            int(cell): Refined(T[i], covariance[i], observable[i], self.problem.length, True)
-            for i, cell in enumerate(cells)
-        }
+        by = [found if converged else None for converged in found.converged]
+        return refined_at(self.index, cells, T, by, self.problem.length, np.ones(len(cells), bool))

@@ -61,8 +61,7 @@ def write_all(
         view = turnable(posterior, modes, shown) if modes else None
         html = page(content, table(summaries), [*facts(posterior), *caution(summaries)], picture.bands, view)
         write_text(folder / "report.html", html)
-    for name in REPORTS:
-        if picture is None or name not in reports:  # of an earlier touch
-            (folder / f"report.{name}").unlink(missing_ok=True)
+    for name in set(REPORTS) - set(reports):  # of an earlier touch
+        (folder / f"report.{name}").unlink(missing_ok=True)
     write_text(folder / "result.json", to_text(content))
     return content

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import zipfile
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
+from geomtact.contact_space.store import lock_of
 from geomtact.errors import MeshError
 from geomtact.files import write_text, write_whole
 from geomtact.progress import Progress
@@ -146,7 +146,10 @@ def fitted_scorer(
     fitted = _fitted_before(name, path, known, index)
     if fitted is not None:
         return fitted
-    with _by_itself(folder):
+    with contextlib.ExitStack() as held:  # of two processes that would fit it, the second waits for the first
+        if folder is not None:
+            with contextlib.suppress(OSError):  # beside a read-only cache no lock can be written
+                held.enter_context(lock_of(folder))
         return _fitted_before(name, path, known, index) or _fitted_now(name, path, known, index, progress)
 
 
@@ -178,25 +181,6 @@ def _fitted_now(
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
             write_text(path, json.dumps(data))
     return _from_json(name, data, known, index)
-
-
-@contextlib.contextmanager
-def _by_itself(folder: Path | None) -> Iterator[None]:
-    """Of two processes that would fit a score in the same ``folder``, the second waits for the first; unless no lock can be
-    written beside it, as in a read-only cache."""
-    import filelock
-
-    lock = None if folder is None else filelock.FileLock(folder.with_name(f"{folder.name}.lock"))
-    held = False
-    if lock is not None:
-        with contextlib.suppress(OSError):
-            lock.acquire()
-            held = True
-    try:
-        yield
-    finally:
-        if lock is not None and held:
-            lock.release()
 
 
 def _simulated(index: Index, path: Path | None, progress: Progress | None) -> Touches:
