@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from geomtact.contact_space.carry import RigStd
     from geomtact.geometry.mesh import Mesh
     from geomtact.geometry.mesh_file import load_mesh
+    from geomtact.inference.densities import GaussianPrior
     from geomtact.inference.identify import identify
     from geomtact.inference.localizer import Effort, Localizer
     from geomtact.inference.modes import Mode
     from geomtact.inference.motion import GaussianTwist
     from geomtact.inference.posterior import Posterior
-    from geomtact.inference.prior import GaussianPrior
     from geomtact.planning.actions import Probe, Touch
     from geomtact.planning.next_touch import Action
     from geomtact.sensing.calibrate import calibrate
@@ -44,7 +44,7 @@ _MODULE_OF = {
     "Action": "geomtact.planning.next_touch",
     "Contact": "geomtact.sensing.contact",
     "Effort": "geomtact.inference.localizer",
-    "GaussianPrior": "geomtact.inference.prior",
+    "GaussianPrior": "geomtact.inference.densities",
     "GaussianTwist": "geomtact.inference.motion",
     "Localizer": "geomtact.inference.localizer",
     "Mesh": "geomtact.geometry.mesh",

@@ -26,8 +26,8 @@ def read_json(path: Path) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """``text`` as UTF-8, whole or not at all."""
-    write_whole(path, lambda temporary: temporary.write_text(text, "utf-8"))
+    """``text`` as UTF-8, whole or not at all; what no UTF-8 can say, as of a strange file name, by its number."""
+    write_whole(path, lambda temporary: temporary.write_text(text, "utf-8", "backslashreplace"))
 
 
 def write_bytes(path: Path, data: bytes) -> None:

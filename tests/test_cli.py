@@ -11,7 +11,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from geomtact import se3
-from geomtact.cli import app, project
+from geomtact.cli import app, main, project
 from geomtact.cli.options import approach_from
 from geomtact.errors import CacheError, InputError, UsageError
 
@@ -79,6 +79,34 @@ def test_help_and_lists(geomtact):
 )
 def test_usage_errors_exit_2(geomtact, args):
     geomtact(*args, status=2)
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["localise"], "did you mean 'localize'?; 'geomtact --help'"),
+        (["localize", "--nope"], "no such option: --nope; 'geomtact localize --help'"),
+        (["simulate", "pin", "--n", "0"], "'--n'"),
+        (["simulate", "pin", "--out", ""], "expected a word after --out, got an empty one"),
+        (["evaluate", "scores", "--effort", "best"], "'balanced'"),
+    ],
+)
+def test_usage_errors_are_told_in_one_line(args, said, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["geomtact", *args])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    told = capsys.readouterr()
+    assert stopped.value.code == 2 and told.out == ""
+    assert told.err.startswith("error: ") and told.err.count("\n") == 1 and said.lower() in told.err.lower()
+
+
+def test_the_command_exits_with_the_status_of_what_it_did(monkeypatch, capsys):
+    for args, status in ((["--version"], 0), (["objects"], 0), ([], 2), (["prepare", "pim", "--sensor", "gelslim"], 3)):
+        monkeypatch.setattr("sys.argv", ["geomtact", *args])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        assert (stopped.value.code or 0) == status, args
+        capsys.readouterr()
 
 
 def test_missing_options_are_named_with_their_choices(geomtact, tmp_path):

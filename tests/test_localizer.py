@@ -15,8 +15,9 @@ from geomtact.geometry.approach import approach_of
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import GaussianPrior, prior_log_mass
+from geomtact.inference.prior import prior_log_mass
 from geomtact.registration.rim import SINK
 from geomtact.scoring import fitted
 from geomtact.se3 import exp, log, random_rotations, transform

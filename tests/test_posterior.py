@@ -426,7 +426,14 @@ def test_a_file_whose_numbers_make_no_posterior_is_refused(
 def test_no_contact_survives_the_disk(plug, tmp_path, cache_dir):
     plug.localize(np.zeros(plug.sensor.image_size_px[::-1], bool)).save(tmp_path / "p.npz")
     again = Posterior.load(tmp_path / "p.npz", cache_dir)
-    assert again.contact is False and again.modes() == [] and again.poses.shape == (0, 4, 4)
+    assert again.contact is False and again.modes() == [] and again.poses.shape == (0, 4, 4) and not again.warnings
+
+
+def test_a_file_without_contact_says_that_it_holds_no_prior(plug, tmp_path, cache_dir):
+    nothing = np.zeros(plug.sensor.image_size_px[::-1], bool)
+    plug.localize(nothing, prior=lambda T: np.where(T[:, 0, 3] > 0, 0.0, -3.0)).save(tmp_path / "p.npz")
+    again = Posterior.load(tmp_path / "p.npz", cache_dir)
+    assert [warning for warning in again.warnings if "prior" in warning] == again.warnings != []
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 truncated"])

@@ -19,8 +19,8 @@ from geomtact.errors import ImageError, InputError, UsageError
 from geomtact.evaluation import track_study
 from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.geometry.distance import PoseDistance
+from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.motion import GaussianTwist, UniformBall
-from geomtact.inference.prior import GaussianPrior
 from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image

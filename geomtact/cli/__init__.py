@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import sys
+
 import typer
 
 from geomtact.cli.calibrate import calibrate
@@ -10,7 +13,7 @@ from geomtact.cli.library import cache, objects, sensors
 from geomtact.cli.localize import localize
 from geomtact.cli.next_touch import next_touch
 from geomtact.cli.prepare import prepare
-from geomtact.cli.shell import one_line_errors
+from geomtact.cli.shell import check_words, one_line_errors, one_line_usage_errors
 from geomtact.cli.simulate import simulate
 from geomtact.cli.track import track
 from geomtact.cli.train import train
@@ -39,4 +42,9 @@ def _root(version: bool = typer.Option(False, "--version", help="Print the versi
 
 def main() -> None:
     """Entry point of the ``geomtact`` command."""
-    app()
+    # a path that is no UTF-8, or a terminal that knows ASCII alone, is no reason to fail
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    with one_line_usage_errors():
+        check_words(sys.argv[1:])
+        sys.exit(app(standalone_mode=False))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,38 @@ def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(BAD_INPUT) from None
 
     return run
+
+
+@contextmanager
+def one_line_usage_errors() -> Iterator[None]:
+    """Tells in one line what is wrong with the command line, and exits."""
+    try:
+        yield
+    except UsageError as error:
+        _tell_error(str(error))
+        sys.exit(USAGE_ERROR)
+    except Exception as error:
+        # typer's own errors, whose classes differ from version to version
+        if not hasattr(error, "format_message"):
+            raise
+        message = error.format_message().rstrip(".")
+        if message:  # it is empty where the help was printed
+            context = getattr(error, "ctx", None)
+            command = context.command_path if context else "geomtact"
+            _tell_error(f"{message[0].lower()}{message[1:]}; '{command} --help' says what there is")
+        sys.exit(USAGE_ERROR)
+
+
+def check_words(words: Sequence[str]) -> None:
+    """Refuse an empty word, which would mean this folder where a path is due.
+
+    Raises
+    ------
+    UsageError
+    """
+    if "" in words:
+        after = ["geomtact", *words][words.index("")]
+        raise UsageError(f"expected a word after {after}, got an empty one; is a variable of the shell not set?")
 
 
 def check_folder(out: Path | None) -> None:

@@ -25,6 +25,9 @@ from geomtact.sensing.sensor import Sensor
 
 _KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many
 _OFF = 1e-3  # that probabilities may add up to beside 1
+_WITHOUT_PRIOR = (
+    "what a prior and other sensors told is not in this file: it knows no more than where one sensor felt nothing"
+)
 _FORMAT = "geomtact/posterior/2"
 _BROKEN = (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError)
 
@@ -57,7 +60,7 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "contact": posterior.contact,
         "log_evidence": posterior.log_evidence,
         "settings": posterior.settings,
-        "warnings": posterior.warnings,
+        "warnings": posterior.warnings + [_WITHOUT_PRIOR] * (posterior.elsewhere is not None),
         "refined": [[refined[int(k)].length, refined[int(k)].moved, refined[int(k)].observable.tolist()] for k in keys],
     }
     arrays = {

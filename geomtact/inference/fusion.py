@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.carry import Carry, RigStd
 from geomtact.errors import NoPoseAgreesError
+from geomtact.inference.densities import NothingFelt
 from geomtact.inference.modes import Refined
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import NothingFelt, prior_log_density, prior_log_mass
+from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.inference.refine_together import refine_together
 from geomtact.inference.rig import rig_covariance

@@ -1,0 +1,142 @@
+"""What was known before the touch, as a density over poses that touch or not (the thesis's P(G), 6.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.contact_space.index import Index
+from geomtact.errors import InputError
+from geomtact.geometry.symmetry import Symmetry
+from geomtact.inference.posterior import Posterior
+from geomtact.se3 import Array, check_pose, hat, inverse, log
+
+LogDensity = Callable[[Array], Array]
+
+_TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianPrior:
+    """A pose known with an uncertainty, T exp(xi^) with xi ~ N(0, covariance): a vision system's, or that of a ``Mode``.
+
+    Its share of a cell is that of poses drawn from it, of those that touch; where it covers too many cells for that, its density
+    at the cell's pose, widened by a cell's own spread.
+
+    Attributes
+    ----------
+    T : (4, 4), in the posterior's frame
+    covariance : (6, 6) of xi = (rx, ry, rz, tx, ty, tz), in the object's frame [rad, m], positive definite
+
+    Raises
+    ------
+    PoseError, InputError
+    """
+
+    T: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        T, C = check_pose(self.T, "GaussianPrior"), np.asarray(self.covariance, float)
+        wrong = None
+        if C.shape != (6, 6):
+            wrong = f"the shape {C.shape}"
+        elif not np.allclose(C, C.T):
+            wrong = "one that is not symmetric"
+        elif not (np.linalg.eigvalsh(C) > 0).all():
+            wrong = f"one with an eigenvalue of {np.linalg.eigvalsh(C).min():.2g}"
+        if wrong:
+            raise InputError(
+                "GaussianPrior: expected a symmetric positive definite covariance (6, 6), variances in radians and metres "
+                f"squared, got {wrong}"
+            )
+        object.__setattr__(self, "T", T)
+        object.__setattr__(self, "covariance", C)
+
+    def __call__(self, T: Array) -> Array:
+        """Log density (n,), not normalised, at poses (n, 4, 4)."""
+        xi = log(inverse(self.T) @ T)
+        # the exponential takes less volume, the larger the angle (Barfoot, State Estimation for Robotics, ch. 7)
+        volume = 4 * np.log(np.sinc(np.linalg.norm(xi[:, :3], axis=1) / (2 * np.pi)))
+        return np.asarray(-0.5 * np.einsum("ni,ni->n", xi, np.linalg.solve(self.covariance, xi.T).T) - volume)
+
+    def over_cells(self, index: Index, T_frame_sensor: Array) -> GaussianPrior:
+        """As it is told by the cells of ``index`` and by the images under a symmetry that stand for all."""
+        assert index.mesh.symmetry is not None
+        spread = index.cell_covariance(inverse(T_frame_sensor) @ self.T)
+        return GaussianPrior(self.T, self._between_images(index.mesh.symmetry).covariance + spread)
+
+    def _between_images(self, symmetry: Symmetry) -> GaussianPrior:
+        """As it is told by the images under a ``symmetry`` that stand for all: wider by what lies between them."""
+        free = np.zeros((3, 3)) if symmetry.axis is None else np.outer(symmetry.axis, symmetry.axis) / _TURNS**2
+        if symmetry.kind == "sphere":
+            free = np.eye(3) / _ROTATIONS**2
+        about_centre = np.vstack([np.eye(3), hat(symmetry.centre)])
+        return GaussianPrior(self.T, self.covariance + about_centre @ free @ about_centre.T * (2 * np.pi) ** 2 / 12)
+
+
+@dataclass(frozen=True, eq=False)
+class OfAllImages:
+    """Log density, not normalised, of a prior that is a function, at poses touching or not: the same for every image of a pose.
+
+    Attributes
+    ----------
+    prior : a :class:`GaussianPrior` or a function, as in :func:`prior_log_mass`
+    symmetry : of the object
+    """
+
+    prior: LogDensity
+    symmetry: Symmetry
+
+    def __call__(self, T: Array) -> Array:
+        """At poses (n, 4, 4)."""
+        told = self.prior
+        if isinstance(told, GaussianPrior):
+            told = told._between_images(self.symmetry)
+        return mean_density([checked(told(T @ S), len(T)) for S in images(self.symmetry)])
+
+
+@dataclass(frozen=True, eq=False)
+class NothingFelt:
+    """Log density, not normalised, where the object touches none of several sensors.
+
+    Attributes
+    ----------
+    others : what each sensor but the first told, all without contact
+    before : what was known before that; None for nothing
+    """
+
+    others: Sequence[Posterior]
+    before: LogDensity | None
+
+    def __call__(self, T: Array) -> Array:
+        """At poses (n, 4, 4), touching the first sensor or not."""
+        density = np.zeros(len(T)) if self.before is None else self.before(T)
+        return density + np.sum([other.log_density(T) for other in self.others], axis=0)
+
+
+def checked(density: Any, n: int) -> Array:
+    out = np.asarray(density, float)
+    if out.shape != (n,):
+        raise InputError(
+            f"prior: the function was given {n} poses and returned shape {out.shape}; return one log density a pose, ({n},)"
+        )
+    return out
+
+
+def images(symmetry: Symmetry) -> Array:
+    """Elements (m, 4, 4) of ``symmetry`` at which a prior that is a function is asked."""
+    return symmetry.sampled(_TURNS if symmetry.axis is not None else _ROTATIONS)
+
+
+def mean_density(each: ArrayLike, counts: NDArray[np.bool_] | None = None) -> Array:
+    """Log of the mean density (n,) over images, of the log density (m, n) of ``each``, or of those that count (m, n)."""
+    each = np.asarray(each, float)
+    counts = np.ones(each.shape, bool) if counts is None else counts
+    with np.errstate(invalid="ignore"):  # NaN is told of later
+        total = np.logaddexp.reduce(np.where(counts, each, -np.inf), 0)
+    return np.asarray(total - np.log(np.maximum(counts.sum(0), 1)))

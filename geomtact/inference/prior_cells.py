@@ -1,0 +1,207 @@
+"""What was known before the touch, as the mass of every cell of an index (the thesis's P(G), 6.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.carry import Carry
+from geomtact.contact_space.index import Index
+from geomtact.errors import InputError
+from geomtact.inference.densities import (
+    GaussianPrior,
+    LogDensity,
+    NothingFelt,
+    OfAllImages,
+    checked,
+    images,
+    mean_density,
+)
+from geomtact.inference.posterior import Posterior
+from geomtact.scoring.calibration import normalised
+from geomtact.se3 import Array, exp, inverse
+
+_CHUNK = 1 << 16
+_DRAWN = 1024  # poses of a Gaussian at a time
+_BATCHES, _TOUCHING = 8, 1000  # how often at most, and until how many touch
+_FARTHEST = 8.0  # standard deviations from a Gaussian, widened by a cell, that touching poses may be
+_LOOK = (24, 32)  # rays that tell which may
+
+
+def of_density(index: Index, density: LogDensity, T_frame_sensor: Array) -> NDArray[np.floating]:
+    """Log mass (N,) of every cell, of a log ``density``, relative to the uniform one, at poses (n, 4, 4) in a frame in which the
+    sensor lies at ``T_frame_sensor`` (4, 4).
+
+    Raises
+    ------
+    InputError
+        It is NaN or infinite at some poses, or rules out every pose that touches.
+    """
+    if isinstance(density, GaussianPrior):
+        return _of_gaussian(index, density, T_frame_sensor)
+    return _normalised(index, _over_images(index, lambda T: checked(density(T_frame_sensor @ T), len(T))))
+
+
+def of_poses(index: Index, T: Array, log_mass: Array, T_frame_sensor: Array) -> NDArray[np.floating]:
+    """Log mass (N,) of every cell, of poses ``T`` (n, 4, 4), each of which is spread over its cell.
+
+    Raises
+    ------
+    InputError
+        None of them touches.
+    """
+    inside = inverse(T_frame_sensor) @ T
+    depth = index.space.penetration(inside)
+    ok = np.isfinite(depth) & np.isfinite(log_mass)
+    if not ok.any():
+        raise InputError(
+            "prior: none of its poses touches the sensor; check that they are T_sensor_object (or T_world_object where "
+            "T_world_sensor is given), in metres"
+        )
+    out = np.full(len(index), -np.inf)
+    np.logaddexp.at(out, index.lookup(inside[ok], depth[ok]), log_mass[ok])
+    return normalised(out)
+
+
+def of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array) -> NDArray[np.floating]:
+    """Log mass (N,) of every cell, of what the same sensor told on any grid, or another sensor in the same frame.
+
+    Raises
+    ------
+    InputError
+        The same sensor felt nothing.
+    """
+    if not np.allclose(prior.T_frame_sensor, T_frame_sensor, atol=1e-9):
+        return _normalised(index, _carried(index, prior, T_frame_sensor))
+    if not prior.contact:
+        raise InputError(
+            "prior: it says that the object does not touch the sensor, but this image shows a contact; leave it out"
+        )
+    if prior.index.key == index.key:
+        return _normalised(index, prior.cell_log_density(np.arange(len(index))))
+    return _normalised(index, _on_another_grid(index, prior))
+
+
+def _normalised(index: Index, density: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Log mass (N,) of every cell, of the log density (N,) in it, relative to the uniform one."""
+    if not (density < np.inf).all():
+        raise InputError(
+            "prior: the log density is NaN or infinite at some poses; return -inf where a pose is ruled out"
+        )
+    log_mass = index.log_weight + density
+    if not np.isfinite(log_mass).any():
+        raise InputError(
+            "prior: it rules out every pose that touches the sensor; check its frame and its units (metres)"
+        )
+    return normalised(log_mass)
+
+
+def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> NDArray[np.floating]:
+    """Log mass (N,) of every cell. Of n poses drawn that touch and k cells among which the widened density spreads, the draws
+    count n times, that density k times: as many as it takes to see all those cells."""
+    wide = prior.over_cells(index, T_frame_sensor)
+    density = _over_images(index, lambda T: wide(T_frame_sensor @ T))
+    if density[index.possible].max() < -0.5 * _FARTHEST**2:
+        raise InputError(
+            f"prior: no pose that touches the sensor lies within about {_FARTHEST:.0f} of its standard deviations, even "
+            "widened by a grid cell; check its frame and its units (metres, radians)"
+        )
+    log_mass = _normalised(index, density)
+    mass = np.exp(log_mass.astype(float))
+    spread = np.exp(-float(mass @ np.maximum(log_mass, -700)))
+    rng, cells = np.random.default_rng(0), np.zeros(0, np.int64)
+    # a few rays leave out those that cannot touch: what lies between them is hidden, by about their distance at most
+    hidden = 2 * float(max(index.sensor.half_window)) / max(_LOOK)
+    for _ in range(_BATCHES):
+        xi = rng.multivariate_normal(np.zeros(6), prior.covariance, _DRAWN)
+        T = inverse(T_frame_sensor) @ prior.T @ exp(xi)
+        seen = index.space.caster.depths(index.sensor, T, index.sensor.along(_LOOK)).max((1, 2))
+        T = T[(seen >= -hidden) & (seen <= index.sensor.max_penetration)]
+        depth = index.space.penetration(T)
+        touches = np.isfinite(depth)
+        cells = np.append(cells, index.lookup(T[touches], depth[touches]))
+        if len(cells) >= _TOUCHING:
+            break
+    drawn = np.bincount(cells, minlength=len(index))
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log((drawn + spread * mass) / (len(cells) + spread)), np.float32)
+
+
+def _on_another_grid(index: Index, prior: Posterior) -> Array:
+    """Log density (N,) in the cells of ``index`` of a prior that the same sensor told on another grid: at each cell's own pose;
+    or, where these miss half of what it holds because its cells are the finer ones, as much as lies in each."""
+    mass = prior.densities * np.exp(prior.index.log_weight)
+    looked_up, out = _home(index, np.arange(len(index)), prior.index), np.full(len(index), -np.inf)
+    found = np.flatnonzero(looked_up >= 0)
+    covered = mass[np.unique(looked_up[found])].sum()
+    if covered < 0.5:
+        some = np.flatnonzero(mass > 0)
+        home = _home(prior.index, some, index)
+        there = np.bincount(home[home >= 0], mass[some[home >= 0]], len(index))
+        if covered < 0.5 * there.sum():
+            held = there > 0
+            out[held] = np.log(there[held]) - index.log_weight[held]
+            return out
+    out[found] = prior.cell_log_density(looked_up[found])
+    return out
+
+
+def _home(index: Index, ids: NDArray[np.int64], other: Index) -> NDArray[np.int64]:
+    """The cell (n,) of ``other`` that holds the pose of each of the cells ``ids`` (n,) of ``index``, at the penetration that they
+    stand for; -1 where its approach allows none."""
+    out, depths = np.full(len(ids), -1), np.array(index.resolution.penetrations)
+    for start in range(0, len(ids), _CHUNK):
+        T, depth = index.poses(ids[start : start + _CHUNK]), depths[ids[start : start + _CHUNK] // index.places]
+        ok = other.space.approaches(T)
+        out[start : start + _CHUNK][ok] = other.lookup(T[ok], depth[ok])
+    return out
+
+
+def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
+    """Log density (N,) of a prior that a sensor elsewhere told, in the cells of ``index``: the mean over each, for a cell is
+    wider than the gel is deep, so that its own pose seldom touches there."""
+    apart = prior.elsewhere
+    others, before = (apart.others, apart.before) if isinstance(apart, NothingFelt) else ((), apart)
+    density = np.ones(index.places)
+    for told in (prior, *others):
+        carry = Carry(index, told.index, inverse(told.T_frame_sensor) @ T_frame_sensor)
+        density *= carry.mean(told.densities)[0] if told.contact else carry.nothing_felt()
+    with np.errstate(divide="ignore"):
+        out = np.tile(np.log(density), len(index.height))
+    if isinstance(before, OfAllImages):
+        known = of_density(index, before.prior, T_frame_sensor)
+        out[index.possible] += known[index.possible] - index.log_possible_weight
+    elif before is not None:
+        out += _by_chunks(index, lambda T: before(T_frame_sensor @ T))
+    return out
+
+
+def _over_images(index: Index, density: LogDensity) -> Array:
+    """Log of the mean of exp(``density``) over the images of every cell's pose under the object's symmetry (N,).
+
+    A cell stands for all of them: what the function says of any is said of it. Images that the approach rules out do
+    not count.
+    """
+    assert index.mesh.symmetry is not None
+    symmetric = images(index.mesh.symmetry)
+
+    def mean(T: Array) -> Array:
+        each = np.full((len(symmetric), len(T)), np.nan)
+        allowed = np.zeros((len(symmetric), len(T)), bool)
+        for i, S in enumerate(symmetric):
+            image = T @ S
+            allowed[i] = ok = index.space.approaches(image)
+            each[i, ok] = density(image[ok])
+        return mean_density(each, allowed)
+
+    return _by_chunks(index, density if len(symmetric) == 1 else mean)
+
+
+def _by_chunks(index: Index, density: LogDensity) -> Array:
+    """``density`` at the pose of every cell (N,)."""
+    return np.concatenate(
+        [
+            density(index.poses(np.arange(start, min(start + _CHUNK, len(index)))))
+            for start in range(0, len(index), _CHUNK)
+        ]
+    )
