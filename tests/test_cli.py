@@ -314,6 +314,14 @@ def test_a_file_does_not_stand_before_what_is_bundled(tmp_path):
     assert project.read(tmp_path / "geomtact.toml") == {"object": "ball", "sensor": "digit"}
 
 
+def test_a_file_in_the_home_folder_may_be_named(tmp_path, monkeypatch):
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "part.stl").touch()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "geomtact.toml").write_text('object = "~/part.stl"\n')
+    assert project.read(tmp_path / "geomtact.toml") == {"object": str(tmp_path / "home" / "part.stl")}
+
+
 @pytest.mark.parametrize(
     "text, expected",
     [("sensr = 'x'", "'sensor'"), ("unit = 3", "text in quotes"), ("= =", "TOML"), ("object = ''", "object is empty")],

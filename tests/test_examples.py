@@ -1,10 +1,8 @@
 """The examples run as they stand, in an empty folder, and come to what their pages say of them."""
 
 import json
-import os
 import re
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -21,13 +19,15 @@ EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 
 
 @pytest.fixture
-def example(tmp_path, cache_dir):
+def example(tmp_path, cache_dir, few_touches, monkeypatch, capsys):
+    """Runs an example as the command line would, with a score fitted on few touches; what it prints."""
+
     def run(name, *words):
-        environment = {**os.environ, "GEOMTACT_CACHE": str(cache_dir)}
-        command = [sys.executable, str(EXAMPLES / name), *words]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("GEOMTACT_CACHE", str(cache_dir))
+        monkeypatch.setattr(sys, "argv", [name, *words])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
 
     return run
 

@@ -90,7 +90,7 @@ def find(start: Path) -> Path | None:
 
 
 def read(path: Path) -> dict[str, str]:
-    """The entries of a ``geomtact.toml``; files named in it are relative to its own folder.
+    """The entries of a ``geomtact.toml``; files named in it are relative to its own folder, or to the home folder behind a ~.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def read(path: Path) -> dict[str, str]:
             raise InputError(f"{path}: {key} must be text in quotes, got {value!r}")
         if not value.strip():
             raise InputError(f"{path}: {key} is empty; give it, or leave the line out")
-        beside = path.parent / value
+        beside = path.parent / Path(value).expanduser()
         if key in ("object", "sensor", "background") and (beside.is_file() or (key == "object" and beside.is_dir())):
             entries[key] = value if is_bundled(key, value) else str(beside)
     return entries
