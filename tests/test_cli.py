@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+import typer
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -320,6 +321,10 @@ def test_a_file_in_the_home_folder_may_be_named(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     (tmp_path / "geomtact.toml").write_text('object = "~/part.stl"\n')
     assert project.read(tmp_path / "geomtact.toml") == {"object": str(tmp_path / "home" / "part.stl")}
+    (tmp_path / "geomtact.toml").write_text('object = "~nobody_of_that_name/part.stl"\nbackground = "gel.png"\n')
+    # an image is a file beside this one, whether it is there or not; an object may be a name
+    expected = {"object": "~nobody_of_that_name/part.stl", "background": str(tmp_path / "gel.png")}
+    assert project.read(tmp_path / "geomtact.toml") == expected
 
 
 @pytest.mark.parametrize(
@@ -350,6 +355,15 @@ def test_statuses_of_errors(error, status, capsys):
     assert captured.err.startswith("error: ")
     assert captured.err.count("\n") == 1
     assert captured.out == ""
+
+
+@pytest.mark.parametrize("error", ["typer.Abort", "EOFError"])
+def test_what_breaks_off_is_told_in_one_line(error, monkeypatch, capsys):
+    from geomtact.cli.shell import one_line_usage_errors
+
+    with pytest.raises(SystemExit) as stopped, one_line_usage_errors():
+        raise {"typer.Abort": typer.Abort, "EOFError": EOFError}[error]
+    assert stopped.value.code == 1 and capsys.readouterr().err.count("\n") == 1
 
 
 def test_interrupt_exits_130_without_a_traceback():

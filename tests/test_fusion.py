@@ -365,6 +365,8 @@ def test_sensors_may_differ(make_localizer, plug, cache_dir, rng):
         assert together.sensor.name == "gelslim"
         gains.append(together.log_density(T) - single(plug, touches[0], sensors[0]).log_density(T))
     assert np.mean(gains) > 0.5
+    with pytest.raises(UsageError, match="prepared for 2 sensors, got 1 images"):
+        both.localize(touches[0].mask)
     with pytest.raises(UsageError, match="prepared for 2 sensors, got 3 images"):
         both.localize([touches[0].mask] * 3, "mask", None, np.stack([*sensors, se3.transform(np.eye(3), [1, 0, 0])]))
 

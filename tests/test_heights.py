@@ -8,12 +8,11 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from geomtact import Localizer, Mesh, Sensor, contact_mask
+from geomtact import GaussianPrior, Localizer, Mesh, Sensor, contact_mask
 from geomtact.cli import app
 from geomtact.contact_space.touch import felt_height, felt_mask
 from geomtact.evaluation.groove import read_scan
 from geomtact.evaluation.readings import BALLS, calibrations, cameras, circles_of, localize_balls
-from geomtact.scoring.fitted import _deeper
 from geomtact.scoring.likelihood import height_log_likelihood
 from geomtact.se3 import transform
 from geomtact.sensing.contact import Contact
@@ -117,10 +116,10 @@ def test_scores_of_a_contour_line_belong_to_deeper_poses(balls):
     ball = balls[0]
     score = np.arange(ball.index.height.size, dtype=np.float32).reshape(ball.index.height.shape)
     step = ball.sensor.max_penetration / len(score)
-    deeper = _deeper(score, ball.index, 2.2 * step)
+    deeper = ball.index.deeper(score, 2.2 * step)
     assert np.array_equal(deeper[2:], score[:-2]) and (deeper[:2] == score.min()).all()
-    assert _deeper(score, ball.index, 0.4 * step) is score
-    assert np.array_equal(_deeper(score, ball.index, 99 * step)[-1], score[0])
+    assert ball.index.deeper(score, 0.4 * step) is score
+    assert np.array_equal(ball.index.deeper(score, 99 * step)[-1], score[0])
 
 
 @pytest.mark.parametrize("elastic", [False, True])
@@ -156,6 +155,19 @@ def test_a_rendered_reading_gives_its_contact_back(rng):
         offset = np.argwhere(found).mean(0) - np.argwhere(touched).mean(0)
         assert np.hypot(*offset) < 2 and 0.7 < found.sum() / touched.sum() < 2
         assert not contact_mask(background, background, SENSOR, method).any()
+
+
+def test_a_prior_that_tells_the_depth_is_held_against_the_whole_press(ball, rng):
+    """A height map is compared by a contour some way up; how deep the ball lies is not told by that contour's size."""
+    for T in ball.space.sample(6, rng, (1.3 * MM, 1.6 * MM))[0]:
+        height = ball.simulate(T).height
+        told = []
+        for off in (0.0, 0.75 * MM):  # as deep as it is, and as deep as the contour looks
+            at = T.copy()
+            at[2, 3] += off
+            prior = GaussianPrior(at, np.diag([0.05**2] * 3 + [(0.1 * MM) ** 2] * 3))
+            told.append(ball.touch(height, "height", None, np.eye(4), "sensor", prior, "fast", 0)[0].log_evidence)
+        assert told[0] > told[1] + 1
 
 
 def test_simulated_readings_are_localized_as_they_come(tmp_path):

@@ -391,6 +391,10 @@ def test_a_prior_of_another_object_or_frame_is_refused(ball, flat_nut, a_touch):
     nothing = ball.localize(np.zeros_like(mask))
     with pytest.raises(InputError, match="does not touch the sensor"):
         ball.localize(mask, prior=nothing)
+    with pytest.raises(InputError, match="this image shows no contact"):
+        ball.localize(np.zeros_like(mask), prior=held)
+    with pytest.raises(InputError, match="in the frame of the sensor 'other', not of 'gelsight-mini'"):
+        ball.localize(np.zeros_like(mask), prior=elsewhere)
 
 
 # --- approach
@@ -563,6 +567,20 @@ def test_a_uniform_prior_of_another_grid_rules_nothing_out(plug, cache_dir):
     held = plug.index.possible
     assert np.isfinite(mass[held]).all()
     assert np.abs(mass - plug.index.log_weight)[held].max() < 0.01
+
+
+def test_a_prior_of_a_finer_grid_keeps_what_it_has_in_each_place(plug, cache_dir, rng):
+    """Of a few narrow peaks, also where a coarse cell's own pose meets some of them and misses the rest."""
+    coarse, fine = open_index(plug.mesh, plug.sensor, None, 6_000, cache_dir, None), plug.index
+    middle = np.array(coarse.resolution.penetrations)
+    met = np.unique(fine.lookup(coarse.poses(coarse.possible), middle[coarse.possible // coarse.places]))
+    missed = np.setdiff1d(fine.possible, met)
+    cells = np.sort(np.concatenate([rng.choice(met, 12, replace=False), rng.choice(missed, 12, replace=False)]))
+    prior = Posterior(fine, cells, np.full(len(cells), -np.log(len(cells))))
+    mass = np.exp(prior_log_mass(coarse, prior, np.eye(4), "sensor").astype(float))
+    depth = np.array(fine.resolution.penetrations)[cells // fine.places]
+    expected = np.bincount(coarse.lookup(fine.poses(cells), depth), minlength=len(coarse)) / len(cells)
+    assert mass.sum() == pytest.approx(1, abs=1e-5) and np.abs(mass - expected).sum() / 2 < 0.2
 
 
 def test_a_prior_of_a_known_face_is_told_about_that_face_on_a_coarser_grid_and_back(plug, cache_dir, rng):

@@ -262,6 +262,17 @@ def test_a_frame_given_twice_counts_once(flat_nut, creeping):
     assert moved.entropy_nats > once.entropy_nats
 
 
+def test_a_frame_that_the_prior_was_made_from_is_told(flat_nut, creeping):
+    """Also of a prior that is what was known after many frames."""
+    masks = creeping[0][0].masks
+    known = list(track(flat_nut, masks[:3]))[-1]
+    assert len(set(known.settings["images"])) == 3
+    for posterior in (flat_nut.localize(masks[0], prior=known), next(track(flat_nut, masks, prior=known))):
+        assert any("counts twice" in warning for warning in posterior.warnings)
+    fresh = [flat_nut.localize(masks[3], prior=known), *track(flat_nut, masks[3:5], prior=known)]
+    assert not any("counts twice" in warning for posterior in fresh for warning in posterior.warnings)
+
+
 def test_frames_and_the_world_frame(flat_nut, creeping):
     trajectory, _ = creeping[2]
     T_world_sensor = se3.exp([0.3, -0.2, 0.5, 0.1, 0.2, 0.3])

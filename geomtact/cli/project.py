@@ -108,10 +108,20 @@ def read(path: Path) -> dict[str, str]:
             raise InputError(f"{path}: {key} must be text in quotes, got {value!r}")
         if not value.strip():
             raise InputError(f"{path}: {key} is empty; give it, or leave the line out")
-        beside = path.parent / Path(value).expanduser()
-        if key in ("object", "sensor", "background") and (beside.is_file() or (key == "object" and beside.is_dir())):
-            entries[key] = value if is_bundled(key, value) else str(beside)
+        if key in ("object", "sensor", "background") and not is_bundled(key, value):
+            # an object or a sensor may be a name; an image is a file
+            beside = path.parent / _home(value)
+            is_there = beside.is_file() or (key == "object" and beside.is_dir())
+            entries[key] = str(beside) if is_there or key == "background" else value
     return entries
+
+
+def _home(path: str) -> Path:
+    """A path with the home folder in the place of ~; as it is where there is none."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        return Path(path)
 
 
 def is_bundled(key: str, name: str) -> bool:

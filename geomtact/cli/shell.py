@@ -47,6 +47,9 @@ def one_line_usage_errors() -> Iterator[None]:
     except UsageError as error:
         _tell_error(str(error))
         sys.exit(USAGE_ERROR)
+    except (typer.Abort, EOFError):
+        _tell_error("stopped before it was done; nothing more is written")
+        sys.exit(1)
     except Exception as error:
         # typer's own errors, whose classes differ from version to version
         if not hasattr(error, "format_message"):

@@ -149,6 +149,16 @@ class Index:
         y = np.rint(-centre[:, 1] / step).astype(np.int64) + ny // 2
         return x, y
 
+    def deeper(self, score: NDArray[np.floating], by: float) -> NDArray[np.floating]:
+        """What ``score`` (P, n) says of the cells of all places and penetrations, of those ``by`` [m] deeper: those that are not
+        as deep get the lowest there is."""
+        bins = min(round(by * len(score) / self.sensor.max_penetration), len(score) - 1)
+        if not bins:
+            return score
+        out = np.full_like(score, score[np.isfinite(score)].min())
+        out[bins:] = score[:-bins]
+        return out
+
     def cell_covariance(self, T: ArrayLike) -> Array:
         """Spread (..., 6, 6) of the poses in the cell around each ``T`` (..., 4, 4): covariance of xi in T exp(xi^), radians and
         metres.

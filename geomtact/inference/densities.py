@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.posterior import Posterior
@@ -64,13 +63,7 @@ class GaussianPrior:
         volume = 4 * np.log(np.sinc(np.linalg.norm(xi[:, :3], axis=1) / (2 * np.pi)))
         return np.asarray(-0.5 * np.einsum("ni,ni->n", xi, np.linalg.solve(self.covariance, xi.T).T) - volume)
 
-    def over_cells(self, index: Index, T_frame_sensor: Array) -> GaussianPrior:
-        """As it is told by the cells of ``index`` and by the images under a symmetry that stand for all."""
-        assert index.mesh.symmetry is not None
-        spread = index.cell_covariance(inverse(T_frame_sensor) @ self.T)
-        return GaussianPrior(self.T, self._between_images(index.mesh.symmetry).covariance + spread)
-
-    def _between_images(self, symmetry: Symmetry) -> GaussianPrior:
+    def between_images(self, symmetry: Symmetry) -> GaussianPrior:
         """As it is told by the images under a ``symmetry`` that stand for all: wider by what lies between them."""
         free = np.zeros((3, 3)) if symmetry.axis is None else np.outer(symmetry.axis, symmetry.axis) / _TURNS**2
         if symmetry.kind == "sphere":
@@ -85,7 +78,7 @@ class OfAllImages:
 
     Attributes
     ----------
-    prior : a :class:`GaussianPrior` or a function, as in :func:`prior_log_mass`
+    prior : a :class:`GaussianPrior` or a function of poses (n, 4, 4)
     symmetry : of the object
     """
 
@@ -96,7 +89,7 @@ class OfAllImages:
         """At poses (n, 4, 4)."""
         told = self.prior
         if isinstance(told, GaussianPrior):
-            told = told._between_images(self.symmetry)
+            told = told.between_images(self.symmetry)
         return mean_density([checked(told(T @ S), len(T)) for S in images(self.symmetry)])
 
 
@@ -120,6 +113,13 @@ class NothingFelt:
 
 
 def checked(density: Any, n: int) -> Array:
+    """What a function of a user's gave for ``n`` poses, as log densities (n,).
+
+    Raises
+    ------
+    InputError
+        Of another shape.
+    """
     out = np.asarray(density, float)
     if out.shape != (n,):
         raise InputError(

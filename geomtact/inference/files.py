@@ -118,6 +118,8 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
     ------
     InputError
         The file cannot be read, or is no posterior.
+    CacheError
+        Its index cannot be opened or built.
     """
     path = file_of(path)
     data, meta = _read(path)

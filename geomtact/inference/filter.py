@@ -12,6 +12,7 @@ frame, so that what a slip made of the pose enters with the next one.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
@@ -35,6 +36,7 @@ _SLIP = -2.0  # nats by which what was known may make a frame less likely than c
 _WIDENED = 4  # frames without contact, at most, for which the object is taken to have moved on
 _TAIL = 1e-3  # density relative to the uniform distribution below which cells are not told apart
 _AT_HAND = 1 << 15
+_IMAGES = 1_000  # of the last frames, by which a prior made from one of them is found out
 _BELIEVED = 2_000  # cells of a posterior that stand for it when the next frame is held against it
 
 Counts = tuple[float, float | None]
@@ -79,6 +81,7 @@ class Filter:
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.spreading.seed)
         self._last: Posterior | None = None
+        self._images: deque[str] = deque(maxlen=_IMAGES)
         self._moments: NDArray[np.float32] | None = None
 
     def step(self, seen: Posterior) -> Posterior:
@@ -110,7 +113,9 @@ class Filter:
         else:
             self.missed += 1
         timing = seen.timing_ms | {"filter": 1e3 * (perf_counter() - began)}
-        settings = seen.settings | {"frame": self.frames, "surprise_nats": surprise}
+        own = seen.settings.get("images", [])
+        settings = seen.settings | {"frame": self.frames, "surprise_nats": surprise, "images": [*own, *self._images]}
+        self._images.extend(image for image in own if image is not None and image not in self._images)
         out = replace(seen, settings=settings, timing_ms=timing, warnings=warnings)
         if known is not None:
             out = replace(out, cells=known[0], log_prob=known[1], runs=None, contact=True)

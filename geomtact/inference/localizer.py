@@ -22,13 +22,13 @@ from geomtact.errors import UsageError, nearest_name
 from geomtact.geometry.approach import Approach, to_json
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
-from geomtact.inference.evidence import counted_once, digest
 from geomtact.inference.fusion import fused_posterior
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import opened, prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.inference.refine_by_outline import few_are_left, refine_by_outline
 from geomtact.inference.refine_together import refine_together
+from geomtact.inference.repeated_images import counted_once, digest
 from geomtact.inference.rig import views_of
 from geomtact.inference.search import View
 from geomtact.planning.next_touch import Action, next_touch
@@ -193,6 +193,11 @@ class Localizer:
         backgrounds = background if isinstance(background, list | tuple) else [background] * len(images)
         if len(backgrounds) != len(images):
             raise UsageError(f"localize: expected one background, or {len(images)}, got {len(backgrounds)}")
+        localizers = (self, *self.others) if self.others else (self,) * len(images)
+        if len(localizers) != len(images):
+            raise UsageError(
+                f"localize: prepared for {len(localizers)} sensors, got {len(images)} images; give one for each"
+            )
         prior = opened(prior, self.cache_dir)
         if len(images) == 1:
             touch, before = self.touch(images[0], kind, backgrounds[0], T_frame_sensor[0], frame, prior, effort, seed)
@@ -209,11 +214,6 @@ class Localizer:
                 if heights:
                     return refine_together(touch, [view], how.modes, seed, before)
                 return refine_by_outline(touch, view, how.modes, seed, before)
-        localizers = (self, *self.others) if self.others else (self,) * len(images)
-        if len(localizers) != len(images):
-            raise UsageError(
-                f"localize: prepared for {len(localizers)} sensors, got {len(images)} images; give one for each"
-            )
         touches = [
             each.touch(shown, kind, empty, T, frame, None, effort, seed)[0]
             for each, shown, empty, T in zip(localizers, images, backgrounds, T_frame_sensor, strict=True)
@@ -261,7 +261,7 @@ class Localizer:
             "timing_ms": timing,
         }
         if not touched:
-            elsewhere = prior_log_density(prior, self.mesh, frame)
+            elsewhere = prior_log_density(self.index, prior, T_frame_sensor, frame)
             nothing = Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, **common)
             return replace(nothing, elsewhere=elsewhere, warnings=warnings), None
         log_prior = None
@@ -275,15 +275,18 @@ class Localizer:
         with _timed(timing, "posterior"):
             common["settings"] |= _worth(rows.by, rows.calibration)
             log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
-            evidence, likeliest = self.scorer.witness.evidence(self.index, mask, log_prior)
+            witness = self.scorer.witness
+            usual, likeliest = witness.evidence(self.index, mask)
+            evidence = usual if log_prior is None else witness.evidence(self.index, mask, log_prior, above)[0]
             posterior = Posterior(self.index, rows.first, log_prob, runs=rows.runs, log_evidence=evidence, **common)
-            unknown = evidence if log_prior is None else self.scorer.witness.evidence(self.index, mask)[0]
-        if unknown - evidence > _CONTRADICTS:
-            warnings.append(
-                f"the prior and the image contradict each other, by {unknown - evidence:.0f} nats: look whether both are of this "
-                "touch and part, and at the prior's frame and units"
-            )
-        odd = self.scorer.witness.odd(unknown, likeliest)
+        if log_prior is not None:
+            unknown = witness.evidence(self.index, mask, self.index.log_weight, above)[0] if above else usual
+            if unknown - evidence > _CONTRADICTS:
+                warnings.append(
+                    f"the prior and the image contradict each other, by {unknown - evidence:.0f} nats: look whether both are of "
+                    "this touch and part, and at the prior's frame and units"
+                )
+        odd = witness.odd(usual, likeliest)
         if odd:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
         if self.space.hollow > _HOLLOW:

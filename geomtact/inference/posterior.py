@@ -174,6 +174,11 @@ class Posterior:
 
         -inf outside the contact pose space; inside it finite, unless the prior ruled T out, or T misses another sensor that shows
         contact. Without contact, -inf where T would touch, however deep, and elsewhere the prior's, 0 without one.
+
+        Raises
+        ------
+        PoseError
+            ``T`` is no rigid pose.
         """
         T = check_transforms(T)
         inside = inverse(self.T_frame_sensor) @ T.reshape(-1, 4, 4)
@@ -209,6 +214,11 @@ class Posterior:
 
         Poses of one cell tie: a share of their mass counts, drawn uniformly from T and the posterior's seed. Without contact all
         poses that may not touch tie, whatever the prior makes of them.
+
+        Raises
+        ------
+        PoseError
+            ``T`` is no rigid pose.
         """
         T = check_transforms(T)
         density = np.atleast_1d(self.log_density(T)).ravel()
@@ -262,6 +272,8 @@ class Posterior:
         ------
         InputError
             The file cannot be read, or is no posterior.
+        CacheError
+            Its index cannot be opened or built.
         """
         from geomtact.inference.files import load
 

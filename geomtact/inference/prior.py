@@ -14,7 +14,7 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.densities import LogDensity, OfAllImages
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior_cells import of_density, of_poses, of_posterior
+from geomtact.inference.prior_cells import log_mass_of_density, log_mass_of_poses, log_mass_of_posterior, stands_as
 from geomtact.se3 import Array, check_transforms
 
 _EXPECTED = (
@@ -45,28 +45,33 @@ def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) 
     if prior is None:
         return index.log_weight
     if isinstance(prior, Posterior):
-        check_same(_heading(prior), index.mesh, frame)
-        if frame == "sensor" and prior.sensor.sha256 != index.sensor.sha256:
-            raise InputError(
-                f"prior: it is in the frame of the sensor {prior.sensor.name!r}, not of {index.sensor.name!r}; give both "
-                "sensors' poses in the world (--sensor-poses, T_world_sensor in Python)"
-            )
-        return of_posterior(index, prior, T_frame_sensor)
+        _check_posterior(prior, index, frame)
+        return log_mass_of_posterior(index, prior, T_frame_sensor)
     if callable(prior):
-        return of_density(index, prior, T_frame_sensor)
-    return of_poses(index, *_pair(prior), T_frame_sensor)
+        return log_mass_of_density(index, prior, T_frame_sensor)
+    return log_mass_of_poses(index, *_pair(prior), T_frame_sensor)
 
 
-def prior_log_density(prior: Any, mesh: Mesh, frame: str) -> LogDensity | None:
+def prior_log_density(index: Index, prior: Any, T_frame_sensor: Array, frame: str) -> LogDensity | None:
     """Log density, not normalised, of ``prior`` at poses (n, 4, 4) in ``frame``, touching or not; None without one.
 
     It is the same for every image of a pose under the object's symmetry. Of a pair, each pose's mass counts for all poses within
     the radius of a mode.
+
+    Raises
+    ------
+    UsageError, InputError
+        Of no known kind, for another object or frame, or made by a contact where the sensor feels nothing now.
     """
+    mesh = index.mesh
     if prior is None:
         return None
     if isinstance(prior, Posterior):
-        check_same(_heading(prior), mesh, frame)
+        _check_posterior(prior, index, frame)
+        if prior.contact and stands_as(prior, index.sensor, T_frame_sensor):
+            raise InputError(
+                "prior: it says that the object touches the sensor, but this image shows no contact; leave it out"
+            )
         return prior.log_density
     if callable(prior):
         assert mesh.symmetry is not None
@@ -78,6 +83,16 @@ def prior_log_density(prior: Any, mesh: Mesh, frame: str) -> LogDensity | None:
         return np.array([np.logaddexp.reduce(mass[distance.within(t, poses, radius)], initial=-np.inf) for t in T])
 
     return near
+
+
+def _check_posterior(prior: Posterior, index: Index, frame: str) -> None:
+    """Refuse a posterior that is not of the object of ``index``, or is in another frame, if only another sensor's."""
+    check_same((prior.mesh.name, prior.mesh.sha256, prior.frame), index.mesh, frame)
+    if frame == "sensor" and prior.sensor.sha256 != index.sensor.sha256:
+        raise InputError(
+            f"prior: it is in the frame of the sensor {prior.sensor.name!r}, not of {index.sensor.name!r}; give both "
+            "sensors' poses in the world (--sensor-poses, T_world_sensor in Python)"
+        )
 
 
 def check_same(heading: tuple[str, str, str], mesh: Mesh, frame: str) -> None:
@@ -97,10 +112,6 @@ def check_same(heading: tuple[str, str, str], mesh: Mesh, frame: str) -> None:
             f"prior: its frame is {its_frame!r} but this posterior's is {frame!r}; give the sensor's pose in the world "
             "(--sensor-poses, T_world_sensor in Python) for both or for neither"
         )
-
-
-def _heading(prior: Posterior) -> tuple[str, str, str]:
-    return prior.mesh.name, prior.mesh.sha256, prior.frame
 
 
 def _pair(prior: Any) -> tuple[Array, Array]:

@@ -20,6 +20,7 @@ from geomtact.inference.densities import (
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, exp, inverse
+from geomtact.sensing.sensor import Sensor
 
 _CHUNK = 1 << 16
 _DRAWN = 1024  # poses of a Gaussian at a time
@@ -28,7 +29,7 @@ _FARTHEST = 8.0  # standard deviations from a Gaussian, widened by a cell, that 
 _LOOK = (24, 32)  # rays that tell which may
 
 
-def of_density(index: Index, density: LogDensity, T_frame_sensor: Array) -> NDArray[np.floating]:
+def log_mass_of_density(index: Index, density: LogDensity, T_frame_sensor: Array) -> NDArray[np.floating]:
     """Log mass (N,) of every cell, of a log ``density``, relative to the uniform one, at poses (n, 4, 4) in a frame in which the
     sensor lies at ``T_frame_sensor`` (4, 4).
 
@@ -39,10 +40,10 @@ def of_density(index: Index, density: LogDensity, T_frame_sensor: Array) -> NDAr
     """
     if isinstance(density, GaussianPrior):
         return _of_gaussian(index, density, T_frame_sensor)
-    return _normalised(index, _over_images(index, lambda T: checked(density(T_frame_sensor @ T), len(T))))
+    return _log_mass(index, _over_images(index, lambda T: checked(density(T_frame_sensor @ T), len(T))))
 
 
-def of_poses(index: Index, T: Array, log_mass: Array, T_frame_sensor: Array) -> NDArray[np.floating]:
+def log_mass_of_poses(index: Index, T: Array, log_mass: Array, T_frame_sensor: Array) -> NDArray[np.floating]:
     """Log mass (N,) of every cell, of poses ``T`` (n, 4, 4), each of which is spread over its cell.
 
     Raises
@@ -63,26 +64,32 @@ def of_poses(index: Index, T: Array, log_mass: Array, T_frame_sensor: Array) -> 
     return normalised(out)
 
 
-def of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array) -> NDArray[np.floating]:
+def log_mass_of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array) -> NDArray[np.floating]:
     """Log mass (N,) of every cell, of what the same sensor told on any grid, or another sensor in the same frame.
 
     Raises
     ------
     InputError
-        The same sensor felt nothing.
+        The same sensor felt nothing where it stands.
     """
-    if not np.allclose(prior.T_frame_sensor, T_frame_sensor, atol=1e-9):
-        return _normalised(index, _carried(index, prior, T_frame_sensor))
+    if not stands_as(prior, index.sensor, T_frame_sensor):
+        return _log_mass(index, _carried(index, prior, T_frame_sensor))
     if not prior.contact:
         raise InputError(
             "prior: it says that the object does not touch the sensor, but this image shows a contact; leave it out"
         )
     if prior.index.key == index.key:
-        return _normalised(index, prior.cell_log_density(np.arange(len(index))))
-    return _normalised(index, _on_another_grid(index, prior))
+        return _log_mass(index, prior.cell_log_density(np.arange(len(index))))
+    return _log_mass(index, _on_another_grid(index, prior))
 
 
-def _normalised(index: Index, density: NDArray[np.floating]) -> NDArray[np.floating]:
+def stands_as(prior: Posterior, sensor: Sensor, T_frame_sensor: Array) -> bool:
+    """Whether ``prior`` is of this sensor, where it stands at ``T_frame_sensor`` (4, 4)."""
+    at = np.allclose(prior.T_frame_sensor, T_frame_sensor, rtol=0, atol=1e-9)
+    return bool(at) and prior.sensor.sha256 == sensor.sha256
+
+
+def _log_mass(index: Index, density: NDArray[np.floating]) -> NDArray[np.floating]:
     """Log mass (N,) of every cell, of the log density (N,) in it, relative to the uniform one."""
     if not (density < np.inf).all():
         raise InputError(
@@ -99,14 +106,16 @@ def _normalised(index: Index, density: NDArray[np.floating]) -> NDArray[np.float
 def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> NDArray[np.floating]:
     """Log mass (N,) of every cell. Of n poses drawn that touch and k cells among which the widened density spreads, the draws
     count n times, that density k times: as many as it takes to see all those cells."""
-    wide = prior.over_cells(index, T_frame_sensor)
+    assert index.mesh.symmetry is not None
+    spread = index.cell_covariance(inverse(T_frame_sensor) @ prior.T)
+    wide = GaussianPrior(prior.T, prior.between_images(index.mesh.symmetry).covariance + spread)
     density = _over_images(index, lambda T: wide(T_frame_sensor @ T))
     if density[index.possible].max() < -0.5 * _FARTHEST**2:
         raise InputError(
             f"prior: no pose that touches the sensor lies within about {_FARTHEST:.0f} of its standard deviations, even "
             "widened by a grid cell; check its frame and its units (metres, radians)"
         )
-    log_mass = _normalised(index, density)
+    log_mass = _log_mass(index, density)
     mass = np.exp(log_mass.astype(float))
     spread = np.exp(-float(mass @ np.maximum(log_mass, -700)))
     rng, cells = np.random.default_rng(0), np.zeros(0, np.int64)
@@ -128,22 +137,24 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
 
 
 def _on_another_grid(index: Index, prior: Posterior) -> Array:
-    """Log density (N,) in the cells of ``index`` of a prior that the same sensor told on another grid: at each cell's own pose;
-    or, where these miss half of what it holds because its cells are the finer ones, as much as lies in each."""
+    """Log density (N,) in the cells of ``index`` of a prior that the same sensor told on another grid.
+
+    Of the prior's cells, those in which a cell's own pose lies share out what they hold together by their density at these poses;
+    the mass of all others goes to the cells in which their own poses lie.
+    """
     mass = prior.densities * np.exp(prior.index.log_weight)
-    looked_up, out = _home(index, np.arange(len(index)), prior.index), np.full(len(index), -np.inf)
+    looked_up = _home(index, np.arange(len(index)), prior.index)
     found = np.flatnonzero(looked_up >= 0)
-    covered = mass[np.unique(looked_up[found])].sum()
-    if covered < 0.5:
-        some = np.flatnonzero(mass > 0)
-        home = _home(prior.index, some, index)
-        there = np.bincount(home[home >= 0], mass[some[home >= 0]], len(index))
-        if covered < 0.5 * there.sum():
-            held = there > 0
-            out[held] = np.log(there[held]) - index.log_weight[held]
-            return out
-    out[found] = prior.cell_log_density(looked_up[found])
-    return out
+    told = np.zeros(len(index))
+    told[found] = np.exp(index.log_weight[found] + prior.cell_log_density(looked_up[found]))
+    seen = np.unique(looked_up[found])
+    told *= mass[seen].sum() / max(told.sum(), 1e-300)
+    mass[seen] = 0
+    rest = np.flatnonzero(mass > 0)
+    home = _home(prior.index, rest, index)
+    told += np.bincount(home[home >= 0], mass[rest[home >= 0]], len(index))
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(told) - np.where(told > 0, index.log_weight, 0))
 
 
 def _home(index: Index, ids: NDArray[np.int64], other: Index) -> NDArray[np.int64]:
@@ -169,7 +180,7 @@ def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
     with np.errstate(divide="ignore"):
         out = np.tile(np.log(density), len(index.height))
     if isinstance(before, OfAllImages):
-        known = of_density(index, before.prior, T_frame_sensor)
+        known = log_mass_of_density(index, before.prior, T_frame_sensor)
         out[index.possible] += known[index.possible] - index.log_possible_weight
     elif before is not None:
         out += _by_chunks(index, lambda T: before(T_frame_sensor @ T))

@@ -15,6 +15,7 @@ from geomtact.inference.filter import FRESH, NOW, Counts, Filter
 from geomtact.inference.motion import Motion, UniformBall
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import opened, prior_log_mass
+from geomtact.inference.repeated_images import counted_once
 from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.se3 import Array, check_transforms
 
@@ -119,8 +120,10 @@ def _tracked(
             seen = Posterior(index, *nothing, frame, at, contact=False, seed=options["seed"], warnings=told)
         if prior is not None and (seen.contact or not seen.observations):
             # the cells are those over the sensor where it stands now
-            log_mass = prior_log_mass(index, opened(prior, localizer.cache_dir), at, frame)
+            prior = opened(prior, localizer.cache_dir)
+            log_mass = prior_log_mass(index, prior, at, frame)
             state.memory = Mixture(np.flatnonzero(np.isfinite(log_mass)), np.exp(log_mass[np.isfinite(log_mass)]), 0.0)
+            seen = counted_once(seen, prior) if seen.observations else seen
             prior = None
         yield state.step(replace(seen, settings=seen.settings | settings))
 

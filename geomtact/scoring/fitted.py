@@ -101,21 +101,10 @@ class FittedScorer:
             cells = np.flatnonzero(np.isfinite(log_prior))
             prior = log_prior[cells]
         shares, shown = ways(mask, index.sensor)
-        scores = [_deeper(scorer.score(index, each), index, above).reshape(-1) for each in shown]
+        scores = [index.deeper(scorer.score(index, each), above).reshape(-1) for each in shown]
         score = mixed(shares, scores, index.log_weight, calibration.temperature)
         score = score if len(cells) == len(score) else score[cells]
         return Rows(cells, None, score, prior, calibration, scorer.name)
-
-
-def _deeper(score: NDArray[np.float32], index: Index, by: float) -> NDArray[np.float32]:
-    """Scores (P, n) of poses ``by`` [m] deeper than those scored, or of the deepest; those that are not as deep get the lowest
-    there is."""
-    bins = min(round(by * len(score) / index.sensor.max_penetration), len(score) - 1)
-    if not bins:
-        return score
-    out = np.full_like(score, score[np.isfinite(score)].min())
-    out[bins:] = score[:-bins]
-    return out
 
 
 def fitted_scorer(

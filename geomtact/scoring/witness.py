@@ -31,11 +31,13 @@ class Witness:
     moments: Moments
     usual: tuple[float, float] = (-np.inf, -np.inf)
 
-    def evidence(self, index: Index, mask: Shown, log_prior: NDArray[np.floating] | None = None) -> tuple[float, float]:
+    def evidence(
+        self, index: Index, mask: Shown, log_prior: NDArray[np.floating] | None = None, above: float = 0.0
+    ) -> tuple[float, float]:
         """Log evidence of ``mask`` (h, w), and the log likelihood of the best pose.
 
         Under the uniform distribution on a large grid the mean is over poses drawn once for all; ``log_prior`` (N,) are
-        log masses.
+        log masses, and ``above`` as of :meth:`FittedScorer.cells`: without a prior all depths are alike.
         """
         if log_prior is None and len(index) <= _SMALL:
             log_prior = index.log_weight
@@ -43,7 +45,8 @@ class Witness:
             likelihood = self.moments.of_drawn(index, mask).astype(float)
             log_mass: NDArray[np.floating] = np.full(len(likelihood), -np.log(len(likelihood)))
         else:
-            likelihood, log_mass = self.moments.score(index, mask).ravel().astype(float), log_prior
+            likelihood = index.deeper(self.moments.score(index, mask), above).ravel().astype(float)
+            log_mass = log_prior
         return float(np.logaddexp.reduce(likelihood + log_mass)), float(likelihood.max())
 
     def odd(self, evidence: float, best: float) -> bool:
