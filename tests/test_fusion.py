@@ -265,6 +265,9 @@ def test_a_sensor_that_is_hardly_possible_is_told(plug, rng):
     assert disagreement(fused) is None
     against = replace(fused, support=np.array([1.0, -4.0, 2.0]))
     assert disagreement(against).startswith("sensor 2 of 3 disagrees")
+    assert "check its T_world_sensor" in disagreement(against) and "the prior, its" in disagreement(
+        against, with_prior=True
+    )
 
 
 def test_a_prior_counts_once(plug, rng):

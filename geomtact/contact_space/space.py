@@ -110,8 +110,8 @@ class ContactSpace:
     def sample(
         self, n: int, rng: np.random.Generator, depths: tuple[float, float] | None = None, batch: int = 128
     ) -> tuple[Array, Array]:
-        """``n`` poses uniform over the contact pose space, by rejection: Haar times length along x and y times penetration, which is
-        length along z wherever the deepest point stays in the window.
+        """``n`` poses uniform over the contact pose space, by rejection: Haar times length along x and y times penetration,
+        which is length along z wherever the deepest point stays in the window.
 
         Parameters
         ----------

@@ -153,7 +153,7 @@ def fused_posterior(
         log_prior = prior_log_mass(first.index, prior, first.T_frame_sensor, first.frame)
     fused = fuse(touches, log_prior, rig)
     timing["fuse"] = 1e3 * (time.perf_counter() - began)
-    against = disagreement(fused)
+    against = disagreement(fused, prior is not None)
     posterior = replace(
         first,
         cells=fused.cells,
@@ -237,20 +237,22 @@ def _warnings(touches: Sequence[Posterior]) -> list[str]:
     return [f"sensor {i}: {warning}" for i, touch in enumerate(touches, 1) for warning in touch.warnings]
 
 
-def disagreement(fused: Fused) -> str | None:
-    """Which sensors the others contradict, in words; None where all agree."""
+def disagreement(fused: Fused, with_prior: bool = False) -> str | None:
+    """Which sensors the others, and the prior, contradict, in words; None where all agree."""
     against = np.flatnonzero(fused.support < _DISAGREES)
     if not len(against):
         return None
     if len(fused.support) == 2:
         return (
-            "the two sensors disagree: hardly any pose agrees with both; check T_world_sensor (sensor to world, not the "
-            "inverse), or whether one of them touches something else"
+            "the two sensors disagree: hardly any pose agrees with both; check "
+            f"{'the prior, ' * with_prior}T_world_sensor (sensor to world, not the inverse), or whether one of them touches "
+            "something else"
         )
     worst = int(against[fused.support[against].argmin()])
     return (
         f"sensor {worst + 1} of {len(fused.support)} disagrees with the others: they make what it shows less likely than chance "
-        "does; check its T_world_sensor (sensor to world, not the inverse), or whether it touches something else"
+        f"does; check {'the prior, ' * with_prior}its T_world_sensor (sensor to world, not the inverse), or whether it touches "
+        "something else"
     )
 
 
