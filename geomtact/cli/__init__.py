@@ -22,6 +22,7 @@ from geomtact.cli.view import view
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     help="Localize a known part from the shape of one tactile contact: the whole distribution of its pose.",
 )
