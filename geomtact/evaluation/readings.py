@@ -253,7 +253,8 @@ def localize_balls(
     balls = {}
     for ball in BALLS:
         prepared = Localizer.prepare(_ball(ball), sensor=list(sensors.values()), cache_dir=cache_dir)
-        for used, localizer in zip(sensors, (prepared, *prepared.others), strict=True):
+        each = replace(prepared, others=()), *prepared.others
+        for used, localizer in zip(sensors, each, strict=True):
             balls[ball, used] = localizer
     for row in circles_of(circles, (*_BY_EYE, "ball_mm"))[first:]:
         pressed = float(row["ball_mm"])
