@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
     from geomtact.geometry.mesh_file import load_mesh
     from geomtact.inference.densities import GaussianPrior
+    from geomtact.inference.effort import Effort
     from geomtact.inference.identify import identify
-    from geomtact.inference.localizer import Effort, Localizer
+    from geomtact.inference.localizer import Localizer
     from geomtact.inference.modes import Mode
     from geomtact.inference.motion import GaussianTwist
     from geomtact.inference.posterior import Posterior
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 _MODULE_OF = {
     "Action": "geomtact.planning.next_touch",
     "Contact": "geomtact.sensing.contact",
-    "Effort": "geomtact.inference.localizer",
+    "Effort": "geomtact.inference.effort",
     "GaussianPrior": "geomtact.inference.densities",
     "GaussianTwist": "geomtact.inference.motion",
     "Localizer": "geomtact.inference.localizer",

@@ -128,7 +128,8 @@ def _prepare(part: str, sensor: str, cache: str) -> dict[str, Any]:
 def _localize(part: str, sensor: str, cache: str, repeats: str) -> dict[str, Any]:
     """Each touch at every effort, and by the thesis's query, in turn: all of them meet the same neighbours."""
     from geomtact.evaluation.touches import random_touches
-    from geomtact.inference.localizer import EFFORTS, Localizer
+    from geomtact.inference.effort import EFFORTS
+    from geomtact.inference.localizer import Localizer
 
     localizer = Localizer.prepare(part, sensor=sensor, cache_dir=cache)
     touches = random_touches(localizer.space, int(repeats), seed=0)

@@ -61,7 +61,7 @@ def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], 
     from geomtact.errors import UsageError, nearest_name
     from geomtact.evaluation.study import THESIS_PARTS
     from geomtact.geometry.catalogue import catalogue
-    from geomtact.inference.localizer import EFFORTS
+    from geomtact.inference.effort import EFFORTS
     from geomtact.scoring.catalogue import DEFAULT_SCORER, SCORERS
 
     known = (*SCORERS, *EFFORTS)
@@ -173,7 +173,7 @@ def _judge(
     """Judge one score on one part, from where the file ends."""
     from geomtact.evaluation import scores, study
     from geomtact.evaluation.touches import FELT
-    from geomtact.inference.localizer import EFFORTS
+    from geomtact.inference.effort import EFFORTS
     from geomtact.report.result import plain
     from geomtact.scoring.catalogue import DEFAULT_SCORER
 

@@ -26,7 +26,8 @@ from geomtact.evaluation.study import mean_with_interval
 from geomtact.evaluation.touches import Touch, random_touches
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
-from geomtact.inference.localizer import EFFORTS, Effort, Localizer
+from geomtact.inference.effort import EFFORTS, Effort
+from geomtact.inference.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import calibrate, simulate_touches
 from geomtact.scoring.catalogue import DEFAULT_SCORER, SCORERS

@@ -18,10 +18,11 @@ from geomtact.contact_space.index import Index
 from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import default_cache_dir, open_index
-from geomtact.errors import UsageError, nearest_name
+from geomtact.errors import UsageError
 from geomtact.geometry.approach import Approach, to_json
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.inference.effort import Effort, effort_of
 from geomtact.inference.fusion import fused_posterior
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import opened, prior_log_density, prior_log_mass
@@ -41,46 +42,10 @@ from geomtact.sensing.contact import Contact, Shown
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
 
-RESOLVED = ("blocks", "cells", "all")
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much is done for a touch.
-
-    Attributes
-    ----------
-    resolved : what is scored: "blocks" of about 20 cells, "cells" (on a large grid those where the mass is), or "all"
-        cells, their pixels counted too
-    modes : that are refined
-    thorough : whether each is refined by all registrations or by one
-    outlines : whether, of one mask, the outline is what tells them apart where few enough cells are left (see
-        ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by FilterReg
-    """
-
-    resolved: str
-    modes: int
-    thorough: bool = True
-    outlines: bool = False
-
-    def __post_init__(self) -> None:
-        if self.resolved not in RESOLVED:
-            raise UsageError(
-                f"Effort: no way to resolve named {self.resolved!r}{nearest_name(self.resolved, RESOLVED)}"
-            )
-        if self.modes < 0:
-            raise UsageError(f"Effort: expected 0 refined modes or more, got {self.modes}; give 0 for none")
-
-
 _HOLLOW = 0.01  # share of the surface in hollows that the sensor may fit into, from which it is warned of
 # nats by which an image is likelier without the prior: were the moments' likelihood exact, one image in exp(5), or 148, at most
 # would be, its pose drawn from the prior (Markov's inequality)
 _CONTRADICTS = 5.0
-EFFORTS = {
-    "fast": Effort("blocks", 0),
-    "balanced": Effort("cells", 5, thorough=False),
-    "exact": Effort("all", 25, outlines=True),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +153,7 @@ class Localizer:
         CacheError
             The index of a prior's file cannot be opened or built.
         """
-        how = _effort(effort)
+        how = effort_of(effort)
         images, frame, T_frame_sensor = views_of(image, T_world_sensor)
         backgrounds = background if isinstance(background, list | tuple) else [background] * len(images)
         if len(backgrounds) != len(images):
@@ -201,19 +166,7 @@ class Localizer:
         prior = opened(prior, self.cache_dir)
         if len(images) == 1:
             touch, before = self.touch(images[0], kind, backgrounds[0], T_frame_sensor[0], frame, prior, effort, seed)
-            touch = counted_once(touch, prior)
-            if not touch.contact:
-                return touch
-            with _timed(touch.timing_ms, "refine"):
-                # a mask is registered mode by mode; heights, and outlines where few cells are left, are searched for and weighed
-                contact = touch.observation.contact
-                heights = contact.height is not None
-                if not how.modes or not (heights or (how.outlines and few_are_left(touch))):
-                    return self.refinery.refine(touch, contact, how.modes, how.thorough)
-                view = View(self.refinery, contact, np.eye(4))
-                if heights:
-                    return refine_together(touch, [view], how.modes, seed, before)
-                return refine_by_outline(touch, view, how.modes, seed, before)
+            return self._refined(counted_once(touch, prior), before, how)
         touches = [
             each.touch(shown, kind, empty, T, frame, None, effort, seed)[0]
             for each, shown, empty, T in zip(localizers, images, backgrounds, T_frame_sensor, strict=True)
@@ -235,7 +188,7 @@ class Localizer:
         """What one sensor at ``T_frame_sensor`` (4, 4) tells, not refined; and the log mass of every cell (M,) before that, where
         there is a prior and contact. The rest as in :meth:`localize`."""
         timing: dict[str, float] = {}
-        resolved = _effort(effort).resolved
+        resolved = effort_of(effort).resolved
         settings = self._settings(effort, seed)
         with _timed(timing, "read"):
             observation = read_observation(image, self.sensor, kind, background)
@@ -295,6 +248,21 @@ class Localizer:
                 "touches in there are taken for others: touch from outside, or localize on a mesh of that wall alone"
             )
         return replace(posterior, warnings=warnings, settings=posterior.settings | {"odd": odd}), log_prior
+
+    def _refined(self, touch: Posterior, log_prior: NDArray[np.floating] | None, how: Effort) -> Posterior:
+        """``touch`` with its leading modes below the grid: a mask is registered mode by mode; heights, and outlines where few
+        cells are left, are searched for and weighed. ``log_prior`` as :meth:`touch` gives it."""
+        if not touch.contact:
+            return touch
+        with _timed(touch.timing_ms, "refine"):
+            contact = touch.observation.contact
+            heights = contact.height is not None
+            if not how.modes or not (heights or (how.outlines and few_are_left(touch))):
+                return self.refinery.refine(touch, contact, how.modes, how.thorough)
+            view = View(self.refinery, contact, np.eye(4))
+            if heights:
+                return refine_together(touch, [view], how.modes, touch.seed, log_prior)
+            return refine_by_outline(touch, view, how.modes, touch.seed, log_prior)
 
     def simulate(self, T_sensor_object: Any) -> Contact:
         """What the sensor would see at a pose (4, 4), object to sensor in metres, without noise (thesis 6.1.3): mask and heights
@@ -365,16 +333,6 @@ def _calibrated_as(localizer: Localizer, sensor: Sensor) -> Localizer:
     if held == wanted:
         return localizer
     return replace(localizer, index=replace(localizer.index, sensor=sensor))
-
-
-def _effort(effort: str | Effort) -> Effort:
-    if isinstance(effort, Effort):
-        return effort
-    if not isinstance(effort, str):
-        raise UsageError(f"effort: expected one of {', '.join(EFFORTS)}, or an Effort, got {type(effort).__name__}")
-    if effort not in EFFORTS:
-        raise UsageError(f"no effort named {effort!r}{nearest_name(effort, EFFORTS)}")
-    return EFFORTS[effort]
 
 
 def _worth(scored_by: str, calibration: Calibration) -> dict[str, Any]:
