@@ -301,7 +301,7 @@ def test_a_larger_budget_gives_a_finer_grid():
     grids = [choose(mesh, 3e-3, sensor, None, n) for n in (10_000, 100_000, 1_000_000)]
     size = [np.hypot(g.turn_step * mesh.radius_rms, g.step) for g in grids]
     assert size[0] > size[1] > size[2]
-    with pytest.raises(UsageError, match="max_poses: expected at least 1000, got 999"):
+    with pytest.raises(UsageError, match="max_poses: expected 1000 to 100,000,000, got 999"):
         choose(mesh, 3e-3, sensor, None, 999)
 
 

@@ -269,6 +269,9 @@ def test_a_frame_that_the_prior_was_made_from_is_told(flat_nut, creeping):
     assert len(set(known.settings["images"])) == 3
     for posterior in (flat_nut.localize(masks[0], prior=known), next(track(flat_nut, masks, prior=known))):
         assert any("counts twice" in warning for warning in posterior.warnings)
+    third = flat_nut.localize(masks[2], prior=None)
+    told = [any("counts twice" in w for w in each.warnings) for each in track(flat_nut, masks[:4], prior=third)]
+    assert told == [False, False, True, False]
     fresh = [flat_nut.localize(masks[3], prior=known), *track(flat_nut, masks[3:5], prior=known)]
     assert not any("counts twice" in warning for posterior in fresh for warning in posterior.warnings)
 

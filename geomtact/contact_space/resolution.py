@@ -23,6 +23,7 @@ LEVELS = (1, 2, 3, 4)
 PIXELS_PER_MASK_PIXEL = 3  # of the height maps, along each side
 _BYTES_FOR_FINE_MASKS = 120e6
 _BORDER = 1.3
+_MOST_POSES = 100_000_000
 _FACES = 6  # at most, about which there are disks
 _MOST_MORE = 1.25  # times ``max_poses`` that there may be before the lattice grows coarser for the disks' sake
 _DISK = 0.41  # steps, half angle of a disk: its cells are then a third of a step across, the tilt that a face is felt whole at
@@ -107,10 +108,12 @@ def choose(
     Raises
     ------
     UsageError
-        ``max_poses`` below 1000, or an approach that makes no sense.
+        ``max_poses`` out of range, or an approach that makes no sense.
     """
-    if max_poses < 1000:
-        raise UsageError(f"max_poses: expected at least 1000, got {max_poses}")
+    if not 1000 <= max_poses <= _MOST_POSES:
+        raise UsageError(
+            f"max_poses: expected 1000 to {_MOST_POSES:,}, got {max_poses:,}; a million take 200 MB of disk, and more memory"
+        )
     assert mesh.symmetry is not None
     radius_rms = mesh.radius_rms  # what a rotation moves
     coarse, fine = sensor.along((24, 32)), sensor.along((48, 64))

@@ -63,14 +63,6 @@ class GaussianPrior:
         volume = 4 * np.log(np.sinc(np.linalg.norm(xi[:, :3], axis=1) / (2 * np.pi)))
         return np.asarray(-0.5 * np.einsum("ni,ni->n", xi, np.linalg.solve(self.covariance, xi.T).T) - volume)
 
-    def between_images(self, symmetry: Symmetry) -> GaussianPrior:
-        """As it is told by the images under a ``symmetry`` that stand for all: wider by what lies between them."""
-        free = np.zeros((3, 3)) if symmetry.axis is None else np.outer(symmetry.axis, symmetry.axis) / _TURNS**2
-        if symmetry.kind == "sphere":
-            free = np.eye(3) / _ROTATIONS**2
-        about_centre = np.vstack([np.eye(3), hat(symmetry.centre)])
-        return GaussianPrior(self.T, self.covariance + about_centre @ free @ about_centre.T * (2 * np.pi) ** 2 / 12)
-
 
 @dataclass(frozen=True, eq=False)
 class OfAllImages:
@@ -89,7 +81,7 @@ class OfAllImages:
         """At poses (n, 4, 4)."""
         told = self.prior
         if isinstance(told, GaussianPrior):
-            told = told.between_images(self.symmetry)
+            told = over_images(told, self.symmetry)
         return mean_density([checked(told(T @ S), len(T)) for S in images(self.symmetry)])
 
 
@@ -110,6 +102,15 @@ class NothingFelt:
         """At poses (n, 4, 4), touching the first sensor or not."""
         density = np.zeros(len(T)) if self.before is None else self.before(T)
         return density + np.sum([other.log_density(T) for other in self.others], axis=0)
+
+
+def over_images(prior: GaussianPrior, symmetry: Symmetry) -> GaussianPrior:
+    """``prior`` as it is told by the images under a ``symmetry`` that stand for all: wider by what lies between them."""
+    free = np.zeros((3, 3)) if symmetry.axis is None else np.outer(symmetry.axis, symmetry.axis) / _TURNS**2
+    if symmetry.kind == "sphere":
+        free = np.eye(3) / _ROTATIONS**2
+    about_centre = np.vstack([np.eye(3), hat(symmetry.centre)])
+    return GaussianPrior(prior.T, prior.covariance + about_centre @ free @ about_centre.T * (2 * np.pi) ** 2 / 12)
 
 
 def checked(density: Any, n: int) -> Array:

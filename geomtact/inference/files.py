@@ -25,7 +25,7 @@ from geomtact.sensing.sensor import Sensor
 
 _KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many
 _OFF = 1e-3  # that probabilities may add up to beside 1
-_WITHOUT_PRIOR = (
+WITHOUT_PRIOR = (
     "what a prior and other sensors told is not in this file: it knows no more than where one sensor felt nothing"
 )
 _FORMAT = "geomtact/posterior/2"
@@ -59,8 +59,8 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "approach": to_json(posterior.index.approach),
         "contact": posterior.contact,
         "log_evidence": posterior.log_evidence,
-        "settings": posterior.settings,
-        "warnings": posterior.warnings + [_WITHOUT_PRIOR] * (posterior.elsewhere is not None),
+        "settings": posterior.settings if posterior.elsewhere is None else posterior.settings | {"images": []},
+        "warnings": posterior.warnings + [WITHOUT_PRIOR] * (posterior.elsewhere is not None),
         "refined": [[refined[int(k)].length, refined[int(k)].moved, refined[int(k)].observable.tolist()] for k in keys],
     }
     arrays = {
@@ -173,7 +173,8 @@ def file_of(path: str | Path) -> Path:
     """
     file = Path(path) / "posterior.npz" if Path(path).is_dir() else Path(path)
     if not file.is_file():
-        raise InputError(f"{path}: no such file; give a posterior.npz, or its folder")
+        what = "no posterior.npz in that folder" if Path(path).is_dir() else "no such file"
+        raise InputError(f"{path}: {what}; give a posterior.npz, or its folder")
     return file
 
 

@@ -114,7 +114,11 @@ class Filter:
             self.missed += 1
         timing = seen.timing_ms | {"filter": 1e3 * (perf_counter() - began)}
         own = seen.settings.get("images", [])
-        settings = seen.settings | {"frame": self.frames, "surprise_nats": surprise, "images": [*own, *self._images]}
+        settings = seen.settings | {
+            "frame": self.frames,
+            "surprise_nats": surprise,
+            "images": list(dict.fromkeys([*own, *self._images])),
+        }
         self._images.extend(image for image in own if image is not None and image not in self._images)
         out = replace(seen, settings=settings, timing_ms=timing, warnings=warnings)
         if known is not None:

@@ -215,7 +215,7 @@ def _nothing_felt(touches: Sequence[Posterior], prior: Any) -> Posterior:
     first, others = touches[0], touches[1:]
     return replace(
         first,
-        elsewhere=NothingFelt(others, prior_log_density(first.index, prior, first.T_frame_sensor, first.frame)),
+        elsewhere=NothingFelt(others, prior_log_density(first.index, prior, first.frame)),
         observations=[o for touch in touches for o in touch.observations],
         settings=first.settings | _said(touches),
         warnings=_warnings(touches),

@@ -25,7 +25,7 @@ from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.effort import Effort, effort_of
 from geomtact.inference.fusion import fused_posterior
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import opened, prior_log_density, prior_log_mass
+from geomtact.inference.prior import lost_contact, opened, prior_log_density, prior_log_mass
 from geomtact.inference.refine import Refinery
 from geomtact.inference.refine_by_outline import few_are_left, refine_by_outline
 from geomtact.inference.refine_together import refine_together
@@ -100,6 +100,8 @@ class Localizer:
         InputError
             Weights that cannot be used.
         """
+        if not isinstance(max_poses, int | np.integer):
+            raise UsageError(f"max_poses: expected a whole number, got {max_poses!r}")
         if not isinstance(sensor, str | Path | Sensor):
             if not sensor:
                 raise UsageError("prepare: expected a sensor for every image, got an empty list")
@@ -209,12 +211,20 @@ class Localizer:
                 "kind": observation.kind,
                 "contact_method": observation.method,
                 "heights": contact.height is not None,
-                "images": [digest(observation.image) if touched else None],
+                # a mask is the same in whichever two values
+                "images": [
+                    digest(contact.mask if observation.kind == "mask" else observation.image) if touched else None
+                ],
             },
             "timing_ms": timing,
         }
         if not touched:
-            elsewhere = prior_log_density(self.index, prior, T_frame_sensor, frame)
+            elsewhere = prior_log_density(self.index, prior, frame)
+            if lost_contact(prior, self.sensor, T_frame_sensor):
+                warnings.append(
+                    "the prior says that the object touches this sensor where it stands: it is given up, contact was lost"
+                )
+                elsewhere = None
             nothing = Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, **common)
             return replace(nothing, elsewhere=elsewhere, warnings=warnings), None
         log_prior = None

@@ -16,6 +16,7 @@ from geomtact.inference.densities import LogDensity, OfAllImages
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior_cells import log_mass_of_density, log_mass_of_poses, log_mass_of_posterior, stands_as
 from geomtact.se3 import Array, check_transforms
+from geomtact.sensing.sensor import Sensor
 
 _EXPECTED = (
     "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)), a GaussianPrior or a "
@@ -52,7 +53,12 @@ def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) 
     return log_mass_of_poses(index, *_pair(prior), T_frame_sensor)
 
 
-def prior_log_density(index: Index, prior: Any, T_frame_sensor: Array, frame: str) -> LogDensity | None:
+def lost_contact(prior: Any, sensor: Sensor, T_frame_sensor: Array) -> bool:
+    """Whether ``prior`` says that the object touches the sensor where it stands at ``T_frame_sensor`` (4, 4)."""
+    return isinstance(prior, Posterior) and prior.contact and stands_as(prior, sensor, T_frame_sensor)
+
+
+def prior_log_density(index: Index, prior: Any, frame: str) -> LogDensity | None:
     """Log density, not normalised, of ``prior`` at poses (n, 4, 4) in ``frame``, touching or not; None without one.
 
     It is the same for every image of a pose under the object's symmetry. Of a pair, each pose's mass counts for all poses within
@@ -61,17 +67,13 @@ def prior_log_density(index: Index, prior: Any, T_frame_sensor: Array, frame: st
     Raises
     ------
     UsageError, InputError
-        Of no known kind, for another object or frame, or made by a contact where the sensor feels nothing now.
+        Of no known kind, or for another object or frame.
     """
     mesh = index.mesh
     if prior is None:
         return None
     if isinstance(prior, Posterior):
         _check_posterior(prior, index, frame)
-        if prior.contact and stands_as(prior, index.sensor, T_frame_sensor):
-            raise InputError(
-                "prior: it says that the object touches the sensor, but this image shows no contact; leave it out"
-            )
         return prior.log_density
     if callable(prior):
         assert mesh.symmetry is not None

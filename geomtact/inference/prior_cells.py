@@ -16,6 +16,7 @@ from geomtact.inference.densities import (
     checked,
     images,
     mean_density,
+    over_images,
 )
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring.calibration import normalised
@@ -108,7 +109,7 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     count n times, that density k times: as many as it takes to see all those cells."""
     assert index.mesh.symmetry is not None
     spread = index.cell_covariance(inverse(T_frame_sensor) @ prior.T)
-    wide = GaussianPrior(prior.T, prior.between_images(index.mesh.symmetry).covariance + spread)
+    wide = GaussianPrior(prior.T, over_images(prior, index.mesh.symmetry).covariance + spread)
     density = _over_images(index, lambda T: wide(T_frame_sensor @ T))
     if density[index.possible].max() < -0.5 * _FARTHEST**2:
         raise InputError(

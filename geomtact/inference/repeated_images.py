@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from geomtact.inference.files import WITHOUT_PRIOR
 from geomtact.inference.posterior import Posterior
 
 
@@ -35,5 +36,7 @@ def counted_once(posterior: Posterior, prior: Any) -> Posterior:
         warnings.append(
             "the prior was made from the same image, which so counts twice: give one of other touches alone"
         )
+    if isinstance(prior, Posterior) and WITHOUT_PRIOR in prior.warnings:
+        warnings.append(f"prior: {WITHOUT_PRIOR}")
     settings = posterior.settings | {"images": own + [image for image in before if image is not None]}
     return replace(posterior, settings=settings, warnings=posterior.warnings + warnings)

@@ -103,7 +103,7 @@ def _tracked(
     options: dict[str, Any],
     skip: bool,
 ) -> Iterator[Posterior]:
-    index, motion = localizer.index, state.spreading.motion
+    index, motion, made_from = localizer.index, state.spreading.motion, None
     settings: dict[str, Any] = {"motion": {"kind": type(motion).__name__, **asdict(motion)}}
     settings |= {"counts": list(state.counts), "fresh": state.fresh, "most": state.most}
     for n, image, T in pairs:
@@ -123,8 +123,9 @@ def _tracked(
             prior = opened(prior, localizer.cache_dir)
             log_mass = prior_log_mass(index, prior, at, frame)
             state.memory = Mixture(np.flatnonzero(np.isfinite(log_mass)), np.exp(log_mass[np.isfinite(log_mass)]), 0.0)
-            seen = counted_once(seen, prior) if seen.observations else seen
-            prior = None
+            made_from, prior = prior, None
+        if seen.observations:
+            seen = counted_once(seen, made_from)
         yield state.step(replace(seen, settings=seen.settings | settings))
 
 
@@ -143,6 +144,10 @@ def _check(
         raise UsageError(f"frames: expected several images, got one of shape {frames.shape}; give it in a list")
     if isinstance(frames, Sized) and len(frames) == 0:
         raise InputError(_NO_FRAMES)
+    if not isinstance(motion, Motion):
+        raise UsageError(
+            f"motion: expected a UniformBall or a GaussianTwist, got {motion!r}; UniformBall(0.008) is 8 mm a frame"
+        )
     if not all(0 <= each < np.inf for each in asdict(motion).values()):
         raise UsageError(f"motion: expected finite lengths [m] and angles [rad], not below 0, got {motion}")
     if len(counts) != 2 or not 0 < counts[0] <= 1 or not (counts[1] is None or 0 <= counts[1] <= 1):

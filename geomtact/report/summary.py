@@ -64,7 +64,7 @@ class ModeSummary:
         for motion, share in self.told.items():
             groups["fixed" if share >= TOLD else "not" if share <= HARDLY else "partly"].append(motion)
         if len(groups["not"]) == len(MOTIONS):
-            return "unknown"  # every contact tells at least the depth: this mode was not refined
+            return "unknown"  # every contact tells at least the depth: this mode is not one that registration found
         if len(groups["fixed"]) == len(MOTIONS):
             return "fixed: all six motions"
         return "; ".join(f"{how}: {', '.join(motions)}" for how, motions in groups.items() if motions)

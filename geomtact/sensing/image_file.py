@@ -88,7 +88,7 @@ def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] 
     info = PngImagePlugin.PngInfo()
     for key, value in (metadata or {}).items():
         text = value if isinstance(value, str) else json.dumps(np.asarray(value).tolist())
-        info.add_text(_PREFIX + key.removeprefix(_PREFIX), text)
+        info.add_text(_PREFIX + key.removeprefix(_PREFIX), text.encode("utf-8", "backslashreplace").decode())
     path = Path(path)
     try:
         write_whole(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", pnginfo=info))
