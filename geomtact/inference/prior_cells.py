@@ -108,8 +108,8 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     """Log mass (N,) of every cell. Of n poses drawn that touch and k cells among which the widened density spreads, the draws
     count n times, that density k times: as many as it takes to see all those cells."""
     assert index.mesh.symmetry is not None
-    spread = index.cell_covariance(inverse(T_frame_sensor) @ prior.T)
-    wide = GaussianPrior(prior.T, over_images(prior, index.mesh.symmetry).covariance + spread)
+    cell = index.cell_covariance(inverse(T_frame_sensor) @ prior.T)
+    wide = GaussianPrior(prior.T, over_images(prior, index.mesh.symmetry).covariance + cell)
     density = _over_images(index, lambda T: wide(T_frame_sensor @ T))
     if density[index.possible].max() < -0.5 * _FARTHEST**2:
         raise InputError(
