@@ -49,7 +49,7 @@ def test_touches_are_told_from_those_of_other_parts(drawer):
     for own in drawer:
         found = [
             {c.name: c for c in identify(drawer, mask, kind="mask", effort="fast").candidates}
-            for mask in touches(own, 100)
+            for mask in touches(own, 160)
         ]
         unlike += [each[own.mesh.name].unlike for each in found]
         for other in drawer:

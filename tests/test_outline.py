@@ -165,7 +165,7 @@ def upright(make_localizer):
 
 def test_of_a_known_side_outlines_tell_more_than_the_grid(upright):
     """Of every touch at least as much, rigid and elastic gels in turn; with noise, see docs/no-more-than-needed.md."""
-    touches = random_touches(upright.space, 6, 5, None, CLEAN)
+    touches = random_touches(upright.space, 4, 5, None, CLEAN)
     more, said = [], []
     for touch in touches:
         balanced, exact = (upright.localize(touch.mask, "mask", effort=e) for e in ("balanced", "exact"))
