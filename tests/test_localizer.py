@@ -393,6 +393,7 @@ def test_a_prior_of_another_object_or_frame_is_refused(ball, flat_nut, a_touch):
         ball.localize(mask, prior=nothing)
     lost = ball.localize(np.zeros_like(mask), prior=held)
     assert not lost.contact and lost.elsewhere is None and any("contact was lost" in each for each in lost.warnings)
+    assert lost.settings["images"] == [None]  # what is given up does not count twice later
     with pytest.raises(InputError, match="in the frame of the sensor 'other', not of 'gelsight-mini'"):
         ball.localize(np.zeros_like(mask), prior=elsewhere)
 

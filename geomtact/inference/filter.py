@@ -12,7 +12,6 @@ frame, so that what a slip made of the pose enters with the next one.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
@@ -81,7 +80,7 @@ class Filter:
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.spreading.seed)
         self._last: Posterior | None = None
-        self._images: deque[str] = deque(maxlen=_IMAGES)
+        self._images: list[str] = []
         self._moments: NDArray[np.float32] | None = None
 
     def step(self, seen: Posterior) -> Posterior:
@@ -113,13 +112,9 @@ class Filter:
         else:
             self.missed += 1
         timing = seen.timing_ms | {"filter": 1e3 * (perf_counter() - began)}
-        own = seen.settings.get("images", [])
-        settings = seen.settings | {
-            "frame": self.frames,
-            "surprise_nats": surprise,
-            "images": list(dict.fromkeys([*own, *self._images])),
-        }
-        self._images.extend(image for image in own if image is not None and image not in self._images)
+        images = list(dict.fromkeys([*seen.settings.get("images", []), *self._images]))[:_IMAGES]
+        self._images = [image for image in images if image is not None]
+        settings = seen.settings | {"frame": self.frames, "surprise_nats": surprise, "images": images}
         out = replace(seen, settings=settings, timing_ms=timing, warnings=warnings)
         if known is not None:
             out = replace(out, cells=known[0], log_prob=known[1], runs=None, contact=True)

@@ -168,6 +168,9 @@ class Localizer:
         prior = opened(prior, self.cache_dir)
         if len(images) == 1:
             touch, before = self.touch(images[0], kind, backgrounds[0], T_frame_sensor[0], frame, prior, effort, seed)
+            if not touch.contact and lost_contact(prior, self.sensor, T_frame_sensor[0]):
+                told = "the prior says that the object touches this sensor where it stands: it is given up, contact was lost"
+                touch, prior = replace(touch, elsewhere=None, warnings=[*touch.warnings, told]), None
             return self._refined(counted_once(touch, prior), before, how)
         touches = [
             each.touch(shown, kind, empty, T, frame, None, effort, seed)[0]
@@ -220,11 +223,6 @@ class Localizer:
         }
         if not touched:
             elsewhere = prior_log_density(self.index, prior, frame)
-            if lost_contact(prior, self.sensor, T_frame_sensor):
-                warnings.append(
-                    "the prior says that the object touches this sensor where it stands: it is given up, contact was lost"
-                )
-                elsewhere = None
             nothing = Posterior(self.index, np.zeros(0, np.int64), np.zeros(0), contact=False, **common)
             return replace(nothing, elsewhere=elsewhere, warnings=warnings), None
         log_prior = None
