@@ -76,6 +76,19 @@ def cell_weights(directions):
     return np.repeat(directions.weights / directions.turns, directions.turns)
 
 
+@each_symmetry
+def test_halfway_between_two_turns_the_first_is_taken_whatever_the_last_digit(symmetry):
+    """So that every processor sorts an index alike: rotations of a grid often lie halfway between turns of the coarser one."""
+    directions = grid(symmetry)
+    k = np.repeat(np.arange(len(directions.vectors)), directions.turns)
+    j = np.arange(len(k)) - np.repeat(directions.first_turn, directions.turns)
+    halfway = (j + 0.5) * directions.periods[k] / directions.turns[k]
+    for off in (-1e-13, 0.0, 1e-13):
+        turn = Rotation.from_euler("z", (halfway + off)[:, None]).as_matrix()
+        R = turn @ facing(directions.vectors[k])
+        assert (directions.lookup(transform(R, np.zeros(3)))[2] == j)[directions.turns[k] > 1].all()
+
+
 def chi_square(observed, expected):
     """The p-value, cells that expect fewer than five taken together."""
     few = expected < 5

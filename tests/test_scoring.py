@@ -12,6 +12,7 @@ from geomtact.contact_space.index import pack
 from geomtact.errors import MeshError, UsageError
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.scoring import calibration
 from geomtact.scoring.calibration import (
     FLOORS,
     Calibration,
@@ -303,6 +304,22 @@ def test_simulated_touches_are_of_the_cells_they_say(plug):
     assert len(touches.masks) == 20 and all(m.any() for m in touches.masks)
     w = np.asarray(plug.index.weight).ravel()
     assert (w[touches.ids] > 0).all()
+
+
+def test_a_touch_that_comes_out_otherwise_changes_no_other(plug, monkeypatch):
+    """A draw that one processor rejects and another takes must not give all later touches other random numbers."""
+    touches = simulate_touches(plug.index, 12, seed=7)
+    felt, calls = calibration._felt, iter(range(12))
+
+    def but_the_first(*given):
+        if next(calls) == 0:
+            felt(*given)
+        return felt(*given)
+
+    monkeypatch.setattr(calibration, "_felt", but_the_first)
+    others = simulate_touches(plug.index, 12, seed=7)
+    same = [np.array_equal(a, b) for a, b in zip(touches.masks, others.masks, strict=True)]
+    assert same == [False] + 11 * [True] and (touches.ids[1:] == others.ids[1:]).all()
 
 
 def test_simulated_touches_are_as_often_where_a_cell_hardly_touches_as_poses_are(make_localizer):

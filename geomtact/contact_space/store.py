@@ -31,7 +31,7 @@ from geomtact.sensing.sensor import Sensor
 if TYPE_CHECKING:
     import filelock
 
-FORMAT = 8  # raise whenever a built index would differ
+FORMAT = 9  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
 _CHOOSING = 0.1  # share of the time that choosing the grid takes, about
 _KEY_LENGTH, _KEY_AT_LEAST = 32, 6  # hexadecimal digits of an entry's name, and by how many it may be named

@@ -43,6 +43,7 @@ from geomtact.geometry.orbits import (
 from geomtact.geometry.symmetry import Symmetry, about
 from geomtact.se3 import Array, hat, random_rotations, transform
 
+_TIE = 1e-9  # of a turn's step: halfway between two turns the first is taken, whatever the last digit that a processor computes
 _BATCH = 2**16  # directions proposed at once; after 16 times as many, a cell is taken for one without area
 
 
@@ -292,7 +293,8 @@ class Directions:
         n, period = self.turns[k], self.periods[k]
         safe = np.where(period > 0, period, 1.0)
         turn = np.arctan2(x[:, 1], x[:, 0]) % (2 * np.pi)
-        j = np.where(period > 0, np.rint((turn % safe) * n / safe).astype(np.int64) % n, 0)
+        nearest = np.ceil((turn % safe) * n / safe - 0.5 - _TIE).astype(np.int64)
+        j = np.where(period > 0, nearest % n, 0)
         return T, k, j
 
 

@@ -33,6 +33,8 @@ _TINY = 1e-30  # probabilities below it are added up as logarithms: single preci
 _SPREAD_TOUCHES = 10  # that the spread of the scores is taken from
 FLOORS = np.geomspace(1e-3, 0.5, 16)
 _SHAPE = (72, 96)  # of the simulated touches
+_TRIES = 20  # draws for each simulated touch, at most
+_BATCH = 32  # poses tried at once for one that touches a sensor with a housing
 
 
 @dataclass(frozen=True)
@@ -75,48 +77,56 @@ def simulate_touches(
     noise: Noise = CALIBRATION_NOISE,
 ) -> Touches:
     """``n`` touches all over the contact pose space, with noise of any strength up to ``noise``; rigid and elastic in turn,
-    unless ``elastic`` says which.
+    unless ``elastic`` says which. Fewer than ``n`` where the object hardly makes a contact of any size.
 
-    Poses lie anywhere within the cells, not at their centres: the score has to bridge what lies between.
+    Poses lie anywhere within the cells, not at their centres: the score has to bridge what lies between. Each touch has random
+    numbers of its own, so a last digit that differs between processors changes one touch and not those after it.
 
     Raises
     ------
     MeshError
         Hardly any pose touches a sensor that has a housing.
     """
-    rng = np.random.default_rng(seed)
-    space = index.space
-    shape = index.sensor.along(_SHAPE)
-    pixel = index.sensor.pixel_area(shape)
     masks: list[NDArray[np.bool_]] = []
     ids: list[int] = []
-    for _ in range(100):
-        for pose, i in zip(*_drawn(index, 64, rng), strict=True):
-            mask = felt_mask(space, pose, len(masks) % 2 == 1 if elastic is None else elastic, shape)
-            if mask.sum() * pixel < min(LEAST_CONTACT, 12 * pixel):
-                continue
-            masks.append(spoilt(mask, space, draw_noise(noise, rng), rng))
-            ids.append(int(i))
-            if progress:
-                progress(len(masks) / n, "simulating sensor noise")
-            if len(masks) == n:
-                return Touches(masks, np.array(ids))
+    for k in range(n):
+        rng = np.random.default_rng([seed, k])
+        felt = _felt(index, k % 2 == 1 if elastic is None else elastic, rng)
+        if felt is not None:
+            masks.append(spoilt(felt[0], index.space, draw_noise(noise, rng), rng))
+            ids.append(felt[1])
+        if progress:
+            progress((k + 1) / n, "simulating sensor noise")
     return Touches(masks, np.array(ids, np.int64))
 
 
-def _drawn(index: Index, n: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
-    """Up to ``n`` poses (m, 4, 4) all over the contact pose space, and the ids (m,) of the cells that hold them.
+def _felt(index: Index, elastic: bool, rng: np.random.Generator) -> tuple[NDArray[np.bool_], int] | None:
+    """The contact (h, w) of a random pose before noise, and the id of the pose's cell; None where no draw gives one."""
+    shape = index.sensor.along(_SHAPE)
+    pixel = index.sensor.pixel_area(shape)
+    for _ in range(_TRIES):
+        drawn = _drawn(index, rng)
+        if drawn is None:
+            continue
+        mask = felt_mask(index.space, drawn[0], elastic, shape)
+        if mask.sum() * pixel >= min(LEAST_CONTACT, 12 * pixel):
+            return mask, drawn[1]
+    return None
 
-    They are drawn from the cells, by their measure; one that hardly touches may not give any. A housing forbids most tilts of a
-    large part, so that many a pose touches where the own rotation of its cell does not: there cells are no measure of poses,
+
+def _drawn(index: Index, rng: np.random.Generator) -> tuple[Array, int] | None:
+    """A pose (4, 4) drawn uniformly from the contact pose space, and the id of the cell that holds it.
+
+    It is drawn from a cell, which is drawn by its measure; None where the cell hardly touches. A housing forbids most tilts of a
+    large object, so that many a pose touches where the own rotation of its cell does not: there cells do not measure poses,
     which are drawn from the space itself, uniformly and in more time.
     """
     if index.sensor.housing_depth is not None:
-        T, depth = index.space.sample(n, rng)
-        return T, index.lookup(T, depth)
-    cells = index.within_runs(0, len(index), rng.random(n))
+        T, depth = index.space.sample(1, rng, batch=_BATCH)
+        return T[0], int(index.lookup(T, depth)[0])
+    cells = index.within_runs(0, len(index), rng.random(1))
     T, _, found = draw_within(index, index.space, cells, rng, tries=5)
-    return T[found], cells[found]
+    return (T[0], int(cells[0])) if found[0] else None
 
 
 def calibrate(

@@ -37,7 +37,7 @@ from geomtact.scoring.vectors import describe_index
 from geomtact.scoring.witness import Witness
 from geomtact.sensing.contact import Shown
 
-FORMAT = 12
+FORMAT = 13
 _COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
 _LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than choosing which
 _USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual

@@ -18,6 +18,7 @@ from torch import nn
 
 from geomtact.errors import InputError
 from geomtact.scoring.encoder import THESIS
+from geomtact.scoring.precision import autocast
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.contact import Shown
 from geomtact.sensing.sensor import Sensor
@@ -42,7 +43,7 @@ class Resnet:
     def describe(self, masks: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.float32]:
         """Unit vectors (m, 1000) of masks (m, h, w)."""
         images = resized(masks, self.side)
-        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
+        with torch.inference_mode(), autocast():
             parts = [
                 encode(self.network, torch.from_numpy(images[i : i + _BATCH])).float()
                 for i in range(0, len(images), _BATCH)

@@ -18,6 +18,7 @@ from geomtact.files import write_text, write_whole
 from geomtact.geometry.distance import PoseDistance
 from geomtact.progress import Progress
 from geomtact.scoring.encoder import THESIS
+from geomtact.scoring.precision import autocast
 from geomtact.scoring.resnet import SIDE, encode, make_network, resized
 from geomtact.se3 import Array, exp
 from geomtact.training.state import not_a_number, resume, save_state, whose
@@ -108,7 +109,7 @@ def train_thesis(
         some = order[step * settings.batch :][: settings.batch]
         masks = np.concatenate([pairs.left[some], pairs.right[some]])
         images = torch.from_numpy(resized(masks, settings.side)).to(device)
-        with torch.autocast(device, torch.bfloat16):
+        with autocast(device):
             vectors = encode(network, images)
         a, b = vectors.float().chunk(2)
         similarity = F.cosine_similarity(a, b).clamp(min=0)

@@ -24,6 +24,7 @@ from geomtact.errors import InputError
 from geomtact.progress import Progress
 from geomtact.scoring.encoder import SHAPE
 from geomtact.scoring.network import Encoder
+from geomtact.scoring.precision import autocast
 from geomtact.sensing.moments import without_specks
 from geomtact.training.augment import augmented
 from geomtact.training.loop import descend, steps
@@ -123,10 +124,9 @@ def scene_gain(
 ) -> torch.Tensor:
     """Information gained (t,) [nats] about the true cells of some touches of a scene."""
     touches, stored, true, log_w = _batch(scene, settings, rng, flipped)
-    with torch.autocast("cpu", torch.bfloat16):
+    with autocast():
         cell = torch.from_numpy(scene.cell)
-        f, g = network(touches, cell, "touch"), network(stored, cell, "stored")
-    f, g = f.float(), g.float()  # (t, d), (t + n, d)
+        f, g = network(touches, cell, "touch"), network(stored, cell, "stored")  # (t, d), (t + n, d)
     s = 2 * f @ g.T - (f * f).sum(1)[:, None] - (g * g).sum(1)  # (t, t + n)
     row = torch.arange(len(true))
     evidence: torch.Tensor = torch.logsumexp(s[:, len(true) :] + log_w, 1)
