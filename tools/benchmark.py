@@ -57,7 +57,10 @@ def write(figures: dict[str, Any], path: Path) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """Facts that the figures depend on."""
+    """Facts that the figures depend on, with what torch computes in on this processor."""
+    import torch
+
+    from geomtact.scoring.precision import fastest_precision
     from geomtact.versions import versions
 
     model = platform.processor()
@@ -68,7 +71,14 @@ def machine() -> dict[str, Any]:
         ]
         model = names[0] if names else model
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"processor": model, "cores": cores, "system": platform.platform(), "versions": versions()}
+    return {
+        "processor": model,
+        "cores": cores,
+        "capability": torch.backends.cpu.get_cpu_capability(),
+        "precision": str(fastest_precision()).removeprefix("torch."),
+        "system": platform.platform(),
+        "versions": versions(),
+    }
 
 
 def rays(part: str, sensor_name: str) -> dict[str, Any]:
@@ -224,7 +234,10 @@ def spread(values: list[float]) -> dict[str, float]:
 
 def show(figures: dict[str, Any]) -> None:
     facts, cast, made, warm = (figures[k] for k in ("machine", "rays", "prepare", "localize_warm"))
-    print(f"{facts['processor']}, {facts['cores']} cores, load {facts['load_before']:.1f} before the run")
+    print(
+        f"{facts['processor']} ({facts['capability']}, networks in {facts['precision']}), {facts['cores']} cores, "
+        f"load {facts['load_before']:.1f} before the run"
+    )
     rate = " and ".join(f"{cast[f'per_second_{t}_threads'] / 1e6:.1f} M/s ({t} threads)" for t in (1, 2))
     print(f"rays at {cast['part']} ({cast['faces']} faces): {rate}")
     print(

@@ -1,0 +1,76 @@
+"""What docs/quickstart.md prints of its sample is what a run gives on any processor, within tolerances that stand here."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from geomtact.cli import app
+
+ROOT = Path(__file__).parents[1]
+SECTIONS = re.split(r"^## ", (ROOT / "docs" / "quickstart.md").read_text("utf-8"), flags=re.MULTILINE)
+# With bfloat16 and without, the sample's information gain differs by 0.003 nats, the number of poses by 0.3 %, the probability
+# of a mode by 0.01 %; figures are printed with one digit after the point. Ten times that is left for other processors.
+NATS, SHARE, PERCENT = 0.03 + 0.05, 0.03, 0.1 + 0.05
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Gives what words of the command line, or Python code, print; with a cache of its own, so at the full size."""
+    folder = tmp_path_factory.mktemp("quickstart")
+
+    def run(words, capsys=None):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(ROOT)
+            patch.setenv("GEOMTACT_CACHE", str(folder))
+            if capsys is None:
+                result = CliRunner().invoke(app, words, terminal_width=200)
+                assert result.exit_code == 0, result.output
+                return result.stdout
+            exec(words, {})
+            return capsys.readouterr().out
+
+    return run
+
+
+def blocks(section):
+    return SECTIONS[section].split("```")[1::2]
+
+
+def numbers(pattern, text):
+    """The numbers (n, groups) in what a pattern finds in a text."""
+    found = re.findall(pattern, text, re.MULTILINE)
+    assert found, f"{pattern} is not in {text}"
+    return np.array([[float(each.replace(",", "")) for each in np.atleast_1d(match)] for match in found])
+
+
+def test_the_sample_is_localized_as_the_page_prints(run):
+    printed, given = blocks(1)[0], run(["localize", "meshes/samples/pin_1.png"])
+    for pattern, tolerance in {
+        r"^([\d.]+) nats are known": {"abs": NATS},
+        r"^([\d,]+) of the grid's": {"rel": SHARE},
+        r"the grid's ([\d,]+) poses": {"abs": 0},
+        r"^ +\d +([\d.]+) % ": {"abs": PERCENT},
+        r"which holds ([\d.]+) %": {"abs": PERCENT},
+    }.items():
+        assert numbers(pattern, given) == pytest.approx(numbers(pattern, printed), **tolerance), pattern
+    # modes of nearly the same probability may change places
+    place = r"% +(-?[\d.]+), (-?[\d.]+), (-?[\d.]+) "
+    off = numbers(place, printed)[:, None] - numbers(place, given)
+    assert np.abs(off).max(2).min(1) == pytest.approx(0, abs=0.1)
+
+
+def test_its_truth_scores_as_the_page_prints(run, capsys):
+    code = blocks(2)[0].removeprefix("python")
+    printed = numbers(r"\)?  # (-?[\d.]+)", code)[:, 0]
+    given = numbers(r"^(-?[\d.]+)$", run(code, capsys))[:, 0]
+    assert given == pytest.approx(printed, abs=NATS)
+
+
+def test_a_prior_sharpens_it_as_the_page_prints(run, capsys):
+    code, printed = blocks(5)[:2]
+    pattern = r"([\d.]+) nats, mode 1: ([\d.]+) %"
+    given = numbers(pattern, run(code.removeprefix("python"), capsys)) - numbers(pattern, printed)
+    assert given[:, 0] == pytest.approx(0, abs=NATS) and given[:, 1] == pytest.approx(0, abs=5 * PERCENT)
