@@ -70,6 +70,7 @@ KINDS = {
     "ascii.stl": (lambda: mesh("stl_ascii"), lambda path: load_mesh(path, "m"), 500),
     "obj": (lambda: mesh("obj"), lambda path: load_mesh(path, "m"), 700),
     "ply": (lambda: mesh("ply"), lambda path: load_mesh(path, "m"), 700),
+    "glb": (lambda: mesh("glb"), load_mesh, 700),
     "toml": (lambda: Sensor.load("digit").to_toml().encode(), Sensor.load, 1000),
     "yaml": (lambda: GS_SDK, Sensor.load, 500),
     "poses.json": (lambda: POSES, lambda path: read_sensor_poses(path, 2), 700),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import MeshError, did_you_mean, nearest_name
 from geomtact.geometry.catalogue import catalogue
+from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array
@@ -123,10 +124,19 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
 
 def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
     """Vertices (V, 3) in the file's unit and triangles (F, 3); a scene's bodies are placed and concatenated."""
-    import trimesh
-
     if path.stat().st_size == 0:
         raise MeshError(f"{path}: the file is empty (0 bytes); export the mesh again")
+    vertices, faces = read_gltf(path) if path.suffix.lower() in METRE_FORMATS else _read_unitless(path)
+    if not np.isfinite(vertices[faces[(faces >= 0) & (faces < len(vertices))]]).all():
+        raise MeshError(f"{path}: vertices hold NaN or infinity; export the mesh again")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(f"{path}: a face names a vertex that is not there (of {len(vertices)}); export the mesh again")
+    return vertices, faces
+
+
+def _read_unitless(path: Path) -> tuple[Array, NDArray[np.int64]]:
+    import trimesh
+
     try:
         # process=False: trimesh would merge, drop and reorder by rules of its own.
         scene = trimesh.load_scene(str(path), process=False)
@@ -142,10 +152,6 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
             raise MeshError(f"{path}: {cut}; copy or export it again")
         what = "only points or lines" if scene.geometry else "nothing"
         raise MeshError(f"{path}: expected a surface of triangles, found {what}; export the mesh with its faces")
-    if not np.isfinite(vertices[faces[(faces >= 0) & (faces < len(vertices))]]).all():
-        raise MeshError(f"{path}: vertices hold NaN or infinity; export the mesh again")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError(f"{path}: a face names a vertex that is not there (of {len(vertices)}); export the mesh again")
     return vertices, faces
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from geomtact.errors import MeshError
+from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh_file import FORMATS as READ
 from geomtact.geometry.mesh_file import METRE_FORMATS, PREPARED, UNITS
 from geomtact.sensing.sensor import Sensor
 from meshprep import Refused
-from meshprep.surface import Surface
+from meshprep.surface import Array, Surface
 
 STEP = (".step", ".stp")
 FORMATS = READ + PREPARED
@@ -54,15 +57,18 @@ def read(path: Path, unit: str | None, sensor: Sensor) -> tuple[Surface, str]:
         raise Refused(
             f"the file has {path.stat().st_size / 1e6:.0f} MB, more than {_LARGEST_FILE / 1e6:.0f}; export it coarser"
         )
-    scene = _scene(path)
-    own = _own_unit(suffix, scene)
+    if suffix in METRE_FORMATS:
+        own, triangles = "m", _gltf(path)
+    else:
+        scene = _scene(path)
+        own, triangles = _own_unit(suffix, scene), _triangles(scene)
     if own is None and unit is None:
         raise Refused(
             f"{suffix} files do not say their unit; give --unit, one of {', '.join(UNITS)}, or auto for a proposal"
         )
     if own is not None and unit not in (None, "auto", own):
         raise Refused(f"the file says {own}, but --unit {unit} was given; leave the unit out")
-    surface = _triangles(scene)
+    surface = _surface(*triangles)
     if suffix in STEP:  # trimesh gives metres
         surface = Surface(1e3 * surface.vertices, surface.faces)
     if own is None and unit == "auto":
@@ -92,10 +98,15 @@ def _scene(path: Path):
         raise Refused(f"cannot be read as {path.suffix.lower()} ({reason}); export it again") from None
 
 
+def _gltf(path: Path) -> tuple[Array, NDArray[np.int64]]:
+    try:
+        return read_gltf(path)
+    except MeshError as error:
+        raise Refused(str(error).removeprefix(f"{path}: ")) from None
+
+
 def _own_unit(suffix: str, scene) -> str | None:
     """The unit that a file states. STEP files are read in millimetres, whatever they are drawn in."""
-    if suffix in METRE_FORMATS:
-        return "m"
     if suffix in STEP:
         return "mm"
     if suffix == ".3mf":
@@ -106,7 +117,7 @@ def _own_unit(suffix: str, scene) -> str | None:
     return None
 
 
-def _triangles(scene) -> Surface:
+def _triangles(scene) -> tuple[Array, NDArray[np.int64]]:
     try:
         mesh = scene.to_mesh()
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
@@ -115,6 +126,16 @@ def _triangles(scene) -> Surface:
     if not len(faces):
         what = "only points or lines" if scene.geometry else "nothing"
         raise Refused(f"expected a surface of triangles, found {what}; export the mesh with its faces")
+    return vertices, faces
+
+
+def _surface(vertices: Array, faces: NDArray[np.int64]) -> Surface:
+    """The triangles as a surface, if they are one.
+
+    Raises
+    ------
+    Refused
+    """
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise Refused(f"a face names a vertex that is not there (of {len(vertices)}); export the mesh again")
     used = vertices[np.unique(faces)]
