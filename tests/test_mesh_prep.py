@@ -1,8 +1,10 @@
 """Mesh preparation: what is sound stays to the last bit, what is spoilt comes back, and what moves is measured and refused."""
 
+import io
 import json
 import sys
 import tomllib
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from geomtact import Localizer, Sensor, load_mesh, se3
+from geomtact.errors import MeshError
 from geomtact.geometry import catalogue as catalogues
 from geomtact.geometry.distance import PoseDistance
 
@@ -51,7 +54,7 @@ def as_surface(mesh):
 def sound(surface, folder):
     """The file of a surface, which trimesh and geomtact find closed."""
     path = folder / "mesh.ply"
-    write_ply(path, surface)
+    write_ply(path, surface, "mm")
     mesh = trimesh.load_mesh(path)
     assert mesh.is_watertight and mesh.is_winding_consistent and mesh.is_volume and mesh.volume > 0
     return load_mesh(path, "mm")
@@ -89,7 +92,7 @@ def test_shuffled_repeated_turned_and_torn_apart_it_comes_back(seed, turned, rep
     T = se3.transform(se3.random_rotations(1, rng)[0], rng.uniform(-50, 50, 3))
     vertices = se3.apply(T, 1e3 * scale * part.vertices).astype(np.float32).astype(float)
     path = tmp_path / "sound.ply"
-    write_ply(path, Surface(vertices, part.faces.astype(np.int64)))
+    write_ply(path, Surface(vertices, part.faces.astype(np.int64)), "mm")
     faces = rng.permutation(part.faces.astype(np.int64))
     faces = np.concatenate([faces, faces[rng.random(len(faces)) < repeated]])
     flip = rng.random(len(faces)) < turned
@@ -291,7 +294,7 @@ def prepared(file, unit, folder):
     """A localizer of what becomes of a file, on a grid of some 3,000 poses."""
     surface, own = read(file, unit, Sensor.load("gelslim"))
     path = folder / f"{file.name}.ply"
-    write_ply(path, repair(surface, options(surface)).surface)
+    write_ply(path, repair(surface, options(surface)).surface, own)
     return Localizer.prepare(path, unit=own, sensor="gelslim", max_poses=3_000, cache_dir=folder / "cache")
 
 
@@ -338,7 +341,7 @@ def test_a_curved_step_file_is_localized_within_its_tessellation(few_touches, tm
         ("a.obj", b"v 0 0 3e38\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "beyond 1e9"),
         ("a.ply", b"ply\nformat", "mm", "cannot be read as .ply"),
         ("a.stl", b"x", "mmm", "unknown unit 'mmm'; give --unit, one of mm, cm, m, inch"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", None, "do not say their unit; give --unit"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", None, "does not state its unit; give --unit"),
         ("a.obj", b"v 0 0 0\nv 10 0 0\nv 0 10 0\nf 1 2 3\n", "auto", "likely: 14.1 mm across in mm.*Give --unit"),
     ],
 )
@@ -354,6 +357,48 @@ def test_a_unit_that_contradicts_the_file_is_refused(tmp_path):
         read(tmp_path / "box.glb", "mm", Sensor.load("gelslim"))
     with pytest.raises(Refused, match="no such file"):
         read(tmp_path / "none.stl", "mm", Sensor.load("gelslim"))
+
+
+@pytest.fixture(scope="module")
+def inch_box():
+    """A box of 1 x 0.8 x 0.5 inches as 3MF."""
+    mesh = trimesh.creation.box((1.0, 0.8, 0.5))
+    data = mesh.export(file_type="3mf")
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(out, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name).replace(b'unit="millimeter"', b'unit="inch"'))
+    return out.getvalue()
+
+
+def test_the_unit_of_a_file_goes_with_what_is_made_of_it(command, inch_box, tmp_path):
+    (tmp_path / "part.3mf").write_bytes(inch_box)
+    done = command(tmp_path / "part.3mf", "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert "part.3mf: clean, in inch" in done.output
+    made = tmp_path / "out" / "part.ply"
+    assert f"next: geomtact localize IMAGE --object {made} --unit inch --sensor gelslim" in done.output
+    assert b"\ncomment unit: inch\n" in made.read_bytes()
+    for unit in (None, "inch"):
+        np.testing.assert_allclose(np.ptp(load_mesh(made, unit).vertices, axis=0), np.multiply(25.4e-3, [1, 0.8, 0.5]))
+    with pytest.raises(MeshError, match="a comment in it states the unit inch, but the unit mm was given"):
+        load_mesh(made, "mm")
+    again = command(made, "--out", tmp_path / "again", "--json")
+    assert json.loads(again.stdout)["meshes"][0]["unit"] == "inch"
+    assert (tmp_path / "again" / "part.ply").read_bytes() == made.read_bytes()
+    assert (
+        "the file says inch, but --unit mm was given" in command(made, "--unit", "mm", "--out", tmp_path / "c").output
+    )
+
+
+def test_of_several_files_the_unit_is_for_those_that_need_one(command, inch_box, tmp_path):
+    (tmp_path / "a.3mf").write_bytes(inch_box)
+    BOX.export(tmp_path / "b.stl")
+    BOX.copy().apply_scale(1e-3).export(tmp_path / "c.glb")
+    done = command(
+        *(tmp_path / name for name in ("a.3mf", "b.stl", "c.glb")), "--unit", "cm", "--json", "--out", tmp_path
+    )
+    assert [result["unit"] for result in json.loads(done.stdout)["meshes"]] == ["inch", "cm", "m"]
 
 
 def test_nothing_is_written_over_the_input(command, tmp_path):
@@ -423,7 +468,7 @@ def test_real_nuts_and_gear_become_solids_where_they_were(data_folder, tmp_path)
         before, _ = read(data_folder / "meshes_factory_nist" / f"{file}.obj", "m", Sensor.load("gelslim"))
         work = repair(before, options(before, max_hole=5e-3, max_error=2.5e-5))
         assert prove(before, work).largest < 5e-5 and not work.holes
-        write_ply(tmp_path / "part.ply", work.surface)
+        write_ply(tmp_path / "part.ply", work.surface, "m")
         assert trimesh.load_mesh(tmp_path / "part.ply").is_volume
         mesh = load_mesh(tmp_path / "part.ply", "m")
         if "nut" in file:  # the thread is a helix: six-fold only to within its pitch

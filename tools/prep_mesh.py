@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -102,6 +103,8 @@ def main(
         typer.echo(json.dumps({"schema": SCHEMA, "meshes": results}, indent=1))
     else:
         _table(results)
+    if made := [result for result in results if result["outcome"] != "refused"]:
+        typer.echo(_next(made[0], out, add_to is not None, sensor), err=True)
     raise typer.Exit(3 if all(result["outcome"] == "refused" for result in results) else 0)
 
 
@@ -113,12 +116,13 @@ def prepare(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[s
     from meshprep.writing import write
 
     from geomtact.errors import GeomtactError
-    from geomtact.geometry.mesh_file import UNITS
+    from geomtact.geometry.units import UNITS
     from geomtact.sensing.sensor import Sensor
 
     result: dict[str, Any] = {"file": str(file), "name": name, "outcome": "refused", "reason": None}
     try:
-        surface, unit = read(file, options["unit"], Sensor.load(options["sensor"]))
+        of_several = len(options["taken"]) > 1
+        surface, unit = read(file, options["unit"], Sensor.load(options["sensor"]), of_several)
         mm = 1e3 * UNITS[unit]  # millimetres in the file's unit
         result |= {"unit": unit, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), "size_mm": mm * surface.size}
         allowed = Options(
@@ -131,7 +135,7 @@ def prepare(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[s
         )
         result |= write(surface, repair(surface, allowed), name, unit, out, options)
     except (Refused, GeomtactError) as error:
-        result |= {"outcome": "refused", "reason": str(error)}
+        result |= {"outcome": "refused", "reason": str(error).removeprefix(f"{file}: ")}
     except OSError as error:
         result |= {"outcome": "refused", "reason": f"cannot be read, or its results not written ({error})"}
     except Exception as error:  # noqa: BLE001 -- pymeshlab and readers fail in more ways than can be listed
@@ -226,7 +230,14 @@ def _said(result: dict[str, Any]) -> str:
     if result["outcome"] == "refused":
         return f"refused: {result['reason']}"
     changes = "; ".join(f"{step}: {words}" for step, words in result["changes"].items())
-    return f"{result['outcome']}{': ' if changes else ''}{changes}"
+    return f"{result['outcome']}, in {result['unit']}{': ' if changes else ''}{changes}"
+
+
+def _next(result: dict[str, Any], out: Path, named: bool, sensor: str) -> str:
+    """The command that localizes the first of a file's parts, by its name in the catalogue or by its file."""
+    part = result["parts"][0]
+    which = part if named else f"{shlex.quote(str(out / f'{part}.ply'))} --unit {result['unit']}"
+    return f"next: geomtact localize IMAGE --object {which} --sensor {shlex.quote(sensor)}"
 
 
 def _short(reason: str) -> str:
@@ -241,12 +252,12 @@ def _table(results: Sequence[dict[str, Any]]) -> None:
         row = [r["name"], r["outcome"], f"{r['seconds']:.1f}"]
         if r["outcome"] != "refused":
             holes = str(len(r["holes"]))
-            row += [f"{r['deviation_mm']:.4f}", holes, str(r["faces"]), r["symmetry"]["kind"], ""]
+            row += [r["unit"], f"{r['deviation_mm']:.4f}", holes, str(r["faces"]), r["symmetry"]["kind"], ""]
         else:
-            row += ["", "", "", "", _short(str(r["reason"]))]
+            row += ["", "", "", "", "", _short(str(r["reason"]))]
         rows.append(row)
-    headings = ("mesh", "outcome", "s", "deviation [mm]", "holes", "faces", "symmetry", "why")
-    print_table(headings, rows, headings[2:6])
+    headings = ("mesh", "outcome", "s", "unit", "deviation [mm]", "holes", "faces", "symmetry", "why")
+    print_table(headings, rows, ("s", "deviation [mm]", "holes", "faces"))
 
 
 if __name__ == "__main__":

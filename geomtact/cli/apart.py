@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli import study_file
+from geomtact.cli.parts import units_of
 from geomtact.cli.shell import tell
 
 Jobs = Annotated[
@@ -65,13 +66,12 @@ def everywhere(name: str) -> str:
     return os.path.abspath(name) if os.path.isfile(name) else name
 
 
-def part_of_task(part: str, unit: str | None) -> tuple[str, str | None]:
-    """A part's name or file, and its unit, wherever the task is done; bundled parts have units of their own."""
+def parts_of_tasks(parts: Sequence[str], unit: str | None) -> list[tuple[str, str | None]]:
+    """Each part's name or file, and the unit that it is loaded with, wherever its task is done."""
     from geomtact.geometry.catalogue import catalogue
 
-    if part in catalogue():
-        return part, None
-    return everywhere(part), unit
+    names = [part if part in catalogue() else everywhere(part) for part in parts]
+    return list(zip(names, units_of(parts, unit), strict=True))
 
 
 def quietly(command: Command, options: Mapping[str, Any]) -> None:
@@ -144,8 +144,7 @@ def _judge_apart(judge: Command, options: Mapping[str, Any], jobs: int | None, r
     if "cache_dir" in options:  # a study of what preparing costs has none
         same["cache_dir"] = (options["cache_dir"] or default_cache_dir()).absolute()
     tasks = []
-    for part, file in zip(parts, files, strict=True):
-        name, unit = part_of_task(part, options["unit"])
+    for (name, unit), file in zip(parts_of_tasks(parts, options["unit"]), files, strict=True):
         tasks.append((judge, same | {"parts": [name], "unit": unit, "out": file}))
     try:
         do_all(quietly, tasks, parts, "judged", jobs, ray)

@@ -44,6 +44,7 @@ def judge_registration(
 
     Prints success, errors and times of each method, and writes them and every trial to --out.
     """
+    from geomtact.cli.parts import units_of
     from geomtact.contact_space.build import choose_resolution
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.contact_space.space import ContactSpace
@@ -61,7 +62,9 @@ def judge_registration(
         raise InputError(f"{out}: holds figures alone, no outcomes to go on with; give another file with --out")
     content.pop("figures", None)
     pressed, strength = Sensor.load(sensor), study_options.noise_named(noise)
-    for mesh in [_mesh(part, unit, pressed).with_symmetry() for part in _named(parts)]:
+    named = _named(parts)
+    found = [_mesh(part, own, pressed) for part, own in zip(named, units_of(named, unit), strict=True)]
+    for mesh in [mesh.with_symmetry() for mesh in found]:
         space = ContactSpace(mesh, pressed)
         resolution = choose_resolution(mesh, pressed, None, MAX_POSES)
         assert mesh.symmetry is not None

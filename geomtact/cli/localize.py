@@ -217,7 +217,7 @@ def _identified(asked: _Asked, parts: Sequence[str | None], placed: SensorPoses 
     import time
     from dataclasses import replace
 
-    from geomtact.geometry.catalogue import catalogue
+    from geomtact.cli.parts import units_of
     from geomtact.inference.identify import identify
     from geomtact.sensing.reading import read_observation
 
@@ -228,13 +228,12 @@ def _identified(asked: _Asked, parts: Sequence[str | None], placed: SensorPoses 
             # a bad image is told before minutes go into an index
             read_observation(image, gel, asked.kind, values["background"])
     frame = "sensor" if placed is None else "world"
-    took = 0.0
+    took, units = 0.0, dict(zip(parts, units_of(parts, values["unit"]), strict=True))
 
     def opened(part: str | None) -> Localizer:
         nonlocal took
         began = time.perf_counter()
-        # in a folder of several, bundled parts have units of their own
-        own = {"object": part, "unit": None if len(parts) > 1 and part in catalogue() else values["unit"]}
+        own = {"object": part, "unit": units[part]}
         on = {gel: asked.opened({**own, "sensor": gel}, part != parts[0], frame) for gel in dict.fromkeys(gels)}
         took += 1e3 * (time.perf_counter() - began)
         first, *others = (on[gel] for gel in gels)

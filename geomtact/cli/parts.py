@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from geomtact.errors import InputError
@@ -33,3 +34,14 @@ def parts_of(object_name: str | None) -> list[str | None]:
     if not files:
         raise InputError(f"--object {folder}: no mesh in this folder; expected {', '.join(FORMATS)}")
     return [bundled.get(path.resolve(), str(path)) for path in files]
+
+
+def units_of(parts: Sequence[str | Path | None], unit: str | None) -> list[str | None]:
+    """The unit to load each part with: of several, ``unit`` is for those that state none; None lets a part's own serve.
+
+    If every part states its own, ``unit`` goes to all, so that one which contradicts it is refused as it would be alone.
+    """
+    from geomtact.geometry.mesh_file import states_unit
+
+    own = [part is not None and states_unit(part) for part in parts]
+    return [None if stated and not all(own) else unit for stated in own]

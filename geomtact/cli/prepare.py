@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, part_of_task
+from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, parts_of_tasks
 from geomtact.cli.options import Approaches, CacheDir, MaxPoses, ScorerName, SensorName, Unit, approach_from
 from geomtact.cli.shell import progress_bar, tell
 from geomtact.errors import UsageError
@@ -90,7 +90,7 @@ def _prepare_all(
     # named, so that what is prepared first is not removed to make room for the last
     folder = (cache_dir or default_cache_dir()).absolute()
     how = (gel, everywhere(scorer), max_poses or MAX_POSES, folder)
-    tasks = [(*part_of_task(part, values["unit"]), *how) for part in objects]
+    tasks = [(*part, *how) for part in parts_of_tasks(objects, values["unit"])]
     try:
         do_all(prepare_part, tasks, [f"{part} on {gel.name}" for part in objects], "prepared", jobs, ray)
     finally:
@@ -103,12 +103,11 @@ def _prepare_all(
 
 
 def _doubt_unit_of_first(parts: list[str], unit: str | None, sensor: Sensor) -> None:
-    """As :func:`_doubt_unit`, of the first mesh file: all have the unit that is given."""
+    """As :func:`_doubt_unit`, of the first part that needs the unit: all that do have the one that is given."""
     from geomtact.errors import GeomtactError
-    from geomtact.geometry.catalogue import catalogue
-    from geomtact.geometry.mesh_file import load_mesh
+    from geomtact.geometry.mesh_file import load_mesh, states_unit
 
-    first = next((part for part in parts if part not in catalogue()), None)
+    first = next((part for part in parts if not states_unit(part)), None)
     if first is not None:
         with contextlib.suppress(GeomtactError, OSError):  # which its task tells
             _doubt_unit(load_mesh(first, unit, sensor=sensor), sensor)

@@ -62,10 +62,12 @@ def noise_named(name: str) -> Noise:
 
 def meshes(parts: Sequence[str | Path] | None, unit: str | None, sensor: Sensor) -> list[Mesh]:
     """The meshes of the parts, the thesis's four by default: a wrong name is told before any work is done."""
+    from geomtact.cli.parts import units_of
     from geomtact.evaluation.study import THESIS_PARTS
     from geomtact.geometry.mesh_file import load_mesh
 
-    return [load_mesh(part, unit, sensor=sensor) for part in parts or THESIS_PARTS]
+    parts = parts or THESIS_PARTS
+    return [load_mesh(part, own, sensor=sensor) for part, own in zip(parts, units_of(parts, unit), strict=True)]
 
 
 def localizers(

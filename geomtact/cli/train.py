@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, part_of_task, quietly
+from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
 from geomtact.cli.options import Seed, Unit
 from geomtact.cli.parts import parts_of
 from geomtact.cli.shell import progress_bar, tell
@@ -158,9 +158,8 @@ def _train_each(parts: list[str], options: dict[str, Any]) -> None:
     start = options["start"] and options["start"].absolute()
     same = options | {"sensor": everywhere(options["sensor"]), "start": start}
     tasks = []
-    for part in parts:
-        name, unit = part_of_task(part, options["unit"])
-        own = {"object_name": name, "unit": unit, "out": folder / f"{Path(part).stem}.safetensors"}
+    for name, unit in parts_of_tasks(parts, options["unit"]):
+        own = {"object_name": name, "unit": unit, "out": folder / f"{Path(name).stem}.safetensors"}
         tasks.append((train, same | own))
     do_all(quietly, tasks, parts, "trained", jobs, ray)
 

@@ -15,11 +15,10 @@ from geomtact.geometry.catalogue import catalogue
 from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
+from geomtact.geometry.units import METRE_FORMATS, UNITS, stated_unit, unit_comment
 from geomtact.se3 import Array
 
-UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 UNITLESS_FORMATS = (".stl", ".obj", ".ply", ".off")
-METRE_FORMATS = (".glb", ".gltf")
 FORMATS = UNITLESS_FORMATS + METRE_FORMATS
 PREPARED = (".step", ".stp", ".3mf")  # that tools/prep_mesh.py makes meshes of
 _REEXPORT = "; if its numbers are {unit}, re-export it in metres, or save it as STL or PLY and give --unit {unit}"
@@ -45,8 +44,8 @@ def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _Se
     Parameters
     ----------
     source : name in ``meshes/catalogue.toml``, path of a file, or a Mesh (checked against the sensor only)
-    unit : "mm", "cm", "m" or "inch" in upper or lower case; needed for formats without units, not for catalogue parts
-        and glTF (metres)
+    unit : "mm", "cm", "m" or "inch" in upper or lower case; needed for files that state none (see
+        :func:`geomtact.geometry.units.stated_unit`), not for catalogue parts and glTF (metres)
     sensor : if given, the part's size is checked against its window
 
     Returns
@@ -87,7 +86,7 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
     text = str(source)
     parts = catalogue()
     path = Path(text)
-    name = text if text in parts else next((n for n, e in parts.items() if e.file == path.resolve()), None)
+    name = _catalogue_name(text)
     if unit is not None:
         given, unit = unit, str(unit).lower()
         if unit not in UNITS:
@@ -110,16 +109,35 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
         beside = [p.name for p in path.parent.glob("*") if p.suffix.lower() in FORMATS]
         hint = did_you_mean(path.name, beside) or f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
         raise MeshError(f"{text}: no such file{hint}")
-    if suffix in METRE_FORMATS:
-        if unit not in (None, "m"):
-            raise MeshError(
-                f"{text}: glTF is in metres by definition, but the unit {unit} was given; leave the unit out"
-                f"{_REEXPORT.format(unit=unit)}"
-            )
-        unit = "m"
+    if suffix in METRE_FORMATS and unit not in (None, "m"):
+        raise MeshError(
+            f"{text}: glTF is in metres by definition, but the unit {unit} was given; leave the unit out"
+            f"{_REEXPORT.format(unit=unit)}"
+        )
+    stated = stated_unit(path)
+    if None not in (unit, stated) and unit != stated:
+        raise MeshError(
+            f"{text}: a comment in it states the unit {stated}, but the unit {unit} was given; leave the unit out, or mend "
+            f"the comment ({unit_comment(str(unit))!r}) if that is wrong"
+        )
+    unit = unit or stated
     if unit is None:
-        raise MeshError(f"{text}: {suffix} files do not say their unit; give unit= (--unit) one of {', '.join(UNITS)}")
+        raise MeshError(f"{text}: the file does not state its unit; give unit= (--unit) one of {', '.join(UNITS)}")
     return path.stem, path, unit, None
+
+
+def states_unit(source: str | Path) -> bool:
+    """Whether a part needs no unit: one of the catalogue, or a file that states its own."""
+    try:
+        return _catalogue_name(str(source)) is not None or stated_unit(Path(source)) is not None
+    except (MeshError, OSError):  # which loading it tells
+        return False
+
+
+def _catalogue_name(text: str) -> str | None:
+    """The name of the part in the catalogue that a name or a path means."""
+    parts = catalogue()
+    return text if text in parts else next((n for n, e in parts.items() if e.file == Path(text).resolve()), None)
 
 
 def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.errors import MeshError
 from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh_file import FORMATS as READ
-from geomtact.geometry.mesh_file import METRE_FORMATS, PREPARED, UNITS
+from geomtact.geometry.mesh_file import PREPARED
+from geomtact.geometry.units import METRE_FORMATS, UNITS, stated_unit
 from geomtact.sensing.sensor import Sensor
 from meshprep import Refused
 from meshprep.surface import Array, Surface
@@ -31,17 +31,18 @@ _THREE_MF = {
 TESSELLATION = 0.01  # of STEP files: how far from their surface its triangles may lie [mm]
 
 
-def read(path: Path, unit: str | None, sensor: Sensor) -> tuple[Surface, str]:
+def read(path: Path, unit: str | None, sensor: Sensor, of_several: bool = False) -> tuple[Surface, str]:
     """The surface in a file, and its unit.
 
     Parameters
     ----------
     unit : "mm", "cm", "m", "inch" for files that state none; "auto" only proposes
     sensor : by whose window "auto" judges
+    of_several : whether ``unit`` is given for several files, and so for those that state none
 
     Raises
     ------
-    Refused
+    Refused, geomtact.errors.MeshError
         Unreadable, empty, without unit, or with another one than was given.
     """
     suffix = path.suffix.lower()
@@ -58,15 +59,15 @@ def read(path: Path, unit: str | None, sensor: Sensor) -> tuple[Surface, str]:
             f"the file has {path.stat().st_size / 1e6:.0f} MB, more than {_LARGEST_FILE / 1e6:.0f}; export it coarser"
         )
     if suffix in METRE_FORMATS:
-        own, triangles = "m", _gltf(path)
+        own, triangles = "m", read_gltf(path)
     else:
         scene = _scene(path)
-        own, triangles = _own_unit(suffix, scene), _triangles(scene)
+        own, triangles = _own_unit(path, scene), _triangles(scene)
     if own is None and unit is None:
         raise Refused(
-            f"{suffix} files do not say their unit; give --unit, one of {', '.join(UNITS)}, or auto for a proposal"
+            f"the file does not state its unit; give --unit, one of {', '.join(UNITS)}, or auto for a proposal"
         )
-    if own is not None and unit not in (None, "auto", own):
+    if own is not None and unit not in (None, "auto", own) and not of_several:
         raise Refused(f"the file says {own}, but --unit {unit} was given; leave the unit out")
     surface = _surface(*triangles)
     if suffix in STEP:  # trimesh gives metres
@@ -98,23 +99,16 @@ def _scene(path: Path):
         raise Refused(f"cannot be read as {path.suffix.lower()} ({reason}); export it again") from None
 
 
-def _gltf(path: Path) -> tuple[Array, NDArray[np.int64]]:
-    try:
-        return read_gltf(path)
-    except MeshError as error:
-        raise Refused(str(error).removeprefix(f"{path}: ")) from None
-
-
-def _own_unit(suffix: str, scene) -> str | None:
+def _own_unit(path: Path, scene) -> str | None:
     """The unit that a file states. STEP files are read in millimetres, whatever they are drawn in."""
-    if suffix in STEP:
+    if path.suffix.lower() in STEP:
         return "mm"
-    if suffix == ".3mf":
+    if path.suffix.lower() == ".3mf":
         stated = str(scene.units or "millimeter").lower().removesuffix("s")
         if stated not in _THREE_MF:
             raise Refused(f"the file is in {stated}; export it in one of {', '.join(UNITS)}")
         return _THREE_MF[stated]
-    return None
+    return stated_unit(path)
 
 
 def _triangles(scene) -> tuple[Array, NDArray[np.int64]]:

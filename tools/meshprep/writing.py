@@ -13,7 +13,8 @@ import numpy as np
 from geomtact.errors import MeshError
 from geomtact.files import write_bytes
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.mesh_file import UNITS, load_mesh
+from geomtact.geometry.mesh_file import load_mesh
+from geomtact.geometry.units import UNITS, unit_comment
 from geomtact.versions import versions
 from meshprep import Refused
 from meshprep.adding import add
@@ -57,7 +58,7 @@ def write(before: Surface, work: Work, name: str, unit: str, out: Path, options:
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / f"{each}.ply" for each in names]
         for file, part in zip(files, parts, strict=True):
-            write_ply(file, part)
+            write_ply(file, part, unit)
         meshes = [_checked(file, unit, options["symmetry_mm"]) for file in files]
         told |= {"symmetry": _symmetry(meshes[0]), "versions": versions()}
         contents = {file.name: file.read_bytes() for file in files}
@@ -72,10 +73,10 @@ def write(before: Surface, work: Work, name: str, unit: str, out: Path, options:
     return {key: value for key, value in told.items() if key not in ("schema", "options", "versions")}
 
 
-def write_ply(path: Path, surface: Surface) -> None:
-    """Binary PLY whose coordinates are doubles: what was read is written to the last bit."""
+def write_ply(path: Path, surface: Surface, unit: str) -> None:
+    """Binary PLY whose coordinates are doubles: what was read is written to the last bit. A comment states the unit."""
     header = (
-        "ply\nformat binary_little_endian 1.0\n"
+        f"ply\nformat binary_little_endian 1.0\ncomment {unit_comment(unit)}\n"
         f"element vertex {len(surface.vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
         f"element face {len(surface.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
