@@ -26,8 +26,13 @@ def read_json(path: Path) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """``text`` as UTF-8, whole or not at all; what no UTF-8 can say, as of a strange file name, by its number."""
-    write_whole(path, lambda temporary: temporary.write_text(text, "utf-8", "backslashreplace"))
+    """:func:`printable` ``text`` as UTF-8, whole or not at all."""
+    write_whole(path, lambda temporary: temporary.write_text(printable(text), "utf-8"))
+
+
+def printable(text: str) -> str:
+    """``text`` that UTF-8 holds: bytes of a file name that are no UTF-8 are written by their number."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -1,6 +1,7 @@
 """The command line: exit statuses, one-line errors, where options come from, and what lands in files and on the screen."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -269,6 +270,19 @@ def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touch
     assert "0 indexes" in geomtact("cache", "--cache-dir", "copy", "--remove", "ball").stdout
     assert "0 indexes" in geomtact("cache", "--cache-dir", "copy", "--clear").stdout
     geomtact("cache", "--clear", "--limit-gb", 1, status=2)
+
+
+def test_images_and_folders_of_any_name_serve(geomtact, touched, tmp_path):
+    name = os.fsdecode(b"t\xfcr")
+    image = shutil.copy(touched / "ball_1.png", tmp_path / f"{name}.png")
+    told = geomtact("localize", image, "--out", name, "--json")
+    assert json.loads(told.stdout)["settings"]["image"] == str(tmp_path / r"t\udcfcr.png")
+    assert (tmp_path / name / "result.json").read_text("utf-8") == told.stdout
+    assert r"t\udcfcr.png" in (tmp_path / name / "report.html").read_text("utf-8")
+    assert geomtact("localize", image, "--prior", name, "--json").stdout.startswith("{")
+    film = shutil.copy(image, tmp_path / f"{name}.avi")
+    told = geomtact("track", film, "--object", "ball", "--sensor", "gelsight-mini", status=3).stderr
+    assert "a video whose name is not UTF-8 cannot be opened; rename it" in told
 
 
 def test_no_contact_exits_4_and_writes_its_result(geomtact, tmp_path):

@@ -100,7 +100,9 @@ def main(
             _draw_ambiguity(result, out, sensor)
         typer.echo(f"{file}: {_said(result)}", err=True)
     if as_json:
-        typer.echo(json.dumps({"schema": SCHEMA, "meshes": results}, indent=1))
+        from geomtact.report.result import plain
+
+        typer.echo(json.dumps({"schema": SCHEMA, "meshes": plain(results)}, indent=1))
     else:
         _table(results)
     if made := [result for result in results if result["outcome"] != "refused"]:
@@ -215,13 +217,15 @@ def _files(inputs: Sequence[Path], out: Path) -> list[Path]:
 
 def _names(files: Sequence[Path]) -> list[str]:
     """The stem of each file, numbered where it is taken."""
+    from geomtact.files import printable
+
     names: list[str] = []
-    stems = {file.stem for file in files}
-    for file in files:
-        name, k = file.stem, 1
+    stems = [printable(file.stem) for file in files]
+    for stem in stems:
+        name, k = stem, 1
         while name in names or (k > 1 and name in stems):
             k += 1
-            name = f"{file.stem}_{k}"
+            name = f"{stem}_{k}"
         names.append(name)
     return names
 
@@ -261,6 +265,9 @@ def _table(results: Sequence[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
+    from geomtact.cli.shell import claim_output
+
+    claim_output()
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.command()(main)
     app()

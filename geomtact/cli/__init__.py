@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import sys
 
 import typer
@@ -13,7 +12,7 @@ from geomtact.cli.library import cache, objects, sensors
 from geomtact.cli.localize import localize
 from geomtact.cli.next_touch import next_touch
 from geomtact.cli.prepare import prepare
-from geomtact.cli.shell import check_words, one_line_errors, one_line_usage_errors
+from geomtact.cli.shell import check_words, claim_output, one_line_errors, one_line_usage_errors
 from geomtact.cli.simulate import simulate
 from geomtact.cli.track import track
 from geomtact.cli.train import train
@@ -43,9 +42,7 @@ def _root(version: bool = typer.Option(False, "--version", help="Print the versi
 
 def main() -> None:
     """Entry point of the ``geomtact`` command."""
-    # a path that is no UTF-8, or a terminal that knows ASCII alone, is no reason to fail
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
+    claim_output()
     with one_line_usage_errors():
         check_words(sys.argv[1:])
         sys.exit(app(standalone_mode=False))

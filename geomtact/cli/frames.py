@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from geomtact.errors import InputError, UsageError
+from geomtact.files import printable
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy")
 State = tuple[int, int]  # when a file was last written to [ns], and its size
@@ -107,7 +108,7 @@ def camera_frames(source: str, sensor: str | None = None) -> Generator[Frame, No
 
     size = None if sensor is None else Sensor.load(sensor).image_size_px
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+    capture = cv2.VideoCapture(int(source) if source.isdigit() else _name_for_opencv(source))
     if not capture.isOpened():
         raise InputError(
             f"camera {source}: cannot be opened; give the number of a camera of this computer, its device, or a URL"
@@ -200,7 +201,7 @@ def _filmed(path: Path) -> Iterator[Frame]:
     """The frames of a video (H, W, 3) RGB."""
     import cv2
 
-    video = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(_name_for_opencv(str(path)))
     if not video.isOpened():
         raise InputError(f"{path}: cannot be read as a video; give one that OpenCV reads, or a folder of images")
 
@@ -210,6 +211,18 @@ def _filmed(path: Path) -> Iterator[Frame]:
         video.release()
 
     return frames()
+
+
+def _name_for_opencv(name: str) -> str:
+    """``name``, unless it is no UTF-8, at which OpenCV 5.0 crashes.
+
+    Raises
+    ------
+    InputError
+    """
+    if name != printable(name):
+        raise InputError(f"{name}: a video whose name is not UTF-8 cannot be opened; rename it")
+    return name
 
 
 def _next_rgb(capture: Any) -> Any:

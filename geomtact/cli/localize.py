@@ -164,8 +164,10 @@ def localize(
 
 def _doubt(image: Path, told: Mapping[str, Any], part: str | None, sensor: str | None) -> None:
     """Say where an image's metadata name another part or sensor than it is localized with."""
+    from geomtact.files import printable
+
     for word, made, used in (("of", told.get("geomtact:object"), part), ("with", told.get("geomtact:sensor"), sensor)):
-        if made and used and Path(made).stem != Path(used).stem:
+        if made and used and Path(made).stem != printable(Path(used).stem):
             tell(f"warning: {image} was made {word} {made}, as its metadata says, and is localized on {used}")
 
 

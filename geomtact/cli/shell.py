@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import faulthandler
 import functools
+import io
+import logging
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +19,33 @@ import typer
 from geomtact.errors import GeomtactError, InputError, UsageError
 
 USAGE_ERROR, BAD_INPUT, NO_CONTACT = 2, 3, 4
+
+
+def claim_output() -> None:
+    """Keep standard error to geomtact's own lines: no log, warning or line of C code that a library writes there shows.
+
+    A crash of the interpreter still leaves its trace there. File names that are no UTF-8, or that the terminal cannot show, are
+    printed by number. Pictures go into files, whatever screen MPLBACKEND names.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    if isinstance(sys.stdin, io.TextIOWrapper):  # file names may come from there
+        sys.stdin.reconfigure(errors="surrogateescape")
+    logging.getLogger().addHandler(logging.NullHandler())
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+    try:
+        if sys.stderr.fileno() != 2:
+            return
+        own = os.dup(2)
+    except (AttributeError, OSError, ValueError):  # closed, or no file
+        return
+    sys.stderr = open(own, "w", buffering=1, encoding=sys.stderr.encoding, errors="backslashreplace")  # noqa: SIM115
+    faulthandler.enable(sys.stderr)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
 
 
 def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:

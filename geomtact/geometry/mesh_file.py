@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
+import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.errors import MeshError, did_you_mean, nearest_name
+from geomtact.files import printable
 from geomtact.geometry.catalogue import catalogue
 from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh import Mesh
@@ -123,7 +126,7 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
     unit = unit or stated
     if unit is None:
         raise MeshError(f"{text}: the file does not state its unit; give unit= (--unit) one of {', '.join(UNITS)}")
-    return path.stem, path, unit, None
+    return printable(path.stem), path, unit, None
 
 
 def states_unit(source: str | Path) -> bool:
@@ -152,12 +155,24 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
     return vertices, faces
 
 
-def _read_unitless(path: Path) -> tuple[Array, NDArray[np.int64]]:
+def load_scene(path: Path, **options: Any) -> Any:
+    """A file as trimesh reads it, ``options`` its reader's: without materials, whatever its name, and with no log shown.
+
+    Users who set logging up see what trimesh logs.
+    """
     import trimesh
 
+    log = logging.getLogger("trimesh")
+    if not log.handlers:  # Python writes to standard error what finds no handler
+        log.addHandler(logging.NullHandler())
+    # process=False: trimesh would merge, drop and reorder by rules of its own.
+    same: dict[str, Any] = {"file_type": path.suffix[1:].lower(), "process": False, "skip_materials": True}
+    return trimesh.load_scene(io.BytesIO(path.read_bytes()), **same, **options)
+
+
+def _read_unitless(path: Path) -> tuple[Array, NDArray[np.int64]]:
     try:
-        # process=False: trimesh would merge, drop and reorder by rules of its own.
-        scene = trimesh.load_scene(str(path), process=False)
+        scene = load_scene(path)
         mesh = scene.to_mesh()
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
         if vertices.shape[1] != 3:

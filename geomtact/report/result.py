@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from geomtact.files import printable
 from geomtact.se3 import quat_xyzw
 from geomtact.versions import versions
 
@@ -74,13 +75,13 @@ def to_text(content: Mapping[str, Any]) -> str:
 def plain(value: Any) -> Any:
     """``value`` of JSON's own types: arrays become lists, numbers that are not finite null, anything unknown its text."""
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {printable(str(k)): plain(v) for k, v in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
     if isinstance(value, float):
         return value if np.isfinite(value) else None
-    if value is None or isinstance(value, bool | int | str):
+    if value is None or isinstance(value, bool | int):
         return value
-    return str(value)
+    return printable(str(value))

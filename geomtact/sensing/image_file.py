@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import ImageError, PoseError
-from geomtact.files import write_whole
+from geomtact.files import printable, write_whole
 from geomtact.se3 import check_transforms
 
 MAX_BYTES = 256 * 2**20
@@ -88,7 +88,7 @@ def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] 
     info = PngImagePlugin.PngInfo()
     for key, value in (metadata or {}).items():
         text = value if isinstance(value, str) else json.dumps(np.asarray(value).tolist())
-        info.add_text(_PREFIX + key.removeprefix(_PREFIX), text.encode("utf-8", "backslashreplace").decode())
+        info.add_text(_PREFIX + key.removeprefix(_PREFIX), printable(text))
     path = Path(path)
     try:
         write_whole(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", pnginfo=info))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pymeshlab
@@ -72,9 +73,10 @@ def distances(a: Surface, b: Surface) -> Array:
     return _distance(b, _points(a))
 
 
-def is_solid(path: str) -> str | None:
+def is_solid(path: Path) -> str | None:
     """What trimesh's own checks, of the file as any program reads it, find wrong; None where they pass."""
-    mesh = trimesh.load_mesh(path)
+    with open(path, "rb") as file:
+        mesh = trimesh.load_mesh(file, file_type=path.suffix[1:])
     for passed, what in (
         (mesh.is_watertight, "not watertight"),
         (mesh.is_winding_consistent, "its faces do not agree about the outside"),

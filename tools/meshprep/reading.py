@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh_file import FORMATS as READ
-from geomtact.geometry.mesh_file import PREPARED
+from geomtact.geometry.mesh_file import PREPARED, load_scene
 from geomtact.geometry.units import METRE_FORMATS, UNITS, stated_unit
 from geomtact.sensing.sensor import Sensor
 from meshprep import Refused
@@ -78,8 +78,6 @@ def read(path: Path, unit: str | None, sensor: Sensor, of_several: bool = False)
 
 
 def _scene(path: Path):
-    import trimesh
-
     options = {}
     if path.suffix.lower() in STEP:
         try:
@@ -88,8 +86,7 @@ def _scene(path: Path):
             raise Refused("STEP files need cascadio; install the extra with pip install 'geomtact[step]'") from None
         options = {"tol_linear": TESSELLATION, "tol_angular": 0.1}
     try:
-        # process=False: trimesh would merge, drop and reorder by rules of its own
-        return trimesh.load_scene(str(path), process=False, **options)
+        return load_scene(path, **options)
     except ImportError as error:
         raise Refused(
             f"reading {path.suffix} needs another package ({error}); install the extra 'geomtact[meshprep]'"

@@ -15,6 +15,7 @@ from geomtact.files import write_bytes
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.geometry.units import UNITS, unit_comment
+from geomtact.report.result import plain
 from geomtact.versions import versions
 from meshprep import Refused
 from meshprep.adding import add
@@ -63,7 +64,7 @@ def write(before: Surface, work: Work, name: str, unit: str, out: Path, options:
         told |= {"symmetry": _symmetry(meshes[0]), "versions": versions()}
         contents = {file.name: file.read_bytes() for file in files}
         contents[f"{name}.png"] = draw(name, unit, before, work, proof, max(bound, 1e-6 * before.size))
-        contents[f"{name}.json"] = json.dumps(told, indent=1).encode()
+        contents[f"{name}.json"] = json.dumps(plain(told), indent=1).encode()
         if options["add_to"] is not None:
             words = options["description"] or f"made of {name}"
             symmetries = [mesh.symmetry for mesh in meshes if mesh.symmetry is not None]
@@ -91,7 +92,7 @@ def _checked(file: Path, unit: str, tolerance_mm: float) -> Mesh:
         mesh = load_mesh(file, unit)
     except MeshError as error:
         raise Refused(str(error).removeprefix(f"{file}: ")) from None
-    wrong = is_solid(str(file))
+    wrong = is_solid(file)
     if wrong:
         raise Refused(f"what came of the repair is no solid: {wrong}; repair it in a mesh editor")
     return mesh.with_symmetry(1e-3 * tolerance_mm)
