@@ -45,4 +45,4 @@ def main() -> None:
     claim_output()
     with one_line_usage_errors():
         check_words(sys.argv[1:])
-        sys.exit(app(standalone_mode=False))
+        sys.exit(app(prog_name="geomtact", standalone_mode=False))
