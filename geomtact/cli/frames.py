@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 from collections import deque
@@ -11,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from geomtact.cli.frame_order import doubt, in_order
+from geomtact.cli.shell import tell
 from geomtact.errors import InputError, UsageError
 from geomtact.files import printable
 
@@ -35,10 +36,11 @@ class Frame:
     passed_over: int = 0
 
 
-def all_frames(source: str, follow: bool = False, sensor: str | None = None) -> Iterator[Frame]:
+def all_frames(source: str, follow: bool = False, sensor: str | None = None, masks: bool = False) -> Iterator[Frame]:
     """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
 
-    ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`.
+    ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`; ``masks`` says that a video is of
+    contact masks: what is over half bright in it counts as contact. Names of images that do not settle their order are told of.
 
     Raises
     ------
@@ -52,6 +54,8 @@ def all_frames(source: str, follow: bool = False, sensor: str | None = None) -> 
         images = listed(path)
         if not images and not follow:
             raise InputError(f"{path}: no image in this folder; expected {', '.join(_IMAGES)}")
+        if (open_question := doubt(images)) is not None:
+            tell(f"warning: {path}: {open_question}")
         return _followed(path) if follow else (Frame(str(image)) for image in images)
     if path.is_char_device() or (source.isdigit() and not path.exists()):
         return camera_frames(source, sensor)
@@ -61,15 +65,12 @@ def all_frames(source: str, follow: bool = False, sensor: str | None = None) -> 
         )
     if path.suffix.lower() in _IMAGES:
         raise UsageError(f"{path}: is one image; give its folder, or use 'geomtact localize'")
-    return _filmed(path)
+    return _filmed(path, masks)
 
 
 def listed(folder: Path) -> list[Path]:
-    """The images in a folder by name, numbers in it by value: 2 before 10."""
-    images = (path for path in folder.iterdir() if path.suffix.lower() in _IMAGES and not path.name.startswith("."))
-    return sorted(
-        images, key=lambda path: [(not s.isdecimal(), int(s) if s.isdecimal() else 0, s) for s in _parts(path.name)]
-    )
+    """The images in a folder, :func:`in_order`."""
+    return in_order(_images_in(folder))
 
 
 def newest_in(folder: Path) -> Generator[Frame, None, None]:
@@ -78,7 +79,7 @@ def newest_in(folder: Path) -> Generator[Frame, None, None]:
     given: dict[Path, State] = {}
     before: dict[Path, State] = {}
     while True:
-        now = {path: state for path in listed(folder) if (state := _state(path))}
+        now = {path: state for path in _images_in(folder) if (state := _state(path))}
         came = sorted((path for path in now if now[path] != given.get(path)), key=lambda path: (now[path], path.name))
         whole = [i for i, path in enumerate(came) if now[path] == before.get(path)]
         before = now
@@ -158,6 +159,11 @@ def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) ->
         reader.join(2)  # else it would be within OpenCV still when Python ends
 
 
+def _images_in(folder: Path) -> Iterator[Path]:
+    """The images in a folder, in no order."""
+    return (path for path in folder.iterdir() if path.suffix.lower() in _IMAGES and not path.name.startswith("."))
+
+
 def _state(path: Path) -> State | None:
     """What changes while a file is written; None of one that is empty, or has gone."""
     try:
@@ -165,10 +171,6 @@ def _state(path: Path) -> State | None:
     except FileNotFoundError:
         return None
     return (stat.st_mtime_ns, stat.st_size) if stat.st_size else None
-
-
-def _parts(name: str) -> list[str]:
-    return [s for s in re.split(r"(\d+)", name) if s]
 
 
 def _followed(folder: Path) -> Iterator[Frame]:
@@ -197,9 +199,11 @@ def _named() -> Iterator[Frame]:
             yield Frame(line.strip())
 
 
-def _filmed(path: Path) -> Iterator[Frame]:
-    """The frames of a video (H, W, 3) RGB."""
+def _filmed(path: Path, masks: bool) -> Iterator[Frame]:
+    """The frames of a video (H, W, 3) RGB, or the ``masks`` (H, W) in them, where they are nearly black and white."""
     import cv2
+
+    from geomtact.sensing.drawn import bright_half
 
     video = cv2.VideoCapture(_name_for_opencv(str(path)))
     if not video.isOpened():
@@ -207,7 +211,8 @@ def _filmed(path: Path) -> Iterator[Frame]:
 
     def frames() -> Iterator[Frame]:
         while (image := _next_rgb(video)) is not None:
-            yield Frame(image, 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC))
+            half = bright_half(image) if masks else None
+            yield Frame(image if half is None else half, 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC))
         video.release()
 
     return frames()
