@@ -147,7 +147,7 @@ def open_track(
     values, sources = resolve(given, _metadata(source))
     effort = values["effort"] or Effort.balanced.value
     check_name("effort", effort, Effort, sources.get("effort"))
-    frames = all_frames(source, follow, values["sensor"])
+    frames = all_frames(source, follow, values["sensor"], masks=kind == Kind.mask.value)
     localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior)
 
     from geomtact.inference.motion import UniformBall

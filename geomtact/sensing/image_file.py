@@ -14,15 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.errors import ImageError, PoseError
 from geomtact.files import printable, write_whole
 from geomtact.se3 import check_transforms
+from geomtact.sensing.image_codecs import SUPPORTED, decoded
 
 MAX_BYTES = 256 * 2**20
-MAX_PIXELS = 64 * 2**20
 _PREFIX = "geomtact:"
-_SUPPORTED = "give a PNG, JPEG, BMP, TIFF or .npy file"
 
 
 def read_image(path: str | Path) -> NDArray[Any]:
-    """The pixels of an image file as stored: (H, W) or (H, W, C), colours in the order R, G, B(, A).
+    """The pixels of an image file: (H, W) or (H, W, C), colours in the order R, G, B(, A).
+
+    They are as stored, but for those of a palette, which are its colours, and of a TIFF file in which 0 is white.
 
     Raises
     ------
@@ -31,11 +32,7 @@ def read_image(path: str | Path) -> NDArray[Any]:
     """
     path = Path(path)
     data = _read_bytes(path)
-    if data[:6] == b"\x93NUMPY":
-        return _read_npy(data, path)
-    if data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        return _read_tiff(data, path)
-    return _read_coded(data, path)
+    return decoded(data, path)
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
@@ -100,9 +97,9 @@ def _read_bytes(path: Path) -> bytes:
     try:
         size = path.stat().st_size
         if path.is_dir():
-            raise ImageError(f"{path}: expected an image file, got a folder; {_SUPPORTED}")
+            raise ImageError(f"{path}: expected an image file, got a folder; {SUPPORTED}")
         if size == 0:
-            raise ImageError(f"{path}: the file is empty (0 bytes); {_SUPPORTED}")
+            raise ImageError(f"{path}: the file is empty (0 bytes); {SUPPORTED}")
         if size > MAX_BYTES:
             raise ImageError(f"{path}: {size / 2**20:.0f} MiB, more than {MAX_BYTES / 2**20:.0f} MiB; is it one image?")
         return path.read_bytes()
@@ -112,64 +109,3 @@ def _read_bytes(path: Path) -> bytes:
         raise ImageError(
             f"{path}: cannot be read ({error.strerror or error}); check the file and its permissions"
         ) from None
-
-
-def _read_npy(data: bytes, path: Path) -> NDArray[Any]:
-    try:
-        return np.load(io.BytesIO(data), allow_pickle=False)
-    except Exception as error:  # noqa: BLE001 -- the header is parsed as Python, which fails in more ways than are told
-        raise ImageError(
-            f"{path}: not a whole .npy array of numbers ({error}); save it again with numpy.save"
-        ) from None
-
-
-def _read_tiff(data: bytes, path: Path) -> NDArray[Any]:
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(io.BytesIO(data)) as file:
-            if len(file.pages) == 0:
-                raise ImageError(f"{path}: the TIFF file is damaged (no page in it); save it again")
-            if len(file.pages) > 1:
-                raise ImageError(f"{path}: expected one image, got {len(file.pages)} pages; save one page")
-            page = file.pages[0]
-            _check_pixels(path, page.shape[1] if len(page.shape) > 1 else 1, page.shape[0])
-            image = page.asarray()
-            # tifffile hands out channels as stored; planar images keep them first
-            return np.moveaxis(image, 0, -1) if image.ndim == 3 and image.shape[0] in (3, 4) else image
-    except ImageError:
-        raise
-    except Exception as error:  # noqa: BLE001  (tifffile raises whatever its codecs raise)
-        raise ImageError(f"{path}: the TIFF file is damaged ({error}); save it again") from None
-
-
-def _read_coded(data: bytes, path: Path) -> NDArray[Any]:
-    """PNG, JPEG, BMP and what else OpenCV reads."""
-    import cv2
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(io.BytesIO(data)) as header:
-            _check_pixels(path, *header.size)
-            # OpenCV fills what is missing of a truncated file with grey and says nothing
-            header.load()
-    except UnidentifiedImageError:
-        raise ImageError(f"{path}: not an image; {_SUPPORTED}") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ImageError(f"{path}: the image is truncated or damaged ({error}); save or copy it again") from None
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None:
-        raise ImageError(f"{path}: OpenCV cannot decode this image; {_SUPPORTED}")
-    if image.ndim == 3 and image.shape[2] >= 3:
-        image = image[..., [2, 1, 0, *range(3, image.shape[2])]]
-    return np.ascontiguousarray(image)
-
-
-def _check_pixels(path: Path, width: int, height: int) -> None:
-    if width * height > MAX_PIXELS:
-        raise ImageError(
-            f"{path}: {width} x {height} px is more than {MAX_PIXELS // 2**20} million; is it a sensor image?"
-        )

@@ -14,6 +14,7 @@ from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.sensing.change import as_unit_rgb, check_size
 from geomtact.sensing.checks import faults
 from geomtact.sensing.contact import FAINT, Contact
+from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
 from geomtact.sensing.height import contact_height
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 from geomtact.sensing.local_shape import contact_mask, find_contact
@@ -26,6 +27,7 @@ _DUST = 0.1e-6  # m^2 of contact, under which a touch tells nothing (docs/stabil
 _SPECKS = 100  # pieces and holes no larger than dust, that a mask of one touch has at most
 # share in contact of a mask that may be a negative, if all of its border is, or most of it
 _NEGATIVE, _NEGATIVE_MOST, _BORDER = 0.5, 0.85, 0.8
+_LOSSY = (".jpg", ".jpeg")
 _THOUSANDTH = 1e-6  # m that no indentation is as shallow as, so that its unit is wrong
 
 
@@ -79,6 +81,8 @@ def read_observation(
     method = None
     name, array = _load(image, "image", warnings)
     check_size(array, sensor, name)
+    if kind in ("auto", "mask"):
+        array = without_two_colours(array, name)
     if kind == "auto":
         kind = _decide(array, name, background is not None, warnings)
     if kind != "reading":
@@ -177,46 +181,41 @@ def _perhaps_negative(mask: NDArray[np.bool_], share: float) -> bool:
 
 def _decide(array: NDArray[Any], name: str, beside_background: bool, warnings: list[str]) -> str:
     # an image of one value beside a background is what a camera shows without light, not a mask of nothing
-    if array.ndim == 3 or (beside_background and _plain(array)):
+    if beside_background and _plain(array):
         return "reading"
-    if array.dtype == bool or _two_valued(array):
-        return "mask"
-    if array.dtype.kind == "f" or array.dtype == np.uint16:
-        return "height"
-    if _smeared_mask(array, name):
+    if array.ndim == 2:
+        if array.dtype == bool or two_valued(array):
+            return "mask"
+        if array.dtype.kind == "f" or array.dtype == np.uint16:
+            return "height"
+    if (half := bright_half(array)) is not None and half.any():
         warnings.append(
-            f"{name}: JPEG, taken as a reading; for a mask give --kind mask (and PNG, which keeps it exact)"
+            f"{name}: nearly black and white, taken as a reading; for a mask give --kind mask (and PNG, which keeps it exact)"
         )
-    else:
+    elif array.ndim == 2:
         warnings.append(
             f"{name}: a grey image with many values is taken as a reading; for a mask or height give --kind"
         )
     return "reading"
 
 
-def _smeared_mask(array: NDArray[Any], name: str) -> bool:
-    """A grey JPEG of nearly black and nearly white: what its compression makes of a mask, with rims that are not 0."""
-    if Path(name).suffix.lower() not in (".jpg", ".jpeg") or array.ndim != 2 or array.dtype != np.uint8:
-        return False
-    return bool(((array < 32) | (array > 223)).mean() > 0.95 and (array > 223).any())
-
-
-def _two_valued(array: NDArray[Any]) -> bool:
-    """Zeros and one other value; a single value counts if it is how masks say yes or no."""
-    top = array.max()
-    if top == array.min():
-        return bool(top in (0, 1, 255))
-    return bool(array.min() == 0 and ((array == 0) | (array == top)).all())
-
-
 def _mask(array: NDArray[Any], name: str, warnings: list[str]) -> NDArray[np.bool_]:
+    if array.dtype == bool or (array.ndim == 2 and two_valued(array)):
+        return array != 0
+    half = bright_half(array)
+    if half is not None and (half.any() or Path(name).suffix.lower() in _LOSSY):
+        warnings.append(
+            f"{name}: the mask is nearly black and white, as compression leaves it: what is over half counts as contact; "
+            "better give PNG"
+        )
+        return half
     if array.ndim == 3:
         raise ImageError(f"{name}: a mask has one channel, got a colour image; save it as grey or give --kind reading")
-    if _smeared_mask(array, name) and not _two_valued(array):
-        warnings.append(f"{name}: JPEG smears a mask, so what is brighter than half counts as contact; better give PNG")
-        return array > 127
-    if array.dtype != bool and not _two_valued(array):
-        warnings.append(f"{name}: the mask has more than two values; every pixel that is not 0 counts as contact")
+    if array.min() > 0:
+        raise ImageError(
+            f"{name}: a mask is 0 where nothing touches, got {array.min():g} to {array.max():g}; set it to 0"
+        )
+    warnings.append(f"{name}: the mask has more than two values; every pixel that is not 0 counts as contact")
     return array != 0
 
 

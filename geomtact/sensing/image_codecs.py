@@ -1,0 +1,143 @@
+"""The pixels behind the bytes of an image file: which library reads which kind, and what the stored numbers mean."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.errors import ImageError
+
+MAX_PIXELS = 64 * 2**20
+SUPPORTED = "give a PNG, JPEG, BMP, TIFF or .npy file"
+# of TIFF: compressions that tifffile decodes by itself (none, deflate, PackBits, LZMA), the predictor that it does not (of
+# floats), and photometric interpretations
+_OWN_COMPRESSIONS, _FLOATS = (1, 8, 32946, 32773, 34925), 3
+_ZERO_IS_WHITE, _ZERO_IS_BLACK, _RGB, _PALETTE = range(4)
+_MODES = ("1", "L", "I", "F", "I;16", "I;16B", "LA", "RGB", "RGBA")  # of Pillow, whose pixels are what they say
+
+
+def decoded(data: bytes, path: Path) -> NDArray[Any]:
+    """The pixels (H, W) or (H, W, C), colours in the order R, G, B(, A), in the bytes of the file ``path``.
+
+    Raises
+    ------
+    ImageError
+        It is no image, one of too many pixels, of several pages, or damaged.
+    """
+    if data[:6] == b"\x93NUMPY":
+        return _read_npy(data, path)
+    if data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return _read_tiff(data, path)
+    return _read_coded(data, path)
+
+
+def _read_npy(data: bytes, path: Path) -> NDArray[Any]:
+    try:
+        return np.load(io.BytesIO(data), allow_pickle=False)
+    except Exception as error:  # noqa: BLE001 -- the header is parsed as Python, which fails in more ways than are told
+        raise ImageError(
+            f"{path}: not a whole .npy array of numbers ({error}); save it again with numpy.save"
+        ) from None
+
+
+def _read_tiff(data: bytes, path: Path) -> NDArray[Any]:
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(io.BytesIO(data)) as file:
+            if len(file.pages) == 0:
+                raise ImageError(f"{path}: the TIFF file is damaged (no page in it); save it again")
+            if len(file.pages) > 1:
+                raise ImageError(f"{path}: expected one image, got {len(file.pages)} pages; save one page")
+            page: Any = file.pages[0]
+            _check_pixels(path, page.imagewidth, page.imagelength)
+            if page.photometric <= _PALETTE and page.compression in _OWN_COMPRESSIONS and page.predictor != _FLOATS:
+                return _as_meant(page)
+            # the other libraries decode the rest, but Pillow rounds colours to 8 bits
+            by_opencv = page.samplesperpixel > 1 and page.bitspersample > 8
+            return _by_opencv(data, path) if by_opencv else _by_pillow(data, path)
+    except ImageError:
+        raise
+    except Exception as error:  # noqa: BLE001  (tifffile raises whatever its codecs raise)
+        raise ImageError(
+            f"{path}: the TIFF file is damaged, or of a kind that is not read ({error}); save it again, uncompressed"
+        ) from None
+
+
+def _as_meant(page: Any) -> NDArray[Any]:
+    """The pixels that a page of a TIFF file, read by tifffile, means by what it stores."""
+    image = page.asarray()
+    if image.ndim == 3 and page.planarconfig == 2:
+        return np.moveaxis(image, 0, -1)
+    if page.photometric == _PALETTE:
+        return _in_colours(image, (page.colormap.T >> 8).astype(np.uint8))
+    # where it writes bool arrays, tifffile calls True black, which means contact here
+    if page.photometric == _ZERO_IS_WHITE and not (page.bitspersample == 1 and page.software == "tifffile.py"):
+        return np.asarray(~image if image.dtype == bool else np.iinfo(image.dtype).max - image)
+    return np.asarray(image)
+
+
+def _in_colours(indices: NDArray[Any], palette: NDArray[np.uint8]) -> NDArray[Any]:
+    """The colours (H, W, 3) of indices (H, W) into a palette (n, 3); but the indices, where they are 0 and at most one other, and
+    neither is black: then 0 is what the other is drawn on."""
+    used = np.unique(indices)
+    colours = np.zeros((max(256, len(palette)), 3), np.uint8)
+    colours[: len(palette)] = palette
+    drawn = used[0] == 0 and len(used) <= 2 and colours[used].any(1).all()
+    return indices if drawn else colours[indices]
+
+
+def _read_coded(data: bytes, path: Path) -> NDArray[Any]:
+    """PNG, JPEG, BMP and what else Pillow and OpenCV read."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(data)) as header:
+            _check_pixels(path, *header.size)
+            # OpenCV fills what is missing of a truncated file with grey and says nothing
+            header.load()
+            if header.mode == "P" and "transparency" not in header.info:
+                palette = np.array(header.getpalette("RGB"), np.uint8).reshape(-1, 3)
+                return _in_colours(np.asarray(header), palette)
+    except UnidentifiedImageError:
+        raise ImageError(f"{path}: not an image; {SUPPORTED}") from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path}: the image is truncated or damaged ({error}); save or copy it again") from None
+    return _by_opencv(data, path)
+
+
+def _by_pillow(data: bytes, path: Path) -> NDArray[Any]:
+    """What Pillow reads of a TIFF file."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data)) as image:
+        image.load()
+        if image.mode == "P":
+            return _in_colours(np.asarray(image), np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3))
+        return np.array(image if image.mode in _MODES else image.convert("RGB"))
+
+
+def _by_opencv(data: bytes, path: Path) -> NDArray[Any]:
+    """What OpenCV reads, as stored."""
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise ImageError(f"{path}: OpenCV cannot decode this image; {SUPPORTED}")
+    if image.ndim == 3 and image.shape[2] >= 3:
+        image = image[..., [2, 1, 0, *range(3, image.shape[2])]]
+    return np.ascontiguousarray(image)
+
+
+def _check_pixels(path: Path, width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        raise ImageError(
+            f"{path}: {width} x {height} px is more than {MAX_PIXELS // 2**20} million; is it a sensor image?"
+        )
