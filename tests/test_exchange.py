@@ -8,6 +8,9 @@ import pytest
 from geomtact import InputError, se3
 from geomtact.report.exchange import from_bop, from_tum, to_bop, to_ros, to_table, to_tum
 
+INFINITE = ["nan 1 2 3 0 0 0 1", "0 1 2 inf 0 0 0 1", "0 1 2 3 0 0 NaN 1", "0 1 2 3 0 0 0 -Inf", "0 1e400 2 3 0 0 0 1"]
+BOP_LINE = "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,{},1 0 0 0 1 0 0 0 1,{},{}\n"
+
 
 @pytest.fixture
 def poses(rng):
@@ -67,6 +70,10 @@ def test_a_table_has_a_row_for_each_mode(poses):
     [
         (from_tum, "0 1 2 3\n", "eight numbers each"),
         (from_tum, "0 1 2 3 0 0 0 0\n", "eight numbers each"),
+        *((from_tum, f"# t\n0 1 2 3 0 0 0 1\n{line}\n", "line 3: expected finite numbers") for line in INFINITE),
+        (from_bop, BOP_LINE.format("nan", "0 0 0", 1), "line 2: expected a finite score and time, got nan and 1"),
+        (from_bop, BOP_LINE.format(0.5, "0 0 0", "inf"), "line 2: expected a finite score and time, got 0.5 and inf"),
+        (from_bop, BOP_LINE.format(0.5, "0 inf 0", 1), "line 2: expected finite numbers"),
         (from_bop, "a,b\n1,2\n", "expected the columns scene_id"),
         (from_bop, "scene_id,im_id,obj_id,score,R,t,time\n1,1,1,0.5,1 0 0,0 0 0,1\n", "line 2"),
         (

@@ -400,7 +400,8 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
         (json.dumps({"T_world_sensor": [sensors[0].tolist(), [1, 2]]}), "got 2, not all 4x4"),
         (json.dumps({"T_world_sensor": (2 * sensors).tolist()}), "no rotation"),
         (json.dumps({"T_world_sensor": sensors.tolist(), "std": 1}), "unknown key 'std'"),
-        (json.dumps({"T_world_sensor": sensors.tolist(), "std_mm": -1}), "std_mm must be a number >= 0"),
+        (json.dumps({"T_world_sensor": sensors.tolist(), "std_mm": -1}), "std_mm must be a finite number >= 0"),
+        (json.dumps({"T_world_sensor": sensors.tolist(), "std_deg": np.inf}), "std_deg must be a finite number >= 0"),
     ]:
         poses.write_text(text)
         done = CliRunner().invoke(app, [*args, "--sensor-poses", str(poses)])

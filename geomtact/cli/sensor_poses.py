@@ -77,8 +77,8 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
         raise InputError(f"--sensor-poses {path}: sensor must list a name or TOML file for each of {images}, got {got}")
     std = {key: content.get(key, 0.0) for key in ("std_mm", "std_deg")}
     for key, value in std.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0:
-            raise InputError(f"--sensor-poses {path}: {key} must be a number >= 0, got {value!r}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < np.inf:
+            raise InputError(f"--sensor-poses {path}: {key} must be a finite number >= 0, got {value!r}")
     name = f"--sensor-poses {path}: T_world_sensor"
     T = check_transforms(T, name)
     check_rig(T, name)

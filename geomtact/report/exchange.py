@@ -38,14 +38,22 @@ def from_tum(path: str | Path) -> tuple[Array, Array]:
     Raises
     ------
     InputError
+        It cannot be read, or has a line of other than eight finite numbers, the last four a quaternion.
     """
-    rows = [line.split() for line in _text(path).splitlines() if line.strip() and not line.startswith("#")]
+    lines = enumerate(_text(path).splitlines(), 1)
+    rows = {number: line.split() for number, line in lines if line.strip() and not line.startswith("#")}
     try:
-        numbers = np.array(rows, float).reshape(len(rows), 8)
-        R = Rotation.from_quat(numbers[:, 4:]).as_matrix() if len(rows) else np.zeros((0, 3, 3))
+        values = np.array(list(rows.values()), float).reshape(len(rows), 8)
+        infinite = ~np.isfinite(values).all(1)
+        if infinite.any():
+            first = list(rows)[int(np.argmax(infinite))]
+            raise InputError(
+                f"{path}: line {first}: expected finite numbers, got NaN or infinity; leave such lines out"
+            )
+        R = Rotation.from_quat(values[:, 4:]).as_matrix() if len(rows) else np.zeros((0, 3, 3))
     except ValueError:
         raise InputError(f"{path}: expected lines of timestamp tx ty tz qx qy qz qw, eight numbers each") from None
-    return numbers[:, 0], transform(R, numbers[:, 1:4])
+    return values[:, 0], transform(R, values[:, 1:4])
 
 
 def to_bop(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -79,7 +87,10 @@ def from_bop(path: str | Path) -> list[dict[str, Any]]:
             R, t = (np.array(row[key].split(), float) for key in ("R", "t"))
             T = check_transforms(transform(R.reshape(3, 3), 1e-3 * t.reshape(3)), f"{path}: line {number}")
             ids = {key: int(row[key]) for key in BOP[:3]}
-            out.append(ids | {"score": float(row["score"]), "time": float(row["time"]), "T": T})
+            score, time = float(row["score"]), float(row["time"])
+            if not np.isfinite([score, time]).all():
+                raise InputError(f"{path}: line {number}: expected a finite score and time, got {score:g} and {time:g}")
+            out.append(ids | {"score": score, "time": time, "T": T})
         except (TypeError, ValueError, AttributeError):
             raise InputError(f"{path}: line {number}: expected {','.join(BOP)} with nine and three numbers") from None
     return out
