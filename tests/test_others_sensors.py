@@ -1,11 +1,15 @@
-"""Sensor files of gs_sdk and TACTO."""
+"""Sensor files of gs_sdk, TACTO and gsrobotics."""
 
+import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from geomtact import Sensor, SensorError
+from geomtact import ImageError, Sensor, SensorError
+from geomtact.cli.frames import camera_frames
+from geomtact.sensing.reading import read_observation
 
 GS_SDK = "device_name: Mini\nimgw: 320\nimgh: 240\nppmm: 0.0634\nframerate: 25\n"
 TACTO = """
@@ -17,6 +21,16 @@ sensor:
       yfov: 90
   gel: {origin: [0.02, 0, 0.01], width: 0.03, height: 0.04, curvature: %s, curvatureMax: 0.005}
 """
+# as the GelSight Mini's software keeps it, with other values
+GSROBOTICS = {
+    "default_camera_index": 0,
+    "camera_width": 640,
+    "camera_height": 480,
+    "border_fraction": 0.1,
+    "marker_mask_min": 5,
+    "nn_model_path": "./net.pt",
+    "use_gpu": False,
+}
 
 
 def written(tmp_path, text, name="mine.yaml"):
@@ -47,6 +61,101 @@ def test_tactos_own_digit_has_the_bundled_digits_camera_and_dome(data_folder):
     assert theirs.camera_distance == pytest.approx(ours.camera_distance)
     assert theirs.membrane_radius == pytest.approx(ours.membrane_radius, rel=0.01)
     assert theirs.image_size_px == ours.image_size_px
+
+
+@pytest.mark.parametrize("name", ["mine.YAML", "mine.Yml", "MINE.YML"])
+def test_the_case_of_a_suffix_does_not_matter(tmp_path, name):
+    assert Sensor.load(written(tmp_path, GS_SDK, name)).name == "Mini"
+    assert Sensor.load(written(tmp_path, Sensor.load("digit").to_toml(), "D.TOML")) == Sensor.load("digit")
+    with pytest.raises(SensorError, match="no such file"):
+        Sensor.load(tmp_path / "absent.YAML")
+
+
+def test_a_file_of_gsrobotics_shows_its_part_of_the_minis_frame(tmp_path):
+    """The frame is as large as the bundled sensor's, which shows 5/7 of it; the pixels differ."""
+    mini, theirs = Sensor.load("gelsight-mini"), Sensor.load(written(tmp_path, json.dumps(GSROBOTICS), "config.JSON"))
+    assert theirs.name == "config" and theirs.image_size_px == (640, 480) and theirs.border_fraction == 0.1
+    np.testing.assert_allclose(theirs.half_window / 0.8, mini.half_window / (5 / 7), rtol=1e-5)
+    assert theirs.camera_distance == mini.camera_distance and theirs.max_penetration == mini.max_penetration
+    standard = GSROBOTICS | {"camera_width": 320, "camera_height": 240, "border_fraction": 0.15}
+    theirs = Sensor.load(written(tmp_path, json.dumps(standard, indent="\t"), "config.json"))
+    assert theirs.pixel_pitch == pytest.approx((0.0621e-3, 0.0621e-3), abs=1e-7)
+    assert Sensor.from_toml(theirs.to_toml()) == theirs
+    assert Sensor.from_toml(theirs.to_toml()).border_fraction == 0.15
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (
+            {"camera_width": None},
+            "the key 'camera_width' is missing; gsrobotics writes camera_width, camera_height, bord",
+        ),
+        ({"border_fraction": None}, "the key 'border_fraction' is missing"),
+        ({"camera_height": 240.5}, "camera_width and camera_height must be whole numbers > 0, got 640 and 240.5"),
+        ({"camera_height": 0}, "whole numbers > 0, got 640 and 0"),
+        ({"border_fraction": 15}, "border_fraction is the share cut off at each side, 0 to 0.49, got 15"),
+        ({"border_fraction": float("nan")}, "0 to 0.49, got nan"),
+        ({"border_fraction": "a"}, "what this one holds is not valid"),
+    ],
+)
+def test_what_is_wrong_with_a_file_of_gsrobotics_is_told(tmp_path, wrong, told):
+    text = json.dumps({key: value for key, value in (GSROBOTICS | wrong).items() if value is not None})
+    with pytest.raises(SensorError, match=told) as error:
+        Sensor.load(written(tmp_path, text, "config.json"))
+    assert "\n" not in str(error.value) and "config.json" in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", '{"T_world_sensor": []}', "[" * 9999])
+def test_other_json_is_no_sensor(tmp_path, text):
+    with pytest.raises(
+        SensorError, match="expected one of gs_sdk .* or one of gsrobotics with camera_width, camera_height"
+    ):
+        Sensor.load(written(tmp_path, text, "poses.json"))
+
+
+@pytest.mark.parametrize(
+    ("size", "kept"),
+    [((640, 480), "68:412, 91:549"), ((3280, 2464), "352:2112, 468:2812"), ((1640, 1232), "176:1056, 234:1406")],
+)
+def test_a_whole_frame_of_the_mini_is_refused_with_its_part_that_counts(size, kept):
+    """gs_sdk cuts off a seventh of 640 x 480 and of 3280 x 2464 px, in whole pixels, as here."""
+    frame = np.random.default_rng(0).integers(0, 255, (*size[::-1], 3), np.uint8)
+    message = (
+        f"image: expected 320 x 240 px for sensor gelsight-mini (width x height), got {size[0]} x {size[1]} px; of the camera's "
+        f"whole frame give image[{kept}] scaled to 320 x 240 px, for the sensor's images are without 14 % of it at each side; "
+        "what is cut already, or a mask of the image, only scale"
+    )
+    with pytest.raises(ImageError) as error:
+        read_observation(frame, "gelsight-mini")
+    assert str(error.value) == message
+    with pytest.raises(ImageError, match="name the sensor that took it"):
+        read_observation(frame[:, : size[0] // 2], "gelsight-mini")
+
+
+@pytest.mark.parametrize("size", [(320, 240), (640, 480), (3280, 2464)])
+def test_a_live_frame_is_cut_as_the_sensors_images_are(monkeypatch, size):
+    """Whatever the camera's resolution: the corners of the image lie a seventh within those of the frame."""
+    columns, rows = np.meshgrid(np.linspace(0, 1, size[0]), np.linspace(0, 1, size[1]))
+    frame = np.stack([0 * rows, 255 * rows, 255 * columns], -1).astype(np.uint8)  # BGR
+
+    class Capture:
+        def __init__(self, *_):
+            self.left = 3
+
+        def read(self):
+            self.left -= 1
+            return self.left >= 0, frame
+
+        def __getattr__(self, name):
+            return lambda *_: True
+
+    monkeypatch.setattr(cv2, "VideoCapture", Capture)
+    image = next(camera_frames("0", "gelsight-mini")).image
+    assert image.shape == (240, 320, 3)
+    np.testing.assert_allclose(image[0, 0, :2], 255 / 7, atol=3)
+    np.testing.assert_allclose(image[-1, -1, :2], 255 * 6 / 7, atol=3)
+    assert next(camera_frames("0")).image.shape == frame.shape
 
 
 def test_it_may_be_written_out_as_toml(tmp_path):

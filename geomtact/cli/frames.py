@@ -96,7 +96,7 @@ def camera_frames(source: str, sensor: str | None = None) -> Generator[Frame, No
     Parameters
     ----------
     source : number of the camera, its device, or a URL
-    sensor : name or file of the one whose size of image the camera is asked for
+    sensor : name or file of the one whose size of image the camera is asked for, and whose border is cut off
 
     Raises
     ------
@@ -107,21 +107,27 @@ def camera_frames(source: str, sensor: str | None = None) -> Generator[Frame, No
 
     from geomtact.sensing.sensor import Sensor
 
-    size = None if sensor is None else Sensor.load(sensor).image_size_px
+    taken_by = None if sensor is None else Sensor.load(sensor)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else _name_for_opencv(source))
     if not capture.isOpened():
         raise InputError(
             f"camera {source}: cannot be opened; give the number of a camera of this computer, its device, or a URL"
         )
-    if size is not None:
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+    if taken_by is not None:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, taken_by.image_size_px[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, taken_by.image_size_px[1])
 
-    first = [_next_rgb(capture)]
+    def read() -> Any:
+        image = _next_rgb(capture)
+        if image is None or taken_by is None or not taken_by.border_fraction:
+            return image
+        return cv2.resize(image[taken_by.cut(image.shape)], taken_by.image_size_px, interpolation=cv2.INTER_AREA)
+
+    first = [read()]
     if first[0] is None:
         raise InputError(f"camera {source}: gives no image; does another program use it?")
-    return newest(lambda: first.pop() if first else _next_rgb(capture), capture.release)
+    return newest(lambda: first.pop() if first else read(), capture.release)
 
 
 def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) -> Generator[Frame, None, None]:

@@ -17,6 +17,7 @@ from geomtact.sensing.sensor import Sensor
 
 GRID = 120  # smoothing lengths along an image's shorter side
 _GREY = 1 / 255
+_ALIKE = 0.02  # by which a camera's frame may be wider or narrower than the image that is cut out of it
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 
 
@@ -132,6 +133,16 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
         )
     elif do is not None:
         hint = do
+    elif (
+        sensor.border_fraction
+        and abs(width * sensor.image_size_px[1] / (height * sensor.image_size_px[0]) - 1) < _ALIKE
+    ):
+        rows, columns = sensor.cut(array.shape)
+        hint = (
+            f"of the camera's whole frame give image[{rows.start}:{rows.stop}, {columns.start}:{columns.stop}] scaled to "
+            f"{wanted}, for the sensor's images are without {100 * sensor.border_fraction:.0f} % of it at each side; what is cut "
+            "already, or a mask of the image, only scale"
+        )
     elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
         hint = "the shape agrees: scale a mask to that, or describe this resolution in a sensor file of its own"
     else:

@@ -1,11 +1,14 @@
-"""Sensor files of other makers: what gs_sdk and TACTO write of a sensor's geometry, read as a :class:`Sensor`.
+"""Sensor files of other makers: what gs_sdk, TACTO and gsrobotics write of a sensor's geometry, read as a :class:`Sensor`.
 
-Neither says how deep a gel may be pressed in, and gs_sdk nothing of the camera's distance: then 2 mm, and parallel rays.
+None says how deep a gel may be pressed in, and gs_sdk nothing of the camera's distance: then 2 mm, and parallel rays. gsrobotics'
+file says no more than which part of a GelSight Mini's frame its images show.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +19,20 @@ from geomtact.sensing.sensor import Sensor
 
 _DEPTH = 2e-3  # m that an object can press in
 _TACTO_SIZE = (240, 320)  # px; the file does not say
-_KINDS = "one of gs_sdk with ppmm, imgw and imgh, or one of TACTO with sensor: camera and gel"
+_GSROBOTICS = ("camera_width", "camera_height", "border_fraction")
+_MOST_CUT = 0.49  # to which gsrobotics limits its border_fraction
+_KINDS = (
+    "one of gs_sdk with ppmm, imgw and imgh, or one of TACTO with sensor: camera and gel, or one of gsrobotics with "
+    "camera_width, camera_height and border_fraction"
+)
 
 
-def sensor_of_yaml(text: str, origin: str) -> Sensor:
-    """The sensor that the YAML file of gs_sdk or of TACTO, named ``origin``, describes.
+def sensor_of_others(text: str, origin: str) -> Sensor:
+    """The sensor that the YAML file of gs_sdk or of TACTO, or the JSON file of gsrobotics, named ``origin``, describes.
 
     ``ppmm`` of gs_sdk is millimetres per pixel. TACTO's gel, if curved, is taken for a sphere that falls by ``curvatureMax`` to
-    the gel's corners, seen from the camera's ``position`` with ``yfov``; its picture has 240 x 320 px.
+    the gel's corners, seen from the camera's ``position`` with ``yfov``; its picture has 240 x 320 px. gsrobotics' sensor is a
+    GelSight Mini, of whose frame ``border_fraction`` is cut off at each side.
 
     Raises
     ------
@@ -32,16 +41,19 @@ def sensor_of_yaml(text: str, origin: str) -> Sensor:
     """
     import yaml
 
+    form = "JSON" if Path(origin).suffix.lower() == ".json" else "YAML"
     try:
-        data = yaml.safe_load(text)
+        data = json.loads(text) if form == "JSON" else yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError, KeyError, AttributeError, IndexError, TypeError) as error:
-        raise SensorError(f"{origin}: not valid YAML ({' '.join(str(error).split())}); expected {_KINDS}") from None
+        raise SensorError(f"{origin}: not valid {form} ({' '.join(str(error).split())}); expected {_KINDS}") from None
     name = Path(origin).stem
     try:
         if isinstance(data, dict) and "ppmm" in data:
             return _of_gs_sdk(data, name)
         if isinstance(data, dict) and isinstance(data.get("sensor"), dict):
             return _of_tacto(data["sensor"], name)
+        if isinstance(data, dict) and any(key in data for key in _GSROBOTICS):
+            return _of_gsrobotics(data, name)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise SensorError(f"{origin}: expected {_KINDS}; what this one holds is not valid ({error})") from None
     except SensorError as error:
@@ -86,4 +98,27 @@ def _of_tacto(data: Mapping[str, Any], name: str) -> Sensor:
         _DEPTH,
         membrane_radius=(corner2 + fall**2) / (2 * fall) if fall > 0 else 0.0,
         note=f"From TACTO's file {name}, which says nothing of the gel's depth: 2 mm. The picture is taken as 240 x 320 px.",
+    )
+
+
+def _of_gsrobotics(data: Mapping[str, Any], name: str) -> Sensor:
+    for key in _GSROBOTICS:
+        if key not in data:
+            raise SensorError(f"the key {key!r} is missing; gsrobotics writes {', '.join(_GSROBOTICS)}")
+    width, height, border = (data[key] for key in _GSROBOTICS)
+    if type(width) is not int or type(height) is not int or min(width, height) < 1:
+        raise SensorError(f"camera_width and camera_height must be whole numbers > 0, got {width!r} and {height!r}")
+    if isinstance(border, bool) or not 0 <= border <= _MOST_CUT:
+        raise SensorError(f"border_fraction is the share cut off at each side, 0 to {_MOST_CUT}, got {border!r}")
+    mini = Sensor.load("gelsight-mini")
+    frame = 2 * mini.half_window / (1 - 2 * mini.border_fraction)  # of the camera, on the membrane [m]
+    x, y = (float(f"{pitch:.6g}") for pitch in frame * (1 - 2 * border) / (width, height))
+    return replace(
+        mini,
+        name=name,
+        image_size_px=(width, height),
+        pixel_pitch=(x, y),
+        border_fraction=float(border),
+        note=f"From gsrobotics' file {name}: a GelSight Mini, of whose frame {100 * border:g} % are cut off at each side. All "
+        "else is gelsight-mini's, the frame's size on the membrane too.",
     )

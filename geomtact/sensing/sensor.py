@@ -20,8 +20,7 @@ from geomtact.files import read_text
 from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable
 
-_YAML = (".yaml", ".yml")
-
+_OTHERS = (".yaml", ".yml", ".json")  # of files that other makers' programs read
 HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
 CONTACT_METHODS = ("auto", "classical", "pressure", "learned")  # of finding the contact in a reading, the default first
 
@@ -43,6 +42,7 @@ class Sensor:
     contact_method : one of ``CONTACT_METHODS``, which finds the contact in its readings
     note : where the figures come from
     colour : how its colours tell the gel's slope; None where that is not calibrated
+    border_fraction : share of the camera's frame that is cut off at each side before it is scaled to the image
     """
 
     name: str
@@ -56,6 +56,7 @@ class Sensor:
     contact_method: str = field(default=CONTACT_METHODS[0], compare=False)
     note: str = field(default="", compare=False)
     colour: ColourTable | None = field(default=None, compare=False)
+    border_fraction: float = field(default=0.0, compare=False)
 
     def __post_init__(self) -> None:
         def need(ok: bool, what: str) -> None:
@@ -100,6 +101,10 @@ class Sensor:
         )
         need(self.height_noise > 0, f"height_noise_mm must be positive, got {1e3 * self.height_noise:g}")
         need(
+            0 <= self.border_fraction < 0.5,
+            f"border_fraction is the share cut off at each side, 0 to 0.49, got {self.border_fraction:g}",
+        )
+        need(
             self.contact_method in CONTACT_METHODS,
             f"contact_method must be one of {', '.join(CONTACT_METHODS)}, got {self.contact_method!r}"
             f"{did_you_mean(str(self.contact_method), CONTACT_METHODS)}",
@@ -107,7 +112,7 @@ class Sensor:
 
     @classmethod
     def load(cls, source: str | Path | Sensor) -> Sensor:
-        """A bundled sensor by name, or one from a TOML file, or from a YAML file of gs_sdk or TACTO.
+        """A bundled sensor by name, or one from a TOML file, a YAML file of gs_sdk or TACTO, or gsrobotics' JSON file.
 
         Raises
         ------
@@ -120,18 +125,19 @@ class Sensor:
         if text in bundled_sensors():
             return cls.from_toml(_folder().joinpath(f"{text}.toml").read_text("utf-8"), text)
         path = Path(text)
-        if path.suffix in (".toml", *_YAML) or path.is_file():
+        suffix = path.suffix.lower()
+        if suffix in (".toml", *_OTHERS) or path.is_file():
             try:
                 said = read_text(path)
             except FileNotFoundError:
                 raise SensorError(f"sensor file {path}: no such file; give a TOML file or a bundled sensor") from None
             except (OSError, ValueError) as error:
                 raise SensorError(f"sensor file {path}: cannot be read ({error}); give a TOML file") from None
-            if path.suffix not in _YAML:
+            if suffix not in _OTHERS:
                 return cls.from_toml(said, str(path))
-            from geomtact.sensing.others import sensor_of_yaml
+            from geomtact.sensing.others import sensor_of_others
 
-            return sensor_of_yaml(said, str(path))
+            return sensor_of_others(said, str(path))
         raise SensorError(f"no sensor named {text!r}{nearest_name(text, bundled_sensors())}; or give a .toml file")
 
     @classmethod
@@ -192,6 +198,11 @@ class Sensor:
         x = ((np.arange(w) + 0.5) / w * 2 - 1) * half[0]
         y = ((np.arange(h) + 0.5) / h * 2 - 1) * half[1]
         return x, y
+
+    def cut(self, shape: tuple[int, ...]) -> tuple[slice, slice]:
+        """Rows and columns of a camera's frame (h, w, ...) that its images show, before they are scaled."""
+        rows, columns = (int(round(n * self.border_fraction, 2)) for n in shape[:2])
+        return slice(rows, shape[0] - rows), slice(columns, shape[1] - columns)
 
     def project(self, points: ArrayLike) -> Array:
         """Where the camera rays through ``points`` (..., 3) [m] cross z = 0: (..., 2) [m]."""
