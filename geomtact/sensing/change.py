@@ -133,10 +133,7 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
         )
     elif do is not None:
         hint = do
-    elif (
-        sensor.border_fraction
-        and abs(width * sensor.image_size_px[1] / (height * sensor.image_size_px[0]) - 1) < _ALIKE
-    ):
+    elif sensor.border_fraction and width > sensor.image_size_px[0] and _alike(array.shape, sensor):
         rows, columns = sensor.cut(array.shape)
         hint = (
             f"of the camera's whole frame give image[{rows.start}:{rows.stop}, {columns.start}:{columns.stop}] scaled to "
@@ -151,6 +148,12 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
             "or a sensor file of its resolution"
         )
     raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
+
+
+def _alike(shape: tuple[int, ...], sensor: Sensor) -> bool:
+    """Whether an image (h, w, ...) is about as wide for its height as the sensor's."""
+    width, height = sensor.image_size_px
+    return abs(shape[1] * height / (shape[0] * width) - 1) < _ALIKE
 
 
 def background_of(background: Any, image: Array) -> Array:

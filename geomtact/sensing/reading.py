@@ -14,6 +14,7 @@ from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.sensing.change import as_unit_rgb, check_size
 from geomtact.sensing.checks import faults
 from geomtact.sensing.contact import FAINT, Contact
+from geomtact.sensing.depth_map import depths_of
 from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
 from geomtact.sensing.height import contact_height
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
@@ -28,7 +29,6 @@ _SPECKS = 100  # pieces and holes no larger than dust, that a mask of one touch 
 # share in contact of a mask that may be a negative, if all of its border is, or most of it
 _NEGATIVE, _NEGATIVE_MOST, _BORDER = 0.5, 0.85, 0.8
 _LOSSY = (".jpg", ".jpeg")
-_THOUSANDTH = 1e-6  # m that no indentation is as shallow as, so that its unit is wrong
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def read_observation(
     if kind == "mask":
         contact = Contact(_mask(array, name, warnings))
     elif kind == "height":
-        height = _height(array, name, sensor, warnings)
+        height = depths_of(array, name, sensor, warnings)
         contact = Contact.of_height(height)
         if not np.array_equal(contact.mask, height > FAINT * height.max()):
             warnings.append(
@@ -217,39 +217,6 @@ def _mask(array: NDArray[Any], name: str, warnings: list[str]) -> NDArray[np.boo
         )
     warnings.append(f"{name}: the mask has more than two values; every pixel that is not 0 counts as contact")
     return array != 0
-
-
-def _height(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str]) -> NDArray[np.float32]:
-    if array.ndim == 3:
-        raise ImageError(f"{name}: a height map has one channel, got a colour image; give --kind reading")
-    if array.dtype == np.uint16:
-        height = array * 1e-6
-    elif array.dtype.kind == "f":
-        height = array.astype(np.float64)
-    else:
-        raise ImageError(
-            f"{name}: heights must be float (metres) or 16-bit (micrometres), got {array.dtype}; convert them"
-        )
-    lowest, highest = float(height.min()), float(height.max())
-    if lowest < -1e-6:
-        raise ImageError(
-            f"{name}: heights are depths of the gel's indentation, >= 0; the lowest is {lowest:.4g} m; flip or clip"
-        )
-    if lowest < 0:
-        warnings.append(f"{name}: heights down to {lowest * 1e6:.2g} micrometres were set to 0")
-    if highest > 10 * sensor.max_penetration:
-        raise ImageError(
-            f"{name}: expected heights in metres up to about {sensor.max_penetration:g}, the largest is {highest:.4g}; "
-            "these look like millimetres: divide by 1000 (16-bit grey counts micrometres); or a camera's image: --kind reading"
-        )
-    if 0 < highest < _THOUSANDTH:
-        raise ImageError(
-            f"{name}: expected heights in metres up to about {sensor.max_penetration:g}, the largest is {highest:.4g}; these "
-            "look divided by 1000 once too often (16-bit grey counts micrometres)"
-        )
-    if highest > 1.5 * sensor.max_penetration:
-        warnings.append(f"{name}: heights up to {1e3 * highest:.2f} mm exceed the sensor's max_penetration_mm")
-    return np.maximum(height, 0).astype(np.float32)
 
 
 def _reading(
