@@ -35,7 +35,7 @@ def read(array, kind="auto"):
     [
         (1e-3, "millimetres by 0.001"),
         (1e-6, "micrometres by 1e-06"),
-        (PITCH, "pixels, as gs_sdk gives them by 6.34e-05"),
+        (PITCH, "pixels (of gs_sdk) by 6.34e-05"),
     ],
 )
 def test_another_unit_is_refused_with_its_conversion(depth, unit, conversion):
@@ -53,7 +53,7 @@ def test_the_message_for_gs_sdks_pixels():
     with pytest.raises(ImageError) as error:
         read(ball(5e-4) / PITCH)
     assert str(error.value) == (
-        "image: expected heights in metres up to about 0.002, the largest is 7.886; multiply pixels, as gs_sdk gives them by "
+        "image: expected heights in metres up to about 0.002, the largest is 7.886; multiply pixels (of gs_sdk) by "
         "6.34e-05; or is it a camera's image: --kind reading"
     )
 
@@ -67,7 +67,7 @@ def test_contact_below_a_rest_of_0_is_refused(unit):
         ) as error:
             read(array / unit)
         assert (unit == 1) == ("multiply" not in str(error.value))
-        assert unit != PITCH or "pixels, as gs_sdk gives them by 6.34e-05" in str(error.value)
+        assert unit != PITCH or "pixels (of gs_sdk) by 6.34e-05" in str(error.value)
 
 
 @pytest.mark.parametrize("rest", [20e-3, 10e-3, 22e-3 + FAR2 / 70e-3])
@@ -86,10 +86,10 @@ def test_sixteen_bits_count_micrometres():
     assert read(micrometres).warnings == []
     for scaled in (micrometres * 80, micrometres // 80):
         try:
-            told = read(scaled).warnings[0]
+            said = read(scaled).warnings[0]
         except ImageError as error:
-            told = str(error)
-        assert "16-bit" in told and "micrometres" in told
+            said = str(error)
+        assert "16-bit" in said and "micrometres" in said
 
 
 def test_eight_bits_have_no_unit():
@@ -98,32 +98,31 @@ def test_eight_bits_have_no_unit():
 
 
 @pytest.mark.parametrize("depth", [0.8e-4, 1.5e-4, 3e-4, 8e-4])
-def test_pixels_taken_for_millimetres_are_told_by_their_slope_or_depth(depth):
+def test_pixels_given_as_millimetres_are_too_steep_or_too_deep(depth):
     """A factor of 15.8: what is deeper than the gel, or too steep for any object."""
     wedge = np.maximum(depth - np.abs(0.5 * PITCH * (COLUMNS - 160)), 0) * (abs(ROWS - 120) < 60)
     assert read(wedge).warnings == []
-    told = "; ".join(read(1e-3 * wedge / PITCH).warnings)
-    assert "if they are pixels times 0.001, multiply by 0.0634, pixel_pitch_mm" in told
-    assert ("exceed the sensor's max_penetration_mm, 2" in told) != (
-        "half of the contact is steeper than 72 degrees" in told
+    said = "; ".join(read(1e-3 * wedge / PITCH).warnings)
+    assert "if they are pixels times 0.001, multiply by 0.0634, pixel_pitch_mm" in said
+    assert ("exceed the sensor's max_penetration_mm, 2" in said) != (
+        "half of the contact is steeper than 72 degrees" in said
     )
 
 
 @pytest.mark.parametrize("elastic", [False, True])
-@pytest.mark.parametrize("sensor", ["gelsight-mini", "digit"])
-def test_no_simulated_depth_map_raises_a_doubt(sensor, elastic):
-    sensor, told = Sensor.load(sensor), []
+def test_no_simulated_depth_map_raises_a_doubt(elastic):
+    warnings = []
     for part in ("elbow_pipe", "gear", "hex_nut"):  # whose contacts are the steepest
-        space = ContactSpace(load_mesh(part), sensor)
+        space = ContactSpace(load_mesh(part), MINI)
         for T in space.sample(3, np.random.default_rng(4), (0.3e-3, 1.5e-3))[0]:
-            depths_of(felt_height(space, T, elastic), part, sensor, told)
+            depths_of(felt_height(space, T, elastic), part, MINI, warnings)
     step = np.where(ROWS < 120, 1.5e-3, 0)  # a sharp edge, as steep as the pixels allow
-    depths_of(step, "step", MINI, told)
-    assert told == []
+    depths_of(step, "step", MINI, warnings)
+    assert warnings == []
 
 
 def test_a_real_depth_map_raises_none(data_folder):
     height, pitch = read_scan(data_folder / "gelsight_groove_scan" / "heightmap.tmd")
-    sensor, told = Sensor("bench", height.shape[::-1], pitch, 0.0, 1e-3), []
-    depths_of(height - height.min(), "scan", sensor, told)
-    assert told == []
+    sensor, warnings = Sensor("bench", height.shape[::-1], pitch, 0.0, 1e-3), []
+    depths_of(height - height.min(), "scan", sensor, warnings)
+    assert warnings == []

@@ -50,7 +50,7 @@ def test_a_palette_of_two_colours_is_a_mask(tmp_path, suffix, mask, colours, bac
         assert seen.kind == "mask" and seen.warnings == [] and np.array_equal(seen.contact.mask, mask)
 
 
-@pytest.mark.parametrize("colour", [(255, 0, 0), (0, 1, 0), (200, 200, 255)])
+@pytest.mark.parametrize("colour", [(255, 0, 0), (0, 128, 0), (200, 200, 255)])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64, np.float32])
 def test_black_and_one_colour_is_a_mask(colour, dtype):
     image = np.where(MASK[..., None], colour, 0).astype(dtype)
@@ -78,6 +78,13 @@ def test_other_drawings_are_refused(image, given):
         with pytest.raises(ImageError, match=message):
             read_observation(image.astype(np.uint8), MINI, kind=kind)
     assert read_observation(np.where(MASK, 200, 50).astype(np.uint8), MINI, kind="reading").kind == "reading"
+
+
+def test_the_noise_of_a_camera_without_light_is_no_drawing(rng):
+    dark = rng.integers(0, 2, (240, 320, 3), np.uint8)
+    dark[..., 2] = 0
+    seen = read_observation(dark, MINI)
+    assert seen.kind == "reading" and any("black in 100 % of its pixels" in warning for warning in seen.warnings)
 
 
 def test_a_mask_is_0_where_nothing_touches():
@@ -168,7 +175,7 @@ def test_a_video_of_masks_is_cut_at_half(tmp_path, suffix, codec):
     for frame, mask in zip(frames, masks, strict=True):
         seen = read_observation(frame.image, MINI, kind="mask")
         assert seen.warnings == [] and (seen.contact.mask != mask).sum() <= 0.01 * MASK.sum()
-    # an array in Python, whose origin is not known
+    # an array in Python, of whatever origin
     colours = next(iter(all_frames(str(path)))).image
     seen = read_observation(colours, MINI, kind="mask")
     assert (seen.contact.mask != MASK).sum() <= 0.01 * MASK.sum() and "what is over half counts" in seen.warnings[0]

@@ -70,7 +70,7 @@ def test_counters_and_dates_sort_as_they_count(names):
         (["1", "2", "background"], "2.png and background.png differ by more than their numbers"),
     ],
 )
-def test_what_names_leave_open_is_told(names, why):
+def test_names_that_leave_the_order_open_bring_a_warning(names, why):
     taken, said = ordered(names)
     assert taken == names
     assert said == (

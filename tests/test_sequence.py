@@ -464,16 +464,19 @@ def test_track_writes_a_page_that_plays_the_sequence(command, folder):
         assert frame["image"] is not None
 
 
-def test_track_reads_a_video(command, tmp_path, creeping):
+@pytest.mark.parametrize("codec", ["FFV1", "MJPG"])
+def test_track_reads_a_video(command, tmp_path, creeping, codec):
+    """Whether it keeps the masks or smears them: then what is over half counts."""
     import cv2
 
     masks = creeping[0][0].masks[:3]
-    writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"FFV1"), 25.0, masks[0].shape[::-1])
+    writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*codec), 25.0, masks[0].shape[::-1])
     for mask in masks:
         writer.write(np.repeat(255 * mask[..., None].astype(np.uint8), 3, -1))
     writer.release()
-    lines = command("v.avi", "--kind", "mask", "--tum", "v.txt").stdout.splitlines()
-    assert [json.loads(line)["frame"] for line in lines] == [1, 2, 3]
+    lines = [json.loads(line) for line in command("v.avi", "--kind", "mask", "--tum", "v.txt").stdout.splitlines()]
+    assert [line["frame"] for line in lines] == [1, 2, 3] and all(line["contact"] for line in lines)
+    assert not any("counts as contact" in warning for line in lines for warning in line["warnings"])
     np.testing.assert_allclose(np.loadtxt(tmp_path / "v.txt")[:, 0], [0, 0.04, 0.08], atol=1e-3)
 
 

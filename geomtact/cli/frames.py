@@ -40,7 +40,8 @@ def all_frames(source: str, follow: bool = False, sensor: str | None = None, mas
     """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
 
     ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`; ``masks`` says that a video is of
-    contact masks: what is over half bright in it counts as contact. Names of images that do not settle their order are told of.
+    contact masks: what is over half bright in it counts as contact. Names that leave the order of a folder's images open bring a
+    warning.
 
     Raises
     ------

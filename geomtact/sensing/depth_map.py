@@ -79,7 +79,7 @@ def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str
 
 def _units(highest: float, sensor: Sensor) -> str:
     """How to make metres of heights up to ``highest``, of the units in which that is a touch; of all, where it is in none."""
-    units = {"millimetres": 1e-3, "micrometres": 1e-6, "pixels, as gs_sdk gives them": sensor.pixel_pitch[0]}
+    units = {"millimetres": 1e-3, "micrometres": 1e-6, "pixels (of gs_sdk)": sensor.pixel_pitch[0]}
     most = sensor.max_penetration
     likely = {unit: to for unit, to in units.items() if _SHALLOWEST * most <= highest * to <= _DEEPEST * most}
     return "multiply " + ", or ".join(f"{unit} by {to:.4g}" for unit, to in (likely or units).items())

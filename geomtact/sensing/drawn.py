@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from geomtact.errors import ImageError
 
 _SEEN = 16  # colours that a camera's image has at least; of 178 in colour the poorest has 1043
+_UNLIT = 5  # up to which a camera counts without light
 _EVERY = 16  # px between those looked at first
 # grey values near black and near white, and the share of an image that is either
 _DARK, _BRIGHT, _CLEAR = 32, 223, 0.95
@@ -31,8 +32,12 @@ def without_two_colours(array: NDArray[Any], name: str) -> NDArray[Any]:
     ImageError
         It is drawn in other colours than two, or in two of which none is black; or (H, W) in two whole numbers, none of them 0.
     """
+    if array.ndim == 2 and array.min() == 0:
+        return array
+    if array.ndim == 3 and array.dtype == np.uint8 and array.max() <= _UNLIT:
+        return array
     colours = _few_colours(array)
-    if colours is None or (array.ndim == 2 and (len(colours) != 2 or not colours.all())):
+    if colours is None or (array.ndim == 2 and len(colours) != 2):
         return array
     if len(colours) == 2 and not colours.any(1).all():
         return np.asarray(array.any(-1))
