@@ -16,7 +16,7 @@ SUPPORTED = "give a PNG, JPEG, BMP, TIFF or .npy file"
 # of TIFF: compressions that tifffile decodes by itself (none, deflate, PackBits, LZMA), the predictor that it does not (of
 # floats), and photometric interpretations
 _OWN_COMPRESSIONS, _FLOATS = (1, 8, 32946, 32773, 34925), 3
-_ZERO_IS_WHITE, _ZERO_IS_BLACK, _RGB, _PALETTE = range(4)
+_ZERO_IS_WHITE, _PALETTE = 0, 3
 _MODES = ("1", "L", "I", "F", "I;16", "I;16B", "LA", "RGB", "RGBA")  # of Pillow, whose pixels are what they say
 
 
