@@ -59,7 +59,10 @@ def read_gltf(path: Path) -> tuple[Array, NDArray[np.int64]]:
     if not sum(map(len, faces)):
         what = "only points or lines" if data.content.get("meshes") else "nothing"
         raise MeshError(f"{path}: expected a surface of triangles, found {what}; export the mesh with its faces")
-    return np.concatenate([vertices for vertices, _ in pieces]), np.concatenate(faces)
+    vertices, triangles = np.concatenate([vertices for vertices, _ in pieces]), np.concatenate(faces)
+    if not np.isfinite(vertices[triangles]).all():
+        raise MeshError(f"{path}: vertices hold NaN or infinity; export the mesh again")
+    return vertices, triangles
 
 
 def _check(content: Mapping[str, Any]) -> None:

@@ -27,6 +27,7 @@ class Mesh:
     unit : unit of the file it came from
     path : the file, if any
     symmetry : the object's rotation symmetry; None means not looked for yet (see :meth:`with_symmetry`)
+    warnings : what was assumed in reading the file, one line each; they come with every posterior
     """
 
     vertices: Array
@@ -35,6 +36,7 @@ class Mesh:
     unit: str
     path: Path | None = None
     symmetry: Symmetry | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype="<f8", order="C")

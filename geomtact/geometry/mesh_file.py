@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
-import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +13,10 @@ from numpy.typing import NDArray
 from geomtact.errors import MeshError, did_you_mean, nearest_name
 from geomtact.files import printable
 from geomtact.geometry.catalogue import catalogue
+from geomtact.geometry.folds import folded_faces
 from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.polygon_file import read_triangles
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.geometry.units import METRE_FORMATS, UNITS, stated_unit, unit_comment
 from geomtact.se3 import Array
@@ -26,6 +26,10 @@ FORMATS = UNITLESS_FORMATS + METRE_FORMATS
 PREPARED = (".step", ".stp", ".3mf")  # that tools/prep_mesh.py makes meshes of
 _REEXPORT = "; if its numbers are {unit}, re-export it in metres, or save it as STL or PLY and give --unit {unit}"
 
+_FLAT = 5e-5  # m: by which tools/prep_mesh.py lets a surface move, too
+# m2, and share of the surface: from which folds are refused. Touches have 1 mm2 of contact at least; of all real meshes at
+# hand the most is 0.2 mm2, a share of 3e-5, on a scanned marker.
+_FOLDED, _FOLDED_SHARE = 1e-6, 1e-3
 # Beyond these no tactile sensor is meant; they also keep squares and cubes of lengths far from overflow.
 _SMALLEST, _LARGEST = 1e-4, 1e3
 
@@ -61,17 +65,18 @@ def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _Se
     Raises
     ------
     MeshError
-        Unknown name, no or contradicting unit, unreadable, cut short, empty, not closed, inside out, or of an impossible size;
-        or the name of a sensor in place of one.
+        Unknown name, no or contradicting unit, unreadable, cut short, empty, a face that crosses itself, not closed, inside out,
+        folded back onto itself, or of an impossible size; or the name of a sensor in place of one.
     """
     if isinstance(source, Mesh):
         mesh = source
     else:
         name, path, unit, symmetry = _resolve(source, unit)
-        raw_vertices, raw_faces = _read(path)
+        raw_vertices, raw_faces, warnings = _read_triangles(path, unit)
         vertices, faces = _tidy(raw_vertices * UNITS[unit], raw_faces, path, unit)
         _check_closed(vertices, faces, path)
-        mesh = Mesh(vertices, faces, name, unit, path, symmetry)
+        warnings += _check_folds(vertices, faces, path)
+        mesh = Mesh(vertices, faces, name, unit, path, symmetry, warnings)
     if isinstance(sensor, str | os.PathLike):
         raise MeshError(f"sensor: expected a geomtact.Sensor, got {str(sensor)!r}; give geomtact.Sensor.load of it")
     if sensor is not None:
@@ -143,61 +148,20 @@ def _catalogue_name(text: str) -> str | None:
     return text if text in parts else next((n for n, e in parts.items() if e.file == Path(text).resolve()), None)
 
 
-def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (V, 3) in the file's unit and triangles (F, 3); a scene's bodies are placed and concatenated."""
-    if path.stat().st_size == 0:
-        raise MeshError(f"{path}: the file is empty (0 bytes); export the mesh again")
-    vertices, faces = read_gltf(path) if path.suffix.lower() in METRE_FORMATS else _read_unitless(path)
-    if not np.isfinite(vertices[faces[(faces >= 0) & (faces < len(vertices))]]).all():
-        raise MeshError(f"{path}: vertices hold NaN or infinity; export the mesh again")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError(f"{path}: a face names a vertex that is not there (of {len(vertices)}); export the mesh again")
-    return vertices, faces
-
-
-def load_scene(path: Path, **options: Any) -> Any:
-    """A file as trimesh reads it, ``options`` its reader's: without materials, whatever its name, and with no log shown.
-
-    Users who set logging up see what trimesh logs.
-    """
-    import trimesh
-
-    log = logging.getLogger("trimesh")
-    if not log.handlers:  # Python writes to standard error what finds no handler
-        log.addHandler(logging.NullHandler())
-    # process=False: trimesh would merge, drop and reorder by rules of its own.
-    same: dict[str, Any] = {"file_type": path.suffix[1:].lower(), "process": False, "skip_materials": True}
-    return trimesh.load_scene(io.BytesIO(path.read_bytes()), **same, **options)
-
-
-def _read_unitless(path: Path) -> tuple[Array, NDArray[np.int64]]:
-    try:
-        scene = load_scene(path)
-        mesh = scene.to_mesh()
-        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
-        if vertices.shape[1] != 3:
-            raise ValueError(f"vertices of {vertices.shape[1]} numbers")
-    except Exception as error:  # noqa: BLE001 -- a parser fails on bad bytes in more ways than can be listed
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise MeshError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); export the mesh again") from None
-    if len(faces) == 0:
-        if cut := _cut_short(path):
-            raise MeshError(f"{path}: {cut}; copy or export it again")
-        what = "only points or lines" if scene.geometry else "nothing"
-        raise MeshError(f"{path}: expected a surface of triangles, found {what}; export the mesh with its faces")
-    return vertices, faces
-
-
-def _cut_short(path: Path) -> str:
-    """How much a binary STL file lacks of the triangles that it says it holds, "" where it is whole or none."""
-    with open(path, "rb") as file:
-        head = file.read(84)
-    if path.suffix.lower() != ".stl" or len(head) < 84:
-        return ""
-    wanted, size = 84 + 50 * int.from_bytes(head[80:], "little"), path.stat().st_size
-    if size >= wanted or head.lstrip().lower().startswith(b"solid"):  # of which text begins
-        return ""
-    return f"is cut short: expected {wanted:,} bytes for the triangles that it says it holds, found {size:,}"
+def _read_triangles(path: Path, unit: str) -> tuple[Array, NDArray[np.int64], tuple[str, ...]]:
+    """Vertices (V, 3) in the file's unit, triangles (F, 3), and what was assumed."""
+    if path.suffix.lower() in METRE_FORMATS:
+        return *read_gltf(path), ()
+    polygons, faces, _ = read_triangles(path)
+    warnings = tuple(f"{path.name}: {text}" for text in polygons.warnings)
+    bent = UNITS[unit] * polygons.thickness()
+    count = int((bent > _FLAT).sum())
+    if count:
+        warnings += (
+            f"{path.name}: {count} of {len(bent)} faces are not flat, by up to {_mm(bent.max())}, and what lies between their "
+            "corners is not certain; cut them into triangles in the program that made them",
+        )
+    return polygons.vertices, faces, warnings
 
 
 def _tidy(vertices: Array, faces: NDArray, path: Path, unit: str) -> tuple[Array, NDArray[np.int32]]:
@@ -278,6 +242,25 @@ def _check_closed(vertices: Array, faces: NDArray[np.int32], path: Path) -> None
     size = np.linalg.norm(high - low, axis=1).max()
     if volume.sum() < 1e-6 * size**3:
         raise MeshError(f"{path}: the surface encloses no volume; give a solid part")
+
+
+def _check_folds(vertices: Array, faces: NDArray[np.int32], path: Path) -> tuple[str, ...]:
+    """Refuse a surface that is folded back onto itself where a sensor would feel it; of less, a warning."""
+    folded = folded_faces(vertices, faces)
+    if not len(folded):
+        return ()
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area, where = areas[folded].sum(), vertices[faces[folded[areas[folded].argmax()]]].mean(0)
+    said = (
+        f"faces of {1e6 * area:.3g} mm2 are folded back onto their neighbours in one plane, one about "
+        f"({', '.join(f'{1e3 * x:.4g}' for x in where)}) mm, as a fan of triangles does that stands for a polygon"
+    )
+    if area > min(_FOLDED_SHARE * areas.sum(), _FOLDED):
+        raise MeshError(
+            f"{path}: {said}; export it with its polygons (OBJ, PLY, OFF), or mend it there in a mesh editor"
+        )
+    return (f"{path.name}: {said}",)
 
 
 def _bounds(vertices: Array, body: NDArray, count: int, pick: Callable) -> Array:

@@ -197,7 +197,7 @@ class Localizer:
         settings = self._settings(effort, seed)
         with _timed(timing, "read"):
             observation = read_observation(image, self.sensor, kind, background)
-        contact, above, warnings = observation.contact, 0.0, list(observation.warnings)
+        contact, above, warnings = observation.contact, 0.0, [*self.mesh.warnings, *observation.warnings]
         mask: Shown = contact.shown
         if contact.height is not None and contact.height[contact.mask].any():
             # a contour line of the gel where it surely lies on the object, which reaches below it by as much

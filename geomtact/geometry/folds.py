@@ -1,0 +1,72 @@
+"""Faces that are folded back onto their neighbours in one plane, as a fan makes of a polygon that is not convex."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.se3 import Array
+
+# Of the farthest coordinate, by which corners may lie beside a common plane: a few last digits of text of six digits
+_ROUNDING = 1e-5
+
+
+def folded_faces(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.intp]:
+    """The smaller face (n,) of each two that lie in one plane on the same side of an edge they share, and look opposite ways.
+
+    Edges of more than two faces are where bodies touch: nothing is a fold there. Faces without width are looked across.
+
+    Parameters
+    ----------
+    vertices : (V, 3)
+    faces : (F, 3) indices into vertices, wound alike
+    """
+    corners = vertices[faces]
+    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double = np.linalg.norm(crosses, axis=1)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+    rounding = _ROUNDING * float(np.abs(vertices).max())
+    has_width = double > longest * max(rounding, 1e-300)
+    normals = crosses / np.where(double > 0, double, 1)[:, None]
+    one, two = _neighbours(faces, has_width)
+    opposite = np.einsum("ij,ij->i", normals[one], normals[two]) < 0
+    one, two = one[opposite], two[opposite]
+    # both in both planes: the larger one's corners decide
+    apart = [
+        np.abs(np.einsum("ikj,ij->ik", corners[b] - corners[a][:, :1], normals[a])).max(1)
+        for a, b in ((one, two), (two, one))
+    ]
+    smaller = np.where(double[one] < double[two], one, two)
+    return np.unique(smaller[np.maximum(*apart) <= rounding])
+
+
+def _neighbours(faces: NDArray[np.integer], has_width: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pairs (n,), (n,) of faces with width that share an edge of two faces, or that both meet a face without width there."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(faces)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    order = np.lexsort(edges.T)
+    edges, owner = edges[order], order % n
+    first = np.concatenate([[True], (edges[1:] != edges[:-1]).any(1)])
+    start = np.flatnonzero(first)
+    pairs = start[np.diff(np.append(start, len(edges))) == 2]
+    one, two = owner[pairs], owner[pairs + 1]
+    both = has_width[one] & has_width[two]
+    # slivers that meet are one, and whatever meets them is paired
+    thin = ~has_width[one] | ~has_width[two]
+    slivers = ~has_width[one] & ~has_width[two]
+    _, piece = connected_components(
+        coo_array((np.ones(slivers.sum()), (one[slivers], two[slivers])), shape=(n, n)), directed=False
+    )
+    met = np.concatenate(
+        [np.stack([one, two], 1)[thin & has_width[one]], np.stack([two, one], 1)[thin & has_width[two]]]
+    )
+    met = np.stack([met[:, 0], piece[met[:, 1]]], axis=1)
+    met = met[np.argsort(met[:, 1], kind="stable")]
+    across = [(one[both], two[both])]
+    for step in range(1, int(np.bincount(met[:, 1]).max(initial=1))):
+        same = met[step:, 1] == met[:-step, 1]
+        across.append((met[:-step, 0][same], met[step:, 0][same]))
+    return np.concatenate([a for a, _ in across]), np.concatenate([b for _, b in across])
