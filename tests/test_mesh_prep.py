@@ -339,7 +339,7 @@ def test_a_curved_step_file_is_localized_within_its_tessellation(few_touches, tm
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "mm", "only points or lines|found nothing"),
         ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "NaN"),
         ("a.obj", b"v 0 0 3e38\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "beyond 1e9"),
-        ("a.ply", b"ply\nformat", "mm", "cannot be read as .ply"),
+        ("a.ply", b"ply\nformat", "mm", "expected a header from ply to end_header"),
         ("a.stl", b"x", "mmm", "unknown unit 'mmm'; give --unit, one of mm, cm, m, inch"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", None, "does not state its unit; give --unit"),
         ("a.obj", b"v 0 0 0\nv 10 0 0\nv 0 10 0\nf 1 2 3\n", "auto", "likely: 14.1 mm across in mm.*Give --unit"),

@@ -233,7 +233,8 @@ def _names(files: Sequence[Path]) -> list[str]:
 def _said(result: dict[str, Any]) -> str:
     if result["outcome"] == "refused":
         return f"refused: {result['reason']}"
-    changes = "; ".join(f"{step}: {words}" for step, words in result["changes"].items())
+    told = [f"{step}: {words}" for step, words in result["changes"].items()]
+    changes = "; ".join(told + [f"warning: {words}" for words in result["warnings"]])
     return f"{result['outcome']}, in {result['unit']}{': ' if changes else ''}{changes}"
 
 

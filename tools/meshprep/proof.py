@@ -10,6 +10,7 @@ import pymeshlab
 import trimesh
 
 from geomtact.geometry.mesh import Mesh
+from meshprep import polygons
 from meshprep.repair import Work
 from meshprep.surface import Array, Surface
 
@@ -44,9 +45,9 @@ class Proof:
 
 
 def prove(before: Surface, work: Work) -> Proof:
-    """How ``work.surface`` differs from ``before``."""
-    after = work.surface
-    ours, theirs = _points(after), _points(_without(before, work.dropped))
+    """How ``work.surface`` differs from ``before``, and from the polygons of the file where ``before`` has them."""
+    after = Surface(work.surface.vertices, work.surface.faces)  # as it is written: triangles
+    ours, theirs = _points(after), _left_of(_points(before), work.dropped, before.size)
     off = _distance(before, ours)
     patches = Surface(work.patches.reshape(-1, 3), np.arange(3 * len(work.patches)).reshape(-1, 3))
     filled = _distance(patches, ours) < 1e-6 * after.size if len(work.patches) else np.zeros(len(ours), bool)
@@ -88,24 +89,29 @@ def is_solid(path: Path) -> str | None:
 
 
 def _points(surface: Surface) -> Array:
-    """Corners, the middles of faces, and points spread evenly (n, 3)."""
+    """Corners, the middles of faces, and points spread evenly (n, 3); of the polygons where there are some."""
+    if _has_polygons(surface):
+        return polygons.points_on(surface.polygons, SAMPLES)
     spread = Mesh(surface.vertices, surface.faces, "", "").surface_points(SAMPLES)
     return np.concatenate([surface.corners.reshape(-1, 3), surface.corners[surface.areas > 0].mean(1), spread])
 
 
-def _without(before: Surface, dropped: list[Surface]) -> Surface:
-    """``before`` without the faces that were dropped on purpose."""
-    if not dropped:
-        return before
-    corners = np.concatenate([surface.corners.reshape(-1, 3) for surface in dropped])
-    gone = Surface(corners, np.arange(len(corners)).reshape(-1, 3))
-    near = _distance(gone, before.corners.mean(1))
-    kept = before.faces[near > 1e-6 * before.size]
-    return before.with_faces(kept) if len(kept) else before
+def _has_polygons(surface: Surface) -> bool:
+    return surface.polygons is not None and int(surface.polygons.sizes.max()) > 3
+
+
+def _left_of(points: Array, dropped: list[Surface], size: float) -> Array:
+    """``points`` (n, 3) without those of bodies that were dropped on purpose."""
+    for body in dropped:
+        points = points[_distance(body, points) > 1e-6 * size]
+    return points
 
 
 def _distance(surface: Surface, points: Array) -> Array:
-    """Distance (n,) of ``points`` (n, 3) from ``surface``, by pymeshlab, in double precision: exact on long thin faces too."""
+    """Distance (n,) of ``points`` (n, 3) from ``surface``: from the polygons where there are some, else by pymeshlab, in double
+    precision: exact on long thin faces too."""
+    if _has_polygons(surface):
+        return polygons.distance(surface, points)
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(points - surface.middle))
     meshes.add_mesh(pymeshlab.Mesh(surface.vertices - surface.middle, surface.faces))

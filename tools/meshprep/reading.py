@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from geomtact.errors import MeshError
 from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh_file import FORMATS as READ
-from geomtact.geometry.mesh_file import PREPARED, load_scene
+from geomtact.geometry.mesh_file import PREPARED
+from geomtact.geometry.polygon_file import READERS, read_triangles
 from geomtact.geometry.units import METRE_FORMATS, UNITS, stated_unit
 from geomtact.sensing.sensor import Sensor
 from meshprep import Refused
-from meshprep.surface import Array, Surface
+from meshprep.surface import Array, Faces, Surface
 
 STEP = (".step", ".stp")
 FORMATS = READ + PREPARED
@@ -59,17 +62,18 @@ def read(path: Path, unit: str | None, sensor: Sensor, of_several: bool = False)
             f"the file has {path.stat().st_size / 1e6:.0f} MB, more than {_LARGEST_FILE / 1e6:.0f}; export it coarser"
         )
     if suffix in METRE_FORMATS:
-        own, triangles = "m", read_gltf(path)
+        own, surface = "m", _joined(*read_gltf(path))
+    elif suffix in READERS:
+        own, surface = stated_unit(path), _polygons(path)
     else:
         scene = _scene(path)
-        own, triangles = _own_unit(path, scene), _triangles(scene)
+        own, surface = _own_unit(suffix, scene), _triangles(scene)
     if own is None and unit is None:
         raise Refused(
             f"the file does not state its unit; give --unit, one of {', '.join(UNITS)}, or auto for a proposal"
         )
     if own is not None and unit not in (None, "auto", own) and not of_several:
         raise Refused(f"the file says {own}, but --unit {unit} was given; leave the unit out")
-    surface = _surface(*triangles)
     if suffix in STEP:  # trimesh gives metres
         surface = Surface(1e3 * surface.vertices, surface.faces)
     if own is None and unit == "auto":
@@ -78,6 +82,8 @@ def read(path: Path, unit: str | None, sensor: Sensor, of_several: bool = False)
 
 
 def _scene(path: Path):
+    import trimesh
+
     options = {}
     if path.suffix.lower() in STEP:
         try:
@@ -86,7 +92,9 @@ def _scene(path: Path):
             raise Refused("STEP files need cascadio; install the extra with pip install 'geomtact[step]'") from None
         options = {"tol_linear": TESSELLATION, "tol_angular": 0.1}
     try:
-        return load_scene(path, **options)
+        # process=False: trimesh would merge, drop and reorder by rules of its own. From bytes: a name need not be UTF-8
+        same = {"file_type": path.suffix[1:].lower(), "process": False, "skip_materials": True}
+        return trimesh.load_scene(io.BytesIO(path.read_bytes()), **same, **options)
     except ImportError as error:
         raise Refused(
             f"reading {path.suffix} needs another package ({error}); install the extra 'geomtact[meshprep]'"
@@ -96,19 +104,17 @@ def _scene(path: Path):
         raise Refused(f"cannot be read as {path.suffix.lower()} ({reason}); export it again") from None
 
 
-def _own_unit(path: Path, scene) -> str | None:
-    """The unit that a file states. STEP files are read in millimetres, whatever they are drawn in."""
-    if path.suffix.lower() in STEP:
+def _own_unit(suffix: str, scene) -> str:
+    """The unit that a STEP or 3MF file states. STEP files are read in millimetres, whatever they are drawn in."""
+    if suffix in STEP:
         return "mm"
-    if path.suffix.lower() == ".3mf":
-        stated = str(scene.units or "millimeter").lower().removesuffix("s")
-        if stated not in _THREE_MF:
-            raise Refused(f"the file is in {stated}; export it in one of {', '.join(UNITS)}")
-        return _THREE_MF[stated]
-    return stated_unit(path)
+    stated = str(scene.units or "millimeter").lower().removesuffix("s")
+    if stated not in _THREE_MF:
+        raise Refused(f"the file is in {stated}; export it in one of {', '.join(UNITS)}")
+    return _THREE_MF[stated]
 
 
-def _triangles(scene) -> tuple[Array, NDArray[np.int64]]:
+def _triangles(scene) -> Surface:
     try:
         mesh = scene.to_mesh()
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
@@ -117,18 +123,21 @@ def _triangles(scene) -> tuple[Array, NDArray[np.int64]]:
     if not len(faces):
         what = "only points or lines" if scene.geometry else "nothing"
         raise Refused(f"expected a surface of triangles, found {what}; export the mesh with its faces")
-    return vertices, faces
-
-
-def _surface(vertices: Array, faces: NDArray[np.int64]) -> Surface:
-    """The triangles as a surface, if they are one.
-
-    Raises
-    ------
-    Refused
-    """
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise Refused(f"a face names a vertex that is not there (of {len(vertices)}); export the mesh again")
+    return _joined(vertices, faces)
+
+
+def _polygons(path: Path) -> Surface:
+    try:
+        polygons, faces, owner = read_triangles(path)
+    except MeshError as error:
+        raise Refused(str(error).removeprefix(f"{path}: ")) from None
+    return replace(_joined(polygons.vertices, faces), polygons=polygons, owner=owner)
+
+
+def _joined(vertices: Array, faces: Faces) -> Surface:
+    """The surface of triangles, in their order, whose coinciding vertices are one."""
     used = vertices[np.unique(faces)]
     if not np.isfinite(used).all() or np.abs(used).max() > 1e9:
         raise Refused("vertices hold NaN, infinity or numbers beyond 1e9; export the mesh again")

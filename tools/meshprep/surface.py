@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from geomtact.geometry.polygons import Polygons
+
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
@@ -23,10 +25,14 @@ class Surface:
     ----------
     vertices : (V, 3)
     faces : (F, 3) indices into vertices
+    polygons : the faces of the file as it holds them, if they were read; with vertices of their own
+    owner : (F,) which of the polygons each face is of
     """
 
     vertices: Array
     faces: Faces
+    polygons: Polygons | None = None
+    owner: Faces | None = None
 
     @cached_property
     def corners(self) -> Array:

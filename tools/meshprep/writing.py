@@ -62,6 +62,10 @@ def write(before: Surface, work: Work, name: str, unit: str, out: Path, options:
             write_ply(file, part, unit)
         meshes = [_checked(file, unit, options["symmetry_mm"]) for file in files]
         told |= {"symmetry": _symmetry(meshes[0]), "versions": versions()}
+        told["warnings"] = [
+            *(before.polygons.warnings if before.polygons else ()),
+            *(w for m in meshes for w in m.warnings),
+        ]
         contents = {file.name: file.read_bytes() for file in files}
         contents[f"{name}.png"] = draw(name, unit, before, work, proof, max(bound, 1e-6 * before.size))
         contents[f"{name}.json"] = json.dumps(plain(told), indent=1).encode()
