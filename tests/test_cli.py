@@ -12,7 +12,7 @@ import typer
 from PIL import Image
 from typer.testing import CliRunner
 
-from geomtact import se3
+from geomtact import load_mesh, se3
 from geomtact.cli import app, main, project
 from geomtact.cli.options import approach_from
 from geomtact.errors import CacheError, InputError, UsageError
@@ -198,6 +198,12 @@ def test_simulated_images_carry_their_part_and_sensor(touched):
             assert json.loads(image.text["geomtact:T_sensor_object"]) == truth["T_sensor_object"]
         se3.check_transforms(truth["T_sensor_object"])
         assert 0.3 <= truth["penetration_mm"] <= 1.5
+
+
+def test_what_was_assumed_in_reading_a_mesh_is_said(geomtact, tmp_path):
+    (tmp_path / "ball.stl").write_bytes(load_mesh("ball").path.read_bytes() + b"end")
+    done = geomtact("simulate", "ball.stl", "--unit", "mm", "--sensor", "digit", "--n", 1, "--out", tmp_path / "out")
+    assert "warning: ball.stl: 3 bytes after the last triangle are passed over" in done.stderr
 
 
 def test_simulate_is_repeatable_and_replays_a_pose(geomtact, touched, tmp_path):

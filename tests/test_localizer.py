@@ -67,6 +67,13 @@ def test_the_first_modes_predict_the_contact_that_is_seen(curved, flat_nut, ball
         assert first > 0.75 and best > 0.8
 
 
+def test_what_was_assumed_in_reading_the_mesh_comes_with_every_posterior(ball, a_touch):
+    mesh = replace(ball.mesh, warnings=("ball.stl: 37 bytes after the last triangle are passed over",))
+    doubtful = replace(ball, index=replace(ball.index, mesh=mesh))
+    for mask in (a_touch(ball)[1], np.zeros(ball.sensor.image_size_px[::-1], bool)):
+        assert doubtful.localize(mask).warnings[:1] == list(mesh.warnings)
+
+
 def test_the_same_seed_gives_the_same_result(localizer, a_touch):
     T, mask = a_touch(localizer)
     one, other = (localizer.localize(mask, seed=3) for _ in range(2))

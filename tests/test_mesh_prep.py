@@ -5,6 +5,7 @@ import json
 import sys
 import tomllib
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from geomtact import Localizer, Sensor, load_mesh, se3
 from geomtact.errors import MeshError
 from geomtact.geometry import catalogue as catalogues
 from geomtact.geometry.distance import PoseDistance
+from geomtact.geometry.polygons import Polygons
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -26,9 +28,11 @@ sys.path.insert(0, str(ROOT / "tools"))
 import prep_mesh  # noqa: E402
 from meshprep import Refused  # noqa: E402
 from meshprep.adding import add  # noqa: E402
+from meshprep.polygons import distance, points_on  # noqa: E402
+from meshprep.proof import _distance as distances_from  # noqa: E402
 from meshprep.proof import distances, prove  # noqa: E402
 from meshprep.reading import TESSELLATION, read  # noqa: E402
-from meshprep.repair import STEPS, Options, repair  # noqa: E402
+from meshprep.repair import STEPS, Options, Work, repair  # noqa: E402
 from meshprep.surface import Surface  # noqa: E402
 from meshprep.writing import write_ply  # noqa: E402
 from step_files import cylinder_step, solid_step  # noqa: E402
@@ -268,8 +272,6 @@ def test_a_mesh_of_too_many_faces_is_made_coarser_within_the_bound():
 
 
 def test_a_surface_that_moved_is_measured_both_ways():
-    from meshprep.repair import Work
-
     box = as_surface(BOX)
     moved = Surface(box.vertices + [0.0, 0.0, 0.3], box.faces)
     proof = prove(box, Work(moved))
@@ -349,6 +351,67 @@ def test_what_cannot_be_read_is_said(name, content, unit, words, tmp_path):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(Refused, match=words):
         read(tmp_path / name, unit, Sensor.load("gelslim"))
+
+
+L_SHAPE = np.array([(0, 0), (30, 0), (30, 8), (8, 8), (8, 20), (0, 20)], float)
+
+
+def prism_obj(first):
+    """OBJ text of an L-shaped prism whose caps, of six corners each, begin at one of them."""
+    corners = [f"v {x:g} {y:g} {z}" for z in (0, 6) for x, y in L_SHAPE]
+    order = np.roll(np.arange(6), -first)
+    faces = [order[::-1], order + 6] + [[k, (k + 1) % 6, (k + 1) % 6 + 6, k + 6] for k in range(6)]
+    return "\n".join([*corners, *("f " + " ".join(str(k + 1) for k in face) for face in faces)])
+
+
+@pytest.mark.parametrize("first", range(6))
+def test_the_proof_rests_on_the_polygons_of_the_file(first, tmp_path, monkeypatch):
+    (tmp_path / "l.obj").write_text(prism_obj(first))
+    before, _ = read(tmp_path / "l.obj", "mm", Sensor.load("gelslim"))
+    proof = prove(before, repair(before, options(before)))
+    assert before.area == pytest.approx(1272) and proof.largest < 1e-9 and proof.new == 0
+
+    def fans(self):
+        rings = [self.corners[start : start + n] for start, n in zip(self.starts, self.sizes, strict=True)]
+        faces = [(ring[0], ring[k], ring[k + 1]) for ring in rings for k in range(1, len(ring) - 1)]
+        return np.array(faces), np.repeat(np.arange(len(rings)), self.sizes - 2)
+
+    # read as another program reads it, it is found out wherever a fan leaves the polygon
+    monkeypatch.setattr(Polygons, "triangles", fans)
+    wrong, _ = read(tmp_path / "l.obj", "mm", Sensor.load("gelslim"))
+    assert (prove(wrong, Work(wrong)).largest > 1) == (wrong.area > 1300)
+
+
+def test_points_on_polygons_are_spread_evenly_and_measured_exactly(rng, tmp_path):
+    (tmp_path / "l.obj").write_text(prism_obj(2))
+    surface, _ = read(tmp_path / "l.obj", "mm", Sensor.load("gelslim"))
+    turn = se3.exp([0.4, -1.1, 0.3, 0, 0, 0])[:3, :3]
+    turned = replace(surface.polygons, vertices=surface.polygons.vertices @ turn.T)
+    points = (points_on(turned, 100_000) @ turn)[len(turned.corners) :]
+    caps = points[np.minimum(abs(points[:, 2]), abs(points[:, 2] - 6)) < 1e-9]
+    assert len(points) == pytest.approx(100_000, rel=0.01)
+    assert len(caps) / len(points) == pytest.approx(672 / 1272, rel=0.02)
+    assert ((caps[:, 0] <= 8) | (caps[:, 1] <= 8)).all()
+    assert (caps[:, 1] > 8).mean() == pytest.approx(96 / 336, rel=0.03)
+    some = rng.uniform(-5, 35, (500, 3))
+    assert distance(surface, some) == pytest.approx(
+        distances_from(Surface(surface.vertices, surface.faces), some), abs=1e-5
+    )
+
+
+def test_a_file_of_folded_triangles_is_refused_and_a_warning_is_told(command, tmp_path):
+    ring = [(x, y, z) for z in (0.0, 6.0) for x, y in L_SHAPE]
+    faces = [(0, k + 1, k) for k in range(1, 5)] + [(6, 6 + k, 7 + k) for k in range(1, 5)]
+    faces = [tuple((c + 1) % 6 + 6 * (c // 6) for c in face) for face in faces]
+    faces += [f for k in range(6) for f in ((k, (k + 1) % 6, (k + 1) % 6 + 6), (k, (k + 1) % 6 + 6, k + 6))]
+    trimesh.Trimesh(ring, faces, process=False).export(tmp_path / "fan.stl")
+    BOX.export(tmp_path / "box.stl")
+    with open(tmp_path / "box.stl", "ab") as file:
+        file.write(b"end")
+    done = command(tmp_path / "fan.stl", tmp_path / "box.stl", "--unit", "mm", "--out", tmp_path / "out", "--json")
+    fan, box = json.loads(done.stdout)["meshes"]
+    assert fan["outcome"] == "refused" and "folded back onto their neighbours" in fan["reason"], fan
+    assert box["warnings"] == ["3 bytes after the last triangle are passed over"]
 
 
 def test_a_unit_that_contradicts_the_file_is_refused(tmp_path):

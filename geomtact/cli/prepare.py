@@ -52,6 +52,8 @@ def prepare(
         _prepare_all(objects, values, sources, scorer, max_poses, cache_dir, jobs, ray)
     else:
         localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, approach=sides, given="OBJECT")
+        for warning in localizer.mesh.warnings:
+            tell(f"warning: {warning}")
         typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
 
 

@@ -68,6 +68,8 @@ def simulate(
     sensor_named = require(values, "sensor", bundled_sensors(), "a TOML file")
     pressed = Sensor.load(sensor_named)
     mesh = load_mesh(named, values["unit"], sensor=pressed)
+    for warning in mesh.warnings:
+        tell(f"warning: {warning}")
     space = ContactSpace(mesh, pressed)
     elastic = elastic or reading
     strength = {NoiseName.none: noises.CLEAN, NoiseName.moderate: noises.MODERATE, NoiseName.heavy: noises.HEAVY}[noise]

@@ -12,7 +12,7 @@ from geomtact.geometry.polygons import Polygons
 from geomtact.se3 import Array
 
 _HEAD, _EACH = 84, 50  # bytes of the header with the count, and of each triangle
-_SOLID = re.compile(rb"^[ \t]*(end)?solid\b.*$", re.MULTILINE)  # its first line, and its last
+_SOLID = re.compile(rb"^[ \t]*(end[ \t]*)?solid\b.*$", re.MULTILINE)  # its first line, and its last
 
 
 def read_stl(data: bytes) -> Polygons:
@@ -27,7 +27,7 @@ def read_stl(data: bytes) -> Polygons:
         close a surface.
     """
     binary = len(data) >= _HEAD and len(data) == _HEAD + _EACH * int.from_bytes(data[80:_HEAD], "little")
-    text = data.removeprefix(b"\xef\xbb\xbf").lstrip()
+    text = data.removeprefix(b"\xef\xbb\xbf").lstrip().rstrip(b"\0")
     if not binary and text[:5].lower() == b"solid" and b"\0" not in text:
         return _of_text(text)
     if len(data) < _HEAD:
