@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from geomtact.se3 import Array
 
-# Of the farthest coordinate, by which corners may lie beside a common plane: a few last digits of text of six digits
-_ROUNDING = 1e-5
+# By how much corners may lie beside a common plane: of the size the last of six digits, as text is written with, and of the
+# farthest coordinate a few times what single precision rounds away
+_OF_SIZE, _OF_REACH = 1e-5, 2.5e-7
 
 
 def folded_faces(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.intp]:
@@ -25,7 +26,7 @@ def folded_faces(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.intp
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double = np.linalg.norm(crosses, axis=1)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
-    rounding = _ROUNDING * float(np.abs(vertices).max())
+    rounding = max(_OF_SIZE * float(np.ptp(vertices, axis=0).max()), _OF_REACH * float(np.abs(vertices).max()))
     has_width = double > longest * max(rounding, 1e-300)
     normals = crosses / np.where(double > 0, double, 1)[:, None]
     one, two = _neighbours(faces, has_width)

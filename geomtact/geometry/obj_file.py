@@ -52,9 +52,9 @@ def read_obj(data: bytes) -> Polygons:
     named = ", ".join(sorted(curves))
     if curves and not faces:
         raise MeshError(f"holds free-form curves or surfaces ({named}), which are not read; export it as polygons")
-    told = (f"free-form curves or surfaces ({named}) are left out: polygons alone are read",) if curves else ()
-    some = Polygons.of(np.array(vertices), faces, told)
-    return Polygons(some.vertices, some.corners - 1, some.sizes, told)
+    warnings = (f"free-form curves or surfaces ({named}) are left out: polygons alone are read",) if curves else ()
+    some = Polygons.of(np.array(vertices), faces, warnings)
+    return Polygons(some.vertices, some.corners - 1, some.sizes, warnings)
 
 
 def _counted_from_one(face: list[int], before: int) -> list[int]:

@@ -57,5 +57,5 @@ def read_off(data: bytes) -> Polygons:
             f"cannot be read: expected {place} on each line, and some are not; export the mesh again"
         ) from None
     more = len(rows) - 1 - n - m
-    told = (f"{more} lines after the last face are passed over: the file says it holds {m} faces",) if more else ()
-    return Polygons.of(vertices, faces, told)
+    warnings = (f"{more} lines after the last face are passed over: the file says it holds {m} faces",) if more else ()
+    return Polygons.of(vertices, faces, warnings)

@@ -79,10 +79,10 @@ def read_ply(data: bytes) -> Polygons:
             polygons.append((corners, sizes) if element.name == "face" else _strips(corners, sizes))
     if at < len(body) and form == "ascii":
         raise MeshError("holds more numbers than its header says; export the mesh again")
-    told = (f"{len(body) - at} bytes after the last row are passed over",) if at < len(body) else ()
+    warnings = (f"{len(body) - at} bytes after the last row are passed over",) if at < len(body) else ()
     corners = np.concatenate([np.zeros(0, np.int64), *(corners for corners, _ in polygons)])
     sizes = np.concatenate([np.zeros(0, np.int64), *(sizes for _, sizes in polygons)])
-    return Polygons(vertices, corners, sizes, told)
+    return Polygons(vertices, corners, sizes, warnings)
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:

@@ -83,9 +83,9 @@ def _of_text(text: bytes) -> Polygons:
     raise MeshError(f"is cut short: endsolid is missing after {facets} facets; copy or export it again")
 
 
-def _polygons(corners: Array, *told: str) -> Polygons:
+def _polygons(corners: Array, *warnings: str) -> Polygons:
     n = len(corners)
-    return Polygons(corners.reshape(-1, 3), np.arange(3 * n), np.full(n, 3), told)
+    return Polygons(corners.reshape(-1, 3), np.arange(3 * n), np.full(n, 3), warnings)
 
 
 def _is_closed(corners: Array) -> bool:
