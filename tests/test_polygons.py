@@ -334,6 +334,18 @@ def test_what_cannot_be_read_is_named(reader, data, words):
         reader(data)
 
 
+def test_numbers_out_of_any_range_are_refused_or_unused(tmp_path):
+    for far, used in ((1e200, True), (float("nan"), True), (1e50, False)):
+        vertices, faces = BOX
+        vertices = np.concatenate([vertices, [[far, 0, 0]]])
+        (tmp_path / "a.obj").write_bytes(as_obj(vertices, [*faces, [0, 1, 8]] if used else faces))
+        if used:
+            with pytest.raises(MeshError, match="NaN, infinity or numbers beyond 1e"):
+                load_mesh(tmp_path / "a.obj", "mm")
+        else:
+            assert 1e6 * load_mesh(tmp_path / "a.obj", "mm").areas.sum() == pytest.approx(376)
+
+
 def test_what_is_passed_over_is_said():
     assert "2 bytes after the last row" in read_ply(as_ply(*BOX, "binary_little_endian") + b"ab").warnings[0]
     assert "1 lines after the last face" in read_off(as_off(*BOX) + b"\n1 0").warnings[0]

@@ -170,10 +170,11 @@ def _tidy(vertices: Array, faces: NDArray, path: Path, unit: str) -> tuple[Array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    used = vertices[np.unique(faces)]
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used], faces.reshape(-1, 3)
     with np.errstate(over="ignore"):
-        size = float(np.linalg.norm(used.max(0) - used.min(0)))
-        reach = float(np.abs(used).max())
+        size = float(np.linalg.norm(vertices.max(0) - vertices.min(0)))
+        reach = float(np.abs(vertices).max())
     if not _SMALLEST <= size <= _LARGEST or reach > 1e3 * size:
         raise MeshError(
             f"{path}: {_mm(size)} across and up to {_mm(reach)} from the origin as read in {unit}, expected "

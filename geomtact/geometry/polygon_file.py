@@ -13,6 +13,7 @@ from geomtact.geometry.ply_file import read_ply
 from geomtact.geometry.polygons import Indices, Polygons
 from geomtact.geometry.stl_file import read_stl
 
+_LARGEST = 1e60  # whose squares of squares are numbers, too
 READERS = {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".off": read_off}
 
 
@@ -29,7 +30,8 @@ def read_polygons(path: Path) -> Polygons:
     if not data:
         raise MeshError(f"{path}: the file is empty (0 bytes); export the mesh again")
     try:
-        polygons = READERS[path.suffix.lower()](data)
+        with np.errstate(all="ignore"):  # what is no number is refused below
+            polygons = READERS[path.suffix.lower()](data)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from None
     except Exception as error:  # noqa: BLE001 -- bytes of no sense fail in more ways than can be listed
@@ -42,8 +44,8 @@ def read_polygons(path: Path) -> Polygons:
     if not len(faces.sizes):
         what = "only points or lines" if n else "nothing"
         raise MeshError(f"{path}: expected a surface of triangles, found {what}; export the mesh with its faces")
-    if not np.isfinite(faces.vertices[faces.corners]).all():
-        raise MeshError(f"{path}: vertices hold NaN or infinity; export the mesh again")
+    if not (np.abs(faces.vertices[faces.corners]) < _LARGEST).all():  # NaN is not, either
+        raise MeshError(f"{path}: vertices hold NaN, infinity or numbers beyond {_LARGEST:g}; export the mesh again")
     return faces
 
 
