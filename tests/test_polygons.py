@@ -495,4 +495,4 @@ def test_of_all_sound_meshes_one_scan_has_small_folds(data_folder):
             folded[path.name] = len(folds)
     assert set(folded) == {"040_large_marker.obj"}
     (warning,) = load_mesh(data_folder / "hsp_digit_sim_ycb" / "meshes" / "040_large_marker.obj", "m").warnings
-    assert "faces of 0.298 mm2 are folded back" in warning
+    assert "faces of 0.198 mm2 are folded back" in warning

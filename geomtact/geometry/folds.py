@@ -10,6 +10,9 @@ from geomtact.se3 import Array
 # By how much corners may lie beside a common plane: of the size the last of six digits, as text is written with, and of the
 # farthest coordinate a few times what single precision rounds away
 _OF_SIZE, _OF_REACH = 1e-5, 2.5e-7
+# Sine of the angle between folded faces: no blade is that sharp, and where boolean operations leave slivers of some
+# micrometres, their wedges are from 0.005 on
+_ANGLE = 1e-3
 
 
 def folded_faces(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.intp]:
@@ -30,7 +33,7 @@ def folded_faces(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.intp
     has_width = double > longest * max(rounding, 1e-300)
     normals = crosses / np.where(double > 0, double, 1)[:, None]
     one, two = _neighbours(faces, has_width)
-    opposite = np.einsum("ij,ij->i", normals[one], normals[two]) < 0
+    opposite = np.linalg.norm(normals[one] + normals[two], axis=1) < _ANGLE
     one, two = one[opposite], two[opposite]
     # both in both planes: the larger one's corners decide
     apart = [

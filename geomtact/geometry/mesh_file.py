@@ -28,7 +28,7 @@ _REEXPORT = "; if its numbers are {unit}, re-export it in metres, or save it as 
 
 _FLAT = 5e-5  # m: by which tools/prep_mesh.py lets a surface move, too
 # m2, and share of the surface: from which folds are refused. Touches have 1 mm2 of contact at least; of all real meshes at
-# hand the most is 0.3 mm2, a share of 4e-5, on a scanned marker.
+# hand the most is 0.2 mm2, a share of 3e-5, on a scanned marker.
 _FOLDED, _FOLDED_SHARE = 1e-6, 1e-3
 # Beyond these no tactile sensor is meant; they also keep squares and cubes of lengths far from overflow.
 _SMALLEST, _LARGEST = 1e-4, 1e3
