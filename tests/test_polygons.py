@@ -397,6 +397,7 @@ WHOLE, TEXT = as_stl(BOX[0], BOX_TRIANGLES), as_stl_text(BOX[0], BOX_TRIANGLES)
         (WHOLE, None),
         (WHOLE + b"\0" * 37, "37 bytes after the last triangle are passed over"),
         (WHOLE + b"\0" * 100, "100 bytes after"),
+        (WHOLE + b"COLOR=" * 30, "180 bytes after"),
         (as_stl(*BOX[:1], BOX_TRIANGLES, 0), "says that it holds 0 triangles; all 12 that are there are read"),
         (as_stl(*BOX[:1], BOX_TRIANGLES, 5), "says that it holds 5 triangles; all 12"),
         (as_stl(*BOX[:1], BOX_TRIANGLES, 99), "says that it holds 99 triangles; the 12 that are there close a surface"),
@@ -429,6 +430,11 @@ def test_several_solids_of_text_are_one_mesh():
     [
         (WHOLE[:-50], "is cut short: expected 684 bytes .*, found 634"),
         (WHOLE[:-7], "is cut short"),
+        # two boxes, of which the header counts the first: both readings close
+        (
+            as_stl(np.concatenate([BOX[0], BOX[0] + 20]), np.concatenate([BOX_TRIANGLES, BOX_TRIANGLES + 8]), 12),
+            "for 24",
+        ),
         (as_stl(*BOX[:1], BOX_TRIANGLES[:-1], 5), "says that it holds 5 triangles, but is long enough for 11"),
         (TEXT[:-60], "is cut short: 1 of 12 facets are not ended"),
         (

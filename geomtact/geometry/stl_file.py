@@ -52,9 +52,12 @@ def _of_binary(data: bytes) -> Polygons:
         )
     if beyond == 0:
         return _polygons(corners)
-    if there == said or (said and _is_closed(corners[:said])):
+    more = corners[said:]
+    padding = bool((more == more[:, :1]).all())  # no bytes of a whole triangle, or triangles of no extent
+    short, whole = said > 0 and (padding or _is_closed(corners[:said])), not padding and _is_closed(corners)
+    if short and not whole:
         return _polygons(corners[:said], f"{beyond:,} bytes after the last triangle are passed over")
-    if _is_closed(corners) or (said == 0 and beyond % _EACH == 0):
+    if not short and (whole or (said == 0 and beyond % _EACH == 0)):
         return _polygons(corners, f"says that it holds {said:,} triangles; all {there:,} that are there are read")
     raise MeshError(f"says that it holds {said:,} triangles, but is long enough for {there:,}; export the mesh again")
 
