@@ -3,7 +3,7 @@
     python docs/examples/face_on.py [--face X Y Z] [--max-poses N] [--touches N] [--tilt DEGREES ...]
 
 Half a step of a coarse grid lifts a large face off the gel, so directions are finer about plane faces. With approach, only
-touches near to that face are modelled. Some four minutes on two cores, the first time; needs manifold3d (by pip).
+touches near to that face are modelled. Some four minutes on two cores, the first time.
 """
 
 import argparse

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geomtact.errors import UsageError
 from geomtact.geometry.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -23,14 +21,7 @@ def random_part(seed: int, size: float) -> Mesh:
     """The procedural part of ``seed``: a body with features added, cut away and repeated; the same for the same seed.
 
     ``size`` is its longest side [m].
-
-    Raises
-    ------
-    UsageError
-        manifold3d is not installed; it comes with the extra ``train``.
     """
-    if find_spec("manifold3d") is None:
-        raise UsageError("training parts are made with manifold3d; install it with pip install 'geomtact[train]'")
     for attempt in range(_TRIES):
         rng = np.random.default_rng([seed, attempt])
         solid = _body(rng)
