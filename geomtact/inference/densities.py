@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from geomtact.errors import InputError
-from geomtact.geometry.symmetry import Symmetry
+from geomtact.geometry.symmetry import Symmetry, about
 from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array, check_pose, hat, inverse, log
 
 LogDensity = Callable[[Array], Array]
 
 _TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
+_CLOSER = 0.125 * 0.5 ** np.arange(8)  # rad by which a continuous symmetry is searched, from the best of many images on
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +134,30 @@ def checked(density: Any, n: int) -> Array:
 def images(symmetry: Symmetry) -> Array:
     """Elements (m, 4, 4) of ``symmetry`` at which a prior that is a function is asked."""
     return symmetry.sampled(_TURNS if symmetry.axis is not None else _ROTATIONS)
+
+
+def likeliest_images(density: LogDensity, T: Array, posterior: Posterior) -> Array:
+    """The images (n, 4, 4) under the object's symmetry of poses ``T`` (n, 4, 4), in the frame of ``posterior``, where ``density``
+    is largest, of those that the approach allows; the first where several tie."""
+    symmetry, space, T_sensor_frame = posterior.mesh.symmetry, posterior.space, inverse(posterior.T_frame_sensor)
+    assert symmetry is not None
+
+    def value(T: Array) -> Array:
+        told = checked(density(T), len(T))
+        return np.where(space.approaches(T_sensor_frame @ T) & ~np.isnan(told), told, -np.inf)
+
+    images = T[:, None] @ symmetry.sampled()
+    each = value(images.reshape(-1, 4, 4)).reshape(images.shape[:2])
+    best, row = each.argmax(1), np.arange(len(T))
+    images, most = images[row, best], each[row, best]
+    axes = np.eye(3) if symmetry.kind == "sphere" else [] if symmetry.axis is None else [symmetry.axis]
+    for step in _CLOSER:
+        for rotvec in [sign * step * axis for axis in axes for sign in (-1, 1)]:
+            turned = images @ about(Rotation.from_rotvec(rotvec).as_matrix(), symmetry.centre)
+            found = value(turned)
+            better = found > most
+            images[better], most[better] = turned[better], found[better]
+    return images
 
 
 def mean_density(each: ArrayLike, counts: NDArray[np.bool_] | None = None) -> Array:

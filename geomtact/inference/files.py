@@ -20,7 +20,8 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.modes import Refined
 from geomtact.inference.posterior import Posterior
-from geomtact.se3 import check_pose
+from geomtact.inference.reference import Reference
+from geomtact.se3 import check_pose, check_transforms
 from geomtact.sensing.sensor import Sensor
 
 _KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many
@@ -48,7 +49,7 @@ def save(posterior: Posterior, path: str | Path) -> None:
     p = np.exp(posterior.log_prob)
     order = np.argsort(-p, kind="stable")
     some = np.sort(order[: min(_MOST, int(np.searchsorted(np.cumsum(p[order]), _KEPT)) + 1)])
-    refined, symmetry = posterior.refined, posterior.mesh.symmetry
+    refined, symmetry, reference = posterior.refined, posterior.mesh.symmetry, posterior.reference
     assert symmetry is not None
     keys = np.array(sorted(refined), np.int64)
     meta = {
@@ -83,6 +84,8 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "refined_cells": keys,
         "refined_T": np.array([refined[int(k)].T for k in keys]).reshape(-1, 4, 4),
         "refined_covariance": np.array([refined[int(k)].covariance for k in keys]).reshape(-1, 6, 6),
+        "reference_poses": np.zeros((0, 4, 4)) if reference is None else reference.poses,
+        "reference_log_mass": np.zeros(0) if reference is None else reference.log_mass,
         "meta": np.array(json.dumps(meta)),
     }
 
@@ -133,7 +136,11 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         _check(frame in ("sensor", "world"), f"frame {frame!r}")
         _check_rows(cells, runs, log_prob, poses)
         T_frame_sensor = check_pose(data["T_frame_sensor"], "T_frame_sensor")
-        extra = meta["refined"]
+        extra, reference = meta["refined"], None
+        if len(data.get("reference_poses", ())):  # files of before have none
+            expected, log_mass = check_transforms(data["reference_poses"]), data["reference_log_mass"]
+            _check(log_mass.shape == expected.shape[:1], "reference poses without their mass")
+            reference = Reference(expected, log_mass)
         refined = {
             int(k): Refined(T, C, np.array(rows).reshape(-1, 6), length, moved)
             for k, T, C, (length, moved, rows) in zip(
@@ -158,6 +165,7 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         seed=seed,
         runs=runs if len(runs) else None,
         refined=refined,
+        reference=reference,
         settings=settings,
         warnings=meta["warnings"],
     )

@@ -25,7 +25,7 @@ from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.effort import Effort, effort_of
 from geomtact.inference.fusion import fused_posterior
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import lost_contact, opened, prior_log_density, prior_log_mass
+from geomtact.inference.prior import lost_contact, opened, prior_log_density, prior_log_mass, reference_of
 from geomtact.inference.refine import Refinery
 from geomtact.inference.refine_by_outline import few_are_left, refine_by_outline
 from geomtact.inference.refine_together import refine_together
@@ -171,13 +171,15 @@ class Localizer:
             if not touch.contact and lost_contact(prior, self.sensor, T_frame_sensor[0]):
                 told = "the prior says that the object touches this sensor where it stands: it is given up, contact was lost"
                 touch, prior = replace(touch, elsewhere=None, warnings=[*touch.warnings, told]), None
-            return self._refined(counted_once(touch, prior), before, how)
-        touches = [
-            each.touch(shown, kind, empty, T, frame, None, effort, seed)[0]
-            for each, shown, empty, T in zip(localizers, images, backgrounds, T_frame_sensor, strict=True)
-        ]
-        refineries = [each.refinery for each in localizers]
-        return counted_once(fused_posterior(touches, refineries, prior, how.modes, rig), prior)
+            posterior = self._refined(touch, before, how)
+        else:
+            touches = [
+                each.touch(shown, kind, empty, T, frame, None, effort, seed)[0]
+                for each, shown, empty, T in zip(localizers, images, backgrounds, T_frame_sensor, strict=True)
+            ]
+            refineries = [each.refinery for each in localizers]
+            posterior = fused_posterior(touches, refineries, prior, how.modes, rig)
+        return counted_once(replace(posterior, reference=reference_of(prior, posterior)), prior)
 
     def touch(
         self,

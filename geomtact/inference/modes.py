@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.se3 import Array
+from geomtact.se3 import Array, adjoint, inverse
 
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Posterior
@@ -24,7 +24,8 @@ class Mode:
 
     Attributes
     ----------
-    T : (4, 4), the object in the posterior's frame
+    T : (4, 4), the object in the posterior's frame; of its images under the object's symmetry the one nearest to the prior, or to
+        the frame before
     probability : mass within 5 mm or 5 % of the object's diameter, the smaller, of T (mean point distance modulo
         symmetry); each pose counts for its most probable mode only
     covariance : (6, 6) of xi = (rx, ry, rz, tx, ty, tz) in T exp(xi^), radians and metres
@@ -83,11 +84,24 @@ def grown(posterior: Posterior, k: int, full: bool = True) -> list[tuple[int, fl
 def mode_at(posterior: Posterior, cell: int, mass: float) -> Mode:
     """The mode with its heart at ``cell`` that holds ``mass``, in the posterior's frame."""
     found = posterior.refined.get(cell)
-    T = posterior._poses_of_cells(np.array([cell]))[0]
     if found is None:
+        T = posterior._poses_of_cells(np.array([cell]))[0]
         found = Refined(T, posterior.index.cell_covariance(T), np.zeros((0, 6)), posterior.mesh.radius_rms, False)
-    T = posterior.T_frame_sensor @ T
+    found = carried(found, posterior.nearest_images(found.T[None])[0])
+    T = posterior.T_frame_sensor @ found.T
     return Mode(T, mass, found.covariance, found.observable, found.length, found.moved)
+
+
+def carried(found: Refined, T: Array) -> Refined:
+    """``found``, told of its image ``T`` (4, 4) under the object's symmetry: what moves the one by xi moves the other by A xi."""
+    if np.array_equal(T, found.T):
+        return found
+    back = adjoint(inverse(found.T) @ T)  # xi of the image to xi
+    A, scale = np.linalg.inv(back), np.repeat([found.length, 1.0], 3)
+    observable = found.observable
+    if len(observable):
+        observable = np.linalg.qr((observable * scale @ back / scale).T)[0].T
+    return replace(found, T=T, covariance=A @ found.covariance @ A.T, observable=observable)
 
 
 def _share_out(posterior: Posterior, members: list[tuple[int, NDArray[np.int64]]]) -> list[tuple[int, float]]:

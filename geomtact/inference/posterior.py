@@ -16,6 +16,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import UsageError
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.modes import Mode, Refined, grown, mode_at
+from geomtact.inference.reference import Reference
 from geomtact.se3 import Array, check_transforms, inverse
 from geomtact.sensing.sensor import Sensor
 
@@ -41,6 +42,8 @@ class Posterior:
     runs : (N,) how many cells from each of ``cells`` on share one density, as the cells of a block do where there is
         little mass; one each by default
     refined : what registration found, by pose id
+    reference : poses of the prior or of the frame before, by which modes are reported at one of their images under the object's
+        symmetry
     observations : what the sensors saw, that on whose cells it lives first
     settings, timing_ms, warnings : how it came about
     """
@@ -56,6 +59,7 @@ class Posterior:
     seed: int = 0
     runs: NDArray[np.int64] | None = None
     refined: dict[int, Refined] = field(default_factory=dict)
+    reference: Reference | None = None
     observations: list[Any] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
     timing_ms: dict[str, float] = field(default_factory=dict)
@@ -107,7 +111,12 @@ class Posterior:
         return float(np.exp(-(p @ np.where(p > 0, each, 0.0)))) if len(p) else 0.0
 
     def modes(self, k: int = 5) -> list[Mode]:
-        """The ``k`` most probable modes, most probable first; none without contact."""
+        """The ``k`` most probable modes, most probable first; none without contact.
+
+        All images of a pose under the object's symmetry are one placement. With a prior, or a frame before, each mode is reported
+        at the image nearest to it: to a Gaussian's pose, to the first mode of a posterior or of the frame before, to the poses of
+        a pair around it, or where a function is largest. Distances are mean squares over the surface.
+        """
         if not self.contact or k < 1:
             return []
         return [mode_at(self, cell, mass) for cell, mass in grown(self, k)]
@@ -116,10 +125,17 @@ class Posterior:
         """The ``n`` most probable poses (m, 4, 4) in ``frame``, most probable first: one a cell, or a run of cells that are told
         alike; refined where registration found better.
 
-        Fewer where there are fewer, none without contact. Most are neighbours; for places that are apart see :meth:`modes`.
+        Fewer where there are fewer, none without contact. Most are neighbours; for places that are apart see :meth:`modes`, which
+        has the same images under the object's symmetry.
         """
         rows = self._top_rows(n) if self.contact and n > 0 else np.zeros(0, np.int64)
-        return self.poses_of(rows[np.argsort(-self._log_mass_of_a_cell[rows], kind="stable")])
+        T = self._sensor_poses(rows[np.argsort(-self._log_mass_of_a_cell[rows], kind="stable")])
+        return self.T_frame_sensor @ self.nearest_images(T)
+
+    def nearest_images(self, T: Array) -> Array:
+        """The images (n, 4, 4) of poses ``T`` (n, 4, 4), in the sensor frame, that are nearest to :attr:`reference`; themselves
+        without one."""
+        return T if self.reference is None else self.reference.nearest(T, self.space, self.T_frame_sensor)
 
     def leading_cells(self, k: int) -> NDArray[np.int64]:
         """Pose ids (m,) of the index at the heart of the ``k`` leading modes, weighed by the most probable cells alone."""

@@ -12,12 +12,14 @@ from geomtact.contact_space.index import Index
 from geomtact.errors import InputError, UsageError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
-from geomtact.inference.densities import LogDensity, OfAllImages
+from geomtact.inference.densities import GaussianPrior, LogDensity, OfAllImages, likeliest_images
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior_cells import log_mass_of_density, log_mass_of_poses, log_mass_of_posterior, stands_as
+from geomtact.inference.reference import Reference
 from geomtact.se3 import Array, check_transforms
 from geomtact.sensing.sensor import Sensor
 
+_MODES, _POSES = 10, 1000  # modes at which a function, and poses of a pair, that say which image of a pose is expected
 _EXPECTED = (
     "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)), a GaussianPrior or a "
     "function of poses, got {}"
@@ -85,6 +87,37 @@ def prior_log_density(index: Index, prior: Any, frame: str) -> LogDensity | None
         return np.array([np.logaddexp.reduce(mass[distance.within(t, poses, radius)], initial=-np.inf) for t in T])
 
     return near
+
+
+def reference_of(prior: Any, posterior: Posterior) -> Reference | None:
+    """The poses of ``prior`` by which the modes of ``posterior``, made with it, are reported at one of their images; None without
+    symmetry.
+
+    They are a Gaussian's pose, the first mode of a posterior, the poses of a pair, or of each mode of ``posterior`` the image at
+    which a function is largest, the first of those that tie.
+    """
+    if prior is None or posterior.mesh.symmetry is None or posterior.mesh.symmetry.kind == "none":
+        return None
+    if isinstance(prior, GaussianPrior):
+        return Reference(prior.T[None], np.zeros(1))
+    if isinstance(prior, Posterior):
+        return Reference(prior.modes(1)[0].T[None], np.zeros(1)) if prior.contact else prior.reference
+    if callable(prior):
+        modes = posterior.modes(_MODES)
+        if not modes:
+            return None
+        T = likeliest_images(prior, np.stack([mode.T for mode in modes]), posterior)
+        return Reference(T, np.log([mode.probability for mode in modes]))
+    poses, log_mass = _pair(prior)
+    likely = log_mass > -np.inf
+    if not likely.any():
+        return None
+    poses, log_mass = poses[likely], log_mass[likely]
+    if len(poses) > _POSES:  # as many, each as likely to be among them as it has mass
+        upto = np.cumsum(np.exp(log_mass - log_mass.max()))
+        drawn = np.searchsorted(upto, (np.arange(_POSES) + 0.5) / _POSES * upto[-1])
+        poses, log_mass = poses[drawn], np.zeros(_POSES)
+    return Reference(poses, log_mass)
 
 
 def _check_posterior(prior: Posterior, index: Index, frame: str) -> None:

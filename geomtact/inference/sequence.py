@@ -14,7 +14,7 @@ from geomtact.errors import InputError, PoseError, UsageError, nearest_name
 from geomtact.inference.filter import FRESH, NOW, Counts, Filter
 from geomtact.inference.motion import Motion, UniformBall
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.prior import opened, prior_log_mass
+from geomtact.inference.prior import opened, prior_log_mass, reference_of
 from geomtact.inference.repeated_images import counted_once
 from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.se3 import Array, check_transforms
@@ -103,7 +103,7 @@ def _tracked(
     options: dict[str, Any],
     skip: bool,
 ) -> Iterator[Posterior]:
-    index, motion, made_from = localizer.index, state.spreading.motion, None
+    index, motion, made_from, expected = localizer.index, state.spreading.motion, None, None
     settings: dict[str, Any] = {"motion": {"kind": type(motion).__name__, **asdict(motion)}}
     settings |= {"counts": list(state.counts), "fresh": state.fresh, "most": state.most}
     for n, image, T in pairs:
@@ -123,10 +123,14 @@ def _tracked(
             prior = opened(prior, localizer.cache_dir)
             log_mass = prior_log_mass(index, prior, at, frame)
             state.memory = Mixture(np.flatnonzero(np.isfinite(log_mass)), np.exp(log_mass[np.isfinite(log_mass)]), 0.0)
-            made_from, prior = prior, None
+            made_from, expected, prior = prior, prior, None
         if seen.observations:
             seen = counted_once(seen, made_from)
-        yield state.step(replace(seen, settings=seen.settings | settings))
+        known = state.step(replace(seen, settings=seen.settings | settings))
+        known = replace(known, reference=reference_of(expected, known))
+        if known.contact:
+            expected = known
+        yield known
 
 
 def _check(
