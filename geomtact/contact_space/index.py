@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,7 +31,7 @@ _AROUND = np.random.default_rng(0).uniform(-0.75, 0.75, (32, 5))
 _AROUND = np.concatenate([_AROUND, -_AROUND])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Index:
     """A discretised contact pose space (thesis 6.1.1 to 6.1.3).
 
@@ -48,6 +49,7 @@ class Index:
     moments : (6, P n) moments of each mask (see ``sensing.moments``)
     table : (rotations, ny, nx) place of each lattice cell, the nearest one where the cell does not touch
     blocks : (B + 1,) first place of each block, and the number of places
+    folder : its entry in the cache; None where it is in none
     """
 
     mesh: Mesh
@@ -64,6 +66,7 @@ class Index:
     moments: NDArray[np.float32]
     table: NDArray[np.int32]
     blocks: NDArray[np.int32]
+    folder: Path | None = None
 
     ARRAYS = ("rotation", "shift", "height", "weight", "bits", "area", "moments", "table", "blocks")
 
@@ -323,6 +326,7 @@ class Index:
             moments=moments.reshape(len(moments), -1),
             table=np.zeros((0, 0, 0), np.int32),
             blocks=np.array([0, len(places)], np.int32),
+            folder=None,
         )
 
     @cached_property

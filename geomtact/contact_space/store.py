@@ -6,15 +6,16 @@ An entry is written under a temporary name and renamed, so it is whole or absent
 from __future__ import annotations
 
 import contextlib
+import copyreg
 import hashlib
 import json
 import os
 import secrets
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 FORMAT = 9  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
+_KEPT = 4  # indexes that a process has read for pickles and keeps
 _CHOOSING = 0.1  # share of the time that choosing the grid takes, about
 _KEY_LENGTH, _KEY_AT_LEAST = 32, 6  # hexadecimal digits of an entry's name, and by how many it may be named
 
@@ -108,7 +110,7 @@ def open_index(
                 chosen = between(progress, 0, _CHOOSING)
                 resolution = choose_resolution(mesh, sensor, approach, max_poses, chosen)
                 arrays = build(mesh, sensor, approach, resolution, between(progress, _CHOOSING, 1))
-                index = Index(mesh, sensor, approach, resolution, key, **arrays)
+                index = Index(mesh, sensor, approach, resolution, key, folder=None, **arrays)
                 _write(folder, index)
                 if cache_dir is None:
                     bound_cache(DEFAULT_LIMIT, folder, keep=key)
@@ -255,4 +257,32 @@ def _read(folder: Path, mesh: Mesh, sensor: Sensor, approach: Approach | None) -
         return None
     with contextlib.suppress(OSError):  # a read-only cache still serves
         os.utime(folder / "meta.json")
-    return Index(replace(mesh, symmetry=symmetry), sensor, approach, resolution, folder.name, **arrays)
+    mesh = replace(mesh, symmetry=symmetry)
+    return Index(mesh, sensor, approach, resolution, folder.name, folder=folder.absolute(), **arrays)
+
+
+def _reopened(folder: Path, mesh: Mesh, sensor: Sensor, approach: Approach | None) -> Index:
+    """The index in the ``folder`` of a cache entry, of which a pickle holds no more; each process reads it once."""
+    key = folder, mesh.sha256, sensor
+    if key not in _REOPENED:
+        index = _read(folder, mesh, sensor, approach)
+        if index is None:
+            raise CacheError(
+                f"cache entry {folder}: the index of {mesh.name!r} on {sensor.name!r}, which a pickle refers to, is not there; "
+                "prepare the object again with this cache folder, or pickle where it is"
+            )
+        if len(_REOPENED) == _KEPT:
+            del _REOPENED[next(iter(_REOPENED))]
+        _REOPENED[key] = index
+    return _REOPENED[key]
+
+
+def _reduced(index: Index) -> tuple[Any, ...]:
+    """How an index is pickled: by its entry in the cache, or by its arrays where it has none."""
+    if index.folder is None:
+        return Index, tuple(getattr(index, field.name) for field in fields(index))
+    return _reopened, (index.folder, index.mesh, index.sensor, index.approach)
+
+
+_REOPENED: dict[tuple[Path, str, Sensor], Index] = {}
+copyreg.pickle(Index, _reduced)  # type: ignore[arg-type]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from geomtact.errors import InputError
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry, about
 from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array, check_pose, hat, inverse, log
@@ -79,12 +82,47 @@ class OfAllImages:
     prior: LogDensity
     symmetry: Symmetry
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        try:
+            ForkingPickler.dumps(self.prior)
+        except Exception as error:
+            raise InputError(
+                "prior: this function cannot be pickled, and a posterior without contact holds it; define it with def at the "
+                "top level of a module, or pickle posteriors with contact only"
+            ) from error
+        return OfAllImages, (self.prior, self.symmetry)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> OfAllImages:
+        return self
+
     def __call__(self, T: Array) -> Array:
         """At poses (n, 4, 4)."""
         told = self.prior
         if isinstance(told, GaussianPrior):
             told = over_images(told, self.symmetry)
         return mean_density([checked(told(T @ S), len(T)) for S in images(self.symmetry)])
+
+
+@dataclass(frozen=True, eq=False)
+class OfPoses:
+    """Log density, not normalised, of a prior that is a pair: each pose's mass counts for all within the radius of a mode.
+
+    Attributes
+    ----------
+    poses : (n, 4, 4)
+    log_mass : (n,)
+    mesh : of the object
+    """
+
+    poses: Array
+    log_mass: Array
+    mesh: Mesh
+
+    def __call__(self, T: Array) -> Array:
+        """At poses (n, 4, 4)."""
+        distance, radius = PoseDistance(self.mesh), mode_radius(self.mesh)
+        near = [distance.within(t, self.poses, radius) for t in T]
+        return np.array([np.logaddexp.reduce(self.log_mass[each], initial=-np.inf) for each in near])
 
 
 @dataclass(frozen=True, eq=False)

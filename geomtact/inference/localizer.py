@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from geomtact.contact_space.index import Index
 from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import default_cache_dir, open_index
-from geomtact.errors import UsageError
+from geomtact.errors import CacheError, UsageError
 from geomtact.geometry.approach import Approach, to_json
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
@@ -304,6 +304,19 @@ class Localizer:
         """
         return next_touch(posterior, actions, seed=seed)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled by what it was prepared from, with the index and the score read from the cache, once in each process."""
+        if self.index.folder is None:
+            return Localizer, tuple(getattr(self, field.name) for field in fields(self))
+        return _reopened, (
+            self.index,
+            self.scorer.name,
+            _fit_of(self.scorer),
+            self.max_poses,
+            self.cache_dir,
+            self.others,
+        )
+
     def __repr__(self) -> str:
         name = self.scorer.name
         return f"Localizer({self.mesh.name} on {self.sensor.name}, {len(self.index):,} poses, scored by {name})"
@@ -343,6 +356,30 @@ def _calibrated_as(localizer: Localizer, sensor: Sensor) -> Localizer:
     if held == wanted:
         return localizer
     return replace(localizer, index=replace(localizer.index, sensor=sensor))
+
+
+@lru_cache(4)
+def _reopened(
+    index: Index,
+    scorer: str,
+    fit: tuple[Calibration, Calibration | None, bool],
+    max_poses: int,
+    cache_dir: str | Path | None,
+    others: tuple[Localizer, ...],
+) -> Localizer:
+    """The localizer that was pickled."""
+    fitted = fitted_scorer(scorer, index, index.folder)
+    if _fit_of(fitted) != fit:
+        raise CacheError(
+            f"cache entry {index.folder}: its score {scorer!r} is not the one that was pickled; prepare the object again, and "
+            "pickle it anew"
+        )
+    return Localizer(index, fitted, max_poses, cache_dir, others)
+
+
+def _fit_of(scorer: FittedScorer) -> tuple[Calibration, Calibration | None, bool]:
+    """What tells a score from another of its name."""
+    return scorer.calibration, scorer.exact_calibration, scorer.cascade is None
 
 
 def _worth(scored_by: str, calibration: Calibration) -> dict[str, Any]:

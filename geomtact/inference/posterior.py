@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -64,6 +64,10 @@ class Posterior:
     settings: dict[str, Any] = field(default_factory=dict)
     timing_ms: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled without what can be computed again; its index is read from the cache, once in each process."""
+        return Posterior, tuple(getattr(self, each.name) for each in fields(self))
 
     def __repr__(self) -> str:
         known = f"{-self.entropy_nats:.1f} nats known" if self.contact else "no contact"

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError, UsageError
-from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
-from geomtact.inference.densities import GaussianPrior, LogDensity, OfAllImages, likeliest_images
+from geomtact.inference.densities import GaussianPrior, LogDensity, OfAllImages, OfPoses, likeliest_images
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior_cells import log_mass_of_density, log_mass_of_poses, log_mass_of_posterior, stands_as
 from geomtact.inference.reference import Reference
@@ -80,13 +79,7 @@ def prior_log_density(index: Index, prior: Any, frame: str) -> LogDensity | None
     if callable(prior):
         assert mesh.symmetry is not None
         return OfAllImages(prior, mesh.symmetry)
-    poses, mass = _pair(prior)
-    distance, radius = PoseDistance(mesh), mode_radius(mesh)
-
-    def near(T: Array) -> Array:
-        return np.array([np.logaddexp.reduce(mass[distance.within(t, poses, radius)], initial=-np.inf) for t in T])
-
-    return near
+    return OfPoses(*_pair(prior), mesh)
 
 
 def reference_of(prior: Any, posterior: Posterior) -> Reference | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,12 +33,15 @@ class Caster:
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, threads: int = 2):
-        self.vertices = np.asarray(vertices, float)
+        self.vertices, self.faces = np.asarray(vertices, float), np.asarray(faces)
         self.threads = threads
         # Embree works in float32: rays start near the object's centre to keep 1e-8 m
         self._centre = 0.5 * (self.vertices.min(0) + self.vertices.max(0))
         self._radius = float(np.linalg.norm(self.vertices - self._centre, axis=1).max())
-        self._scene = scene_of((self.vertices - self._centre).astype(np.float32)[np.asarray(faces)])
+        self._scene = scene_of((self.vertices - self._centre).astype(np.float32)[self.faces])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Caster, (self.vertices, self.faces, self.threads)  # no scene can be pickled: it is made again
 
     def contact(self, sensor: Sensor, T_sensor_object: ArrayLike, shape: tuple[int, int] | None = None) -> Contact:
         """The contact at one pose ``T_sensor_object`` (4, 4): what the sensor would see, without noise.
