@@ -181,8 +181,8 @@ def likeliest_images(density: LogDensity, T: Array, posterior: Posterior) -> Arr
     assert symmetry is not None
 
     def value(T: Array) -> Array:
-        told = checked(density(T), len(T))
-        return np.where(space.approaches(T_sensor_frame @ T) & ~np.isnan(told), told, -np.inf)
+        each = checked(density(T), len(T))
+        return np.where(space.approaches(T_sensor_frame @ T) & ~np.isnan(each), each, -np.inf)
 
     images = T[:, None] @ symmetry.sampled()
     each = value(images.reshape(-1, 4, 4)).reshape(images.shape[:2])

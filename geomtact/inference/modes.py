@@ -93,7 +93,7 @@ def mode_at(posterior: Posterior, cell: int, mass: float) -> Mode:
 
 
 def carried(found: Refined, T: Array) -> Refined:
-    """``found``, told of its image ``T`` (4, 4) under the object's symmetry: what moves the one by xi moves the other by A xi."""
+    """``found`` at its image ``T`` (4, 4) under the object's symmetry: a motion xi of the one is A xi of the other."""
     if np.array_equal(T, found.T):
         return found
     back = adjoint(inverse(found.T) @ T)  # xi of the image to xi
