@@ -163,22 +163,26 @@ def test_what_trembles_from_pixel_to_pixel_is_smoothed(monkeypatch, rng):
     assert ((trembling > 0) != inside).sum() > 35
     assert ((smoothed(trembling) > 0) != inside).sum() < 8 and ((smoothed(shape) > 0) != inside).sum() < 8
     # and this is what the probability is made of
-    looks = torch.from_numpy(np.stack([trembling, trembling[::-1, ::-1]]))
+    looks = torch.from_numpy(np.stack([trembling[::i, ::j] for i, j in ((1, 1), (1, -1), (-1, -1), (-1, 1))]))
     monkeypatch.setattr(mask_network, "_network", lambda: lambda x: looks)
     change = rng.normal(0, 0.01, (60, 80, 3))
     expected = 1 / (1 + np.exp(-smoothed(trembling)))
     assert contact_probability(change, np.full((60, 80, 3), 0.4)) == pytest.approx(expected, abs=1e-5)
 
 
-def test_a_gel_turned_round_whose_red_and_blue_lamps_are_exchanged_is_told_alike(rng):
+@pytest.mark.parametrize("shape", [(120, 160), (160, 120), (96, 96)])
+def test_a_gel_is_seen_alike_however_the_camera_is_mounted(shape, rng):
     change, image = (
-        cv2.resize(rng.uniform(*ends, (12, 16, 3)), (160, 120), interpolation=cv2.INTER_CUBIC)
+        cv2.resize(rng.uniform(*ends, (12, 16, 3)), shape[::-1], interpolation=cv2.INTER_CUBIC)
         for ends in ((-0.3, 0.3), (0.2, 1.1))
     )
-    turned = [np.rot90(each[..., ::-1], 2) for each in (change, image)]
     probability = contact_probability(change, image)
     assert np.ptp(probability) > 0.2
-    assert np.rot90(contact_probability(*turned), 2) == pytest.approx(probability, abs=1e-4)
+    for turns in range(4):
+        for step in (1, -1):
+            turned = (np.rot90(each[:, ::step], turns) for each in (change, image, probability))
+            changed, seen_so, expected = turned
+            assert contact_probability(changed, seen_so) == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("shape", [(240, 320), (320, 240), (123, 161)])

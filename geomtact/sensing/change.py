@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from geomtact.errors import ImageError
 from geomtact.se3 import Array
 from geomtact.sensing.image_file import read_image
-from geomtact.sensing.pixels import Mask, blurred, closed, filled, median_of, opened, pixels_apart, size_of
+from geomtact.sensing.pixels import Mask, blurred, closed, every, filled, median_of, opened, pixels_apart, size_of
 from geomtact.sensing.sensor import Sensor
 
 GRID = 120  # smoothing lengths along an image's shorter side
 _GREY = 1 / 255
 _ALIKE = 0.02  # by which a camera's frame may be wider or narrower than the image that is cut out of it
+_APART = 3  # pixels from one to the next that a smooth background is fitted to
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 
 
@@ -27,13 +28,14 @@ def colour_change(image: NDArray[np.floating], background: NDArray[np.floating])
     return change, felt
 
 
-def change_from(image: Any, background: Any, sigma: float) -> tuple[Array, Mask, Mask, float]:
-    """The smoothed change (H, W, 3) from the background, where it is felt and where strongly so, and its noise."""
-    smooth = blurred(image, sigma)
-    reference = smooth_background(smooth) if background is None else blurred(background, sigma)
-    change = _without_light_drift(smooth, reference, max(1, round(sigma)))
+def change_from(
+    image: Array, background: Array, sigma: float, estimated: bool = False
+) -> tuple[Array, Mask, Mask, float]:
+    """The smoothed change (H, W, 3) from the background, which may be ``estimated``, where it is felt and where strongly so, and
+    its noise."""
+    change = _without_light_drift(blurred(image, sigma), blurred(background, sigma), 2 * round(0.5 * sigma - 0.5) + 1)
     # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
-    floor = 0.0 if background is not None else median_of(size_of(change).ravel())
+    floor = median_of(size_of(change).ravel()) if estimated else 0.0
     return change, *_felt(change, sigma, floor)
 
 
@@ -41,23 +43,29 @@ def smooth_background(image: Array) -> Array:
     """A background (H, W, 3) for ``image`` (H, W, 3): the smooth surface (degree 5) that most of its pixels lie on."""
     h, w = image.shape[:2]
     along_y, along_x = (np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, n), 5) for n in (h, w))
-    terms = [(i, j) for i in range(6) for j in range(6 - i)]
-    basis = np.stack([np.outer(along_y[:, i], along_x[:, j]).ravel() for i, j in terms], -1)
-    values = image.reshape(-1, 3)
+    terms = np.array([(i, j) for i in range(6) for j in range(6 - i)])
+    rows, columns = every(_APART, h), every(_APART, w)
+    basis = np.einsum("yk,xk->yxk", along_y[rows][:, terms[:, 0]], along_x[columns][:, terms[:, 1]]).reshape(
+        -1, len(terms)
+    )
+    values = image[rows, columns].reshape(-1, 3)
     keep = np.ones(len(values), bool)
     for _ in range(8):
-        fit = basis @ np.linalg.lstsq(basis[keep][::7], values[keep][::7], rcond=None)[0]
-        error = np.abs(values - fit).sum(1)
+        fit = np.linalg.lstsq(basis[keep], values[keep], rcond=None)[0]
+        error = np.abs(values - basis @ fit).sum(1)
         keep = error <= np.quantile(error, 0.7)
-    return fit.reshape(image.shape)
+    surface = np.zeros((6, 6, 3))
+    surface[terms[:, 0], terms[:, 1]] = fit
+    return np.asarray(np.einsum("yi,xj,ijc->yxc", along_y, along_x, surface, optimize=True))
 
 
 def _without_light_drift(image: Array, reference: Array, step: int) -> Array:
     """``image`` minus the background, whose brightness is fitted per channel (gain, offset) to the calmer half of one in
     ``step`` pixels each way."""
+    some = [every(step, n) for n in image.shape[:2]]
     gains, offsets = np.empty(3, image.dtype), np.empty(3, image.dtype)
     for c in range(3):
-        x, y = (each[::step, ::step, c].ravel() for each in (reference, image))
+        x, y = (each[*some, c].ravel() for each in (reference, image))
         calm_x, calm_y = x, y
         for _ in range(6):
             mean_x, mean_y = calm_x.sum() / calm_x.size, calm_y.sum() / calm_y.size
@@ -78,8 +86,10 @@ def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]
     noise2 = 0.0
     for c in range(3):
         # second differences over three smoothing lengths cancel slopes, and most pixels lie outside any rim
-        lines = (a[:, ::apart] for a in (change[..., c], change[..., c].T))
-        second = [np.abs(a[2 * step :: apart] - 2 * a[step:-step:apart] + a[: -2 * step : apart]) for a in lines]
+        lines = (a[:, every(apart, a.shape[1])] for a in (change[..., c], change[..., c].T))
+        second = [
+            np.abs(a[2 * step :] - 2 * a[step:-step] + a[: -2 * step])[every(apart, len(a) - 2 * step)] for a in lines
+        ]
         deviation = median_of(np.concatenate([s.ravel() for s in second])) / 0.6745 / np.sqrt(6)
         noise2 += max(float(deviation), 0.25 * _GREY) ** 2
     noise = max(np.sqrt(noise2), floor)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import UsageError, nearest_name
 from geomtact.se3 import Array
-from geomtact.sensing.change import GRID, as_unit_rgb, background_of, change_from, check_size
+from geomtact.sensing.change import GRID, as_unit_rgb, background_of, change_from, check_size, smooth_background
 from geomtact.sensing.pixels import Mask, blurred, filled, median_of, opened, size_of, transformed
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 from geomtact.sensing.slope import integrate, of_gradient, slope_field
@@ -29,6 +29,7 @@ _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
 _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated readings of many gels and lamps
 _ONE_COLOUR = 0.03  # power of the second colour over that of the first, under which there is but one: a white gel's
 _EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse, from which on slopes are seen
+_HARDLY_LESS = 0.1  # of the fastest fall, by which others fall less fast that count too
 _SURELY = 0.501  # probability of what counts as contact, at least
 # Brightness from which on a camera tells no more, or less than elsewhere; and the share of what is felt that is so bright, more
 # than a glint, from which on colours are no linear image of slopes
@@ -111,15 +112,16 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
     """As :func:`find_contact`, of images (H, W, 3) of 0..1 whose columns and rows are as far apart as ``pitch`` (2,) says, in the
     smaller of both."""
     size = image.shape[1::-1]
-    image, reference = _on_grid(image), None if reference is None else _on_grid(reference)
+    image, estimated = _on_grid(image), reference is None
+    reference = smooth_background(image) if reference is None else _on_grid(reference)
     # a second look smooths more where noise asks for it
     sigma = min(image.shape[:2]) / GRID
-    change, felt, strong, noise = change_from(image, reference, sigma)
+    change, felt, strong, noise = change_from(image, reference, sigma, estimated)
     if felt.any():
         noise_share = noise / float(np.quantile(size_of(change)[felt], 0.9))
         if noise_share > _NOISE_SHARE:
             sigma *= min(noise_share / _NOISE_SHARE, 2.0)
-            change, felt, strong, _ = change_from(image, reference, sigma)
+            change, felt, strong, _ = change_from(image, reference, sigma, estimated)
     if not felt.any():
         return FoundContact(np.zeros(size[::-1], bool), None, "classical" if method == "auto" else method)
     if method == "auto":
@@ -144,12 +146,13 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
 def _on_grid(image: Array) -> Array:
     """``image`` (H, W, 3) on ``GRID`` pixels along its shorter side: finer ones tell nothing that smoothing leaves."""
     share = min(1.0, GRID / min(image.shape[:2]))
-    return np.asarray(cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
+    size = [round(share * n) for n in image.shape[1::-1]]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def _blown_out(felt: Mask, *images: Array | None) -> float:
+def _blown_out(felt: Mask, *images: Array) -> float:
     """Share of what is ``felt`` (H, W) where a channel of one of the ``images`` (H, W, 3) is about as bright as it can be."""
-    bright = [(image >= _NEARLY_WHITE).any(-1) for image in images if image is not None]
+    bright = [(image >= _NEARLY_WHITE).any(-1) for image in images]
     return float(np.logical_or.reduce(bright)[felt].mean())
 
 
@@ -247,14 +250,16 @@ def _inside_rim(height: Array, slope: Array, felt: Mask, sigma: float) -> Mask:
 
 
 def _steepest_fall(share: Array, felt: Mask) -> float:
-    """The level of ``share`` (H, W) on whose contour it falls fastest in the mean."""
+    """The level of ``share`` (H, W) on whose contour it falls fastest in the mean: the mean of those where it hardly falls less
+    fast, so that of two alike neither wins by a rounding error."""
     edges = np.linspace(0.4, 0.9, 21)
     fall = np.hypot(*np.gradient(share))[felt]
     bins = np.searchsorted(edges, share[felt], side="right")
     count = np.bincount(bins, minlength=22)[1:-1]
     mean = np.bincount(bins, fall, minlength=22)[1:-1] / np.maximum(count, 1)
     mean = np.convolve(np.pad(mean, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    return float(edges[int(mean.argmax())] + 0.0125)
+    fastest = np.maximum(mean - (1 - _HARDLY_LESS) * mean.max(), 1e-12)
+    return float((0.5 * (edges[1:] + edges[:-1])) @ fastest / fastest.sum())
 
 
 def _uphill_maximum(height: Array, value: Array) -> Array:

@@ -78,20 +78,32 @@ class _Residual(nn.Module):
 
 def contact_probability(change: ArrayLike, image: ArrayLike) -> Image:
     """Probability (H, W) of contact at each pixel, of a ``change`` of colour (H, W, 3) of an ``image`` (H, W, 3) 0..1 from its
-    background, RGB: the mean log odds of two looks."""
+    background, RGB: the mean log odds of all looks, so that it turns and is mirrored as the image is."""
     x = torch.from_numpy(seen(change, image))
-    looks = torch.stack([x, _the_other_way(x)])
+    upright = x.shape[1] > x.shape[2]
+    x = x.rot90(1, (1, 2)) if upright else x
+    looks = _looks(x.shape[1] == x.shape[2])
+    shown = torch.stack([_turned(x, turns, mirrored) for turns, mirrored in looks])
     with torch.inference_mode():
-        once, again = _network()(looks.contiguous(memory_format=torch.channels_last))
-    log_odds = (once + again.rot90(2)) / 2
+        found = _network()(shown.contiguous(memory_format=torch.channels_last))
+    log_odds = torch.stack([_turned_back(y, *look) for y, look in zip(found, looks, strict=True)]).mean(0)
+    log_odds = log_odds.rot90(-1) if upright else log_odds
     full = cv2.resize(smoothed(log_odds.numpy()), np.shape(change)[1::-1], interpolation=cv2.INTER_CUBIC)
     return np.asarray(1 / (1 + np.exp(-full)), np.float32)
 
 
-def _the_other_way(x: torch.Tensor) -> torch.Tensor:
-    """What is :func:`seen` (``CHANNELS``, h, w), turned by 180 degrees, red and blue exchanged: the same contact under other
-    lamps, of which the network errs otherwise."""
-    return x.reshape(-1, 3, *x.shape[1:]).flip(1, 2, 3).reshape(x.shape)
+def _looks(square: bool) -> list[tuple[int, bool]]:
+    """Quarter turns, and whether mirrored before, that leave the sides of an image as long as they are."""
+    return [(turns, mirrored) for turns in range(0, 4, 1 if square else 2) for mirrored in (False, True)]
+
+
+def _turned(x: torch.Tensor, turns: int, mirrored: bool) -> torch.Tensor:
+    return (x.flip(-1) if mirrored else x).rot90(turns, (-2, -1))
+
+
+def _turned_back(x: torch.Tensor, turns: int, mirrored: bool) -> torch.Tensor:
+    x = x.rot90(-turns, (-2, -1))
+    return x.flip(-1) if mirrored else x
 
 
 def smoothed(log_odds: Image) -> Image:

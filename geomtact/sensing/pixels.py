@@ -36,8 +36,15 @@ def median_of(values: NDArray[Any]) -> float:
 
 
 def pixels_apart(sigma: float) -> int:
-    """Pixels from one to the next that tells something else, where all are smoothed by ``sigma``."""
-    return max(1, round(1.5 * sigma))
+    """Pixels from one to the next that tells something else, where all are smoothed by ``sigma``; an odd number."""
+    return 2 * round(0.75 * sigma) + 1
+
+
+def every(step: int, n: int) -> slice:
+    """Every ``step``-th of ``n`` pixels, ``step`` odd: the same ones from either end, so that a mirrored image gives the same."""
+    left = (n - 1) % step
+    start = (left + step * (left % 2)) // 2
+    return slice(start, n - start, step)
 
 
 def opened(mask: Mask, n: int) -> Mask:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geomtact.se3 import Array
-from geomtact.sensing.pixels import Mask, blurred, pixels_apart, transformed
+from geomtact.sensing.pixels import Mask, blurred, transformed
 
 _CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like slopes
 
@@ -13,9 +13,8 @@ _CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like s
 def slope_field(plane: Array, felt: Mask, sigma: float, pitch: Array) -> Array | None:
     """The gel's slope (H, W, 2) up to a factor, of a change in two colours (H, W, 2); None where these do not tell it."""
     plane = blurred(plane, sigma)
-    some = (slice(None, None, pixels_apart(sigma)),) * 2
-    along_y, along_x = (np.gradient(plane, axis=axis)[some] / pitch[1 - axis] for axis in (0, 1))
-    curl = np.concatenate([along_y, -along_x], -1)[felt[some]]
+    along_y, along_x = (np.gradient(plane, axis=axis) / pitch[1 - axis] for axis in (0, 1))
+    curl = np.concatenate([along_y, -along_x], -1)[felt]
     residual, maps = np.linalg.eigh(curl.T @ curl)
     if residual[0] > _CURL_LIMIT * residual[-1]:
         return None
