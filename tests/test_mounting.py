@@ -1,11 +1,13 @@
-"""How a sensor is mounted is no part of what touches it."""
+"""How a sensor is mounted, and light that flickers, are no part of what touches it."""
 
 import cv2
 import numpy as np
 import pytest
 
 from geomtact import contact_mask
+from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.image_file import read_image
+from geomtact.sensing.reading import read_observation
 from geomtact.sensing.render import Lamps, render
 
 SHAPES = [(240, 320), (320, 240), (240, 240), (123, 161)]
@@ -104,3 +106,73 @@ def test_without_a_background_too(simulated):
     for image, _ in simulated[:12]:
         masks = [contact_mask(each) for each in (image, turned(image, 1, True))]
         assert overlap(turned(masks[0], 1, True), masks[1]) >= 0.97
+
+
+def striped(image, share, bands, phase, along_rows=True):
+    """``image`` (H, W, 3) whose rows, or columns, get brighter and darker by a ``share``."""
+    n = image.shape[0 if along_rows else 1]
+    gain = 1 + share * np.sin(2 * np.pi * bands * np.arange(n) / n + phase)
+    gain = gain[:, None, None] if along_rows else gain[:, None]
+    return np.rint(np.clip(image * gain, 0, 255)).astype(np.uint8)
+
+
+def random_stripes(rng):
+    return {"bands": rng.uniform(2, 20), "phase": rng.uniform(0, 2 * np.pi), "along_rows": bool(rng.integers(2))}
+
+
+def unit(image):
+    return (image / 255).astype(np.float32)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.05, 0.1, 0.2])
+@pytest.mark.parametrize("method", METHODS)
+def test_stripes_of_light_are_no_contact_and_hide_none(simulated, share, method):
+    rng, kept = np.random.default_rng(3), []
+    for image, rest in simulated[:: 5 if method != "learned" else 10]:
+        stripes = random_stripes(rng)
+        assert not contact_mask(striped(rest, share, **stripes), rest, method=method).any()
+        found = contact_mask(striped(image, share, **stripes), rest, method=method)
+        kept.append(overlap(found, contact_mask(image, rest, method=method)))
+    assert np.median(kept) > 0.97 and np.mean(np.array(kept) > 0.9) >= 0.9
+
+
+def test_stripes_of_a_twentieth_are_evened_out_on_real_images(real):
+    rng = np.random.default_rng(4)
+    for name, (rest, images) in real.items():
+        assert not contact_mask(striped(rest, 0.05, **random_stripes(rng)), rest).any(), name
+        if name == "hsp":  # of another simulator: contacts over most of a gel that bulges
+            continue
+        assert all(
+            without_flicker(unit(striped(image, 0.05, **random_stripes(rng))), unit(rest))[1] for image in images
+        )
+
+
+def test_steady_light_is_left_as_it_is(real, simulated):
+    for rest, images in [*real.values(), *((rest, [image]) for image, rest in simulated)]:
+        for image in images:
+            evened, flicker = without_flicker(unit(image), unit(rest))
+            assert flicker == 0 and np.array_equal(evened, unit(image))
+
+
+@pytest.mark.parametrize("along_rows", [True, False])
+def test_a_bar_all_along_the_image_is_a_contact(along_rows, rng):
+    """Striped as light may be, but of the lamps' colours, and on a white gel no more than one stripe."""
+    across = np.mgrid[:240, :320][0 if along_rows else 1] * PITCH - 7e-3
+    depth = np.maximum(2e-3 - 1.4e-3 - (2e-3 - np.sqrt(np.maximum(4e-6 - across**2, 0))) + 0.8e-3, 0)
+    image, rest = reading(cv2.GaussianBlur(depth, (0, 0), 3), rng)
+    assert without_flicker(unit(image), unit(rest))[1] == 0
+    white = 200 * np.ones((240, 320, 3), np.float32)
+    darker = white * (1 - 100 * depth[..., None])
+    assert without_flicker(darker / 255, white / 255)[1] == 0
+
+
+def test_flickering_light_is_a_warning_of_the_reading(real):
+    rest, images = real["gelslam"]
+    image = striped(images[0], 0.05, bands=5, phase=1)
+    seen = read_observation(image, "gelsight-mini", "reading", rest)
+    (warning,) = seen.warnings
+    assert "the light flickers" in warning and "3.5 % rms" in warning
+    plain = read_observation(images[0], "gelsight-mini", "reading", rest)
+    assert plain.warnings == [] and overlap(seen.contact.mask, plain.contact.mask) > 0.97
+    untouched = read_observation(striped(rest, 0.05, bands=5, phase=1), "gelsight-mini", "reading", rest)
+    assert not untouched.contact.mask.any()

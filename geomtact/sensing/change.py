@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import ImageError
 from geomtact.se3 import Array
+from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.image_file import read_image
 from geomtact.sensing.pixels import Mask, blurred, closed, every, filled, median_of, opened, pixels_apart, size_of
 from geomtact.sensing.sensor import Sensor
@@ -24,6 +25,7 @@ _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 
 def colour_change(image: NDArray[np.floating], background: NDArray[np.floating]) -> tuple[Array, Mask]:
     """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it is felt."""
+    image, _ = without_flicker(image, background)
     change, felt, _, _ = change_from(image, background, min(image.shape[:2]) / GRID)
     return change, felt
 

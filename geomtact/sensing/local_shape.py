@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from geomtact.errors import UsageError, nearest_name
 from geomtact.se3 import Array
 from geomtact.sensing.change import GRID, as_unit_rgb, background_of, change_from, check_size, smooth_background
+from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.pixels import Mask, blurred, filled, median_of, opened, size_of, transformed
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 from geomtact.sensing.slope import integrate, of_gradient, slope_field
@@ -114,6 +115,7 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
     size = image.shape[1::-1]
     image, estimated = _on_grid(image), reference is None
     reference = smooth_background(image) if reference is None else _on_grid(reference)
+    image, _ = without_flicker(image, reference)
     # a second look smooths more where noise asks for it
     sigma = min(image.shape[:2]) / GRID
     change, felt, strong, noise = change_from(image, reference, sigma, estimated)

@@ -16,6 +16,7 @@ from geomtact.sensing.checks import faults
 from geomtact.sensing.contact import FAINT, Contact
 from geomtact.sensing.depth_map import depths_of
 from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
+from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.height import contact_height
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 from geomtact.sensing.local_shape import contact_mask, find_contact
@@ -239,8 +240,15 @@ def _reading(
         raise ImageError(
             f"{name}: one of image and background has colours, the other is grey; give both as the camera made them"
         )
-    found = faults(as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background"))
-    warnings.extend(f"{name}: {fault}" for fault in found)
+    seen, reference = as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background")
+    if reference is not None:
+        seen, flicker = without_flicker(seen, reference)
+        if flicker:
+            warnings.append(
+                f"{name}: the light flickers: grey stripes, off the background's brightness by {100 * flicker:.1f} % rms, were "
+                "evened out; keep other lamps off the gel, or expose for whole periods of the mains"
+            )
+    warnings.extend(f"{name}: {fault}" for fault in faults(seen, reference))
     touch = find_contact(seen, reference, sensor)
     if touch.method != sensor.contact_method != "auto":
         warnings.append(
