@@ -1,12 +1,16 @@
 """How a sensor is mounted, and light that flickers, are no part of what touches it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from geomtact import contact_mask
+from geomtact import ImageError, Sensor, SensorError, calibrate, contact_height, contact_mask
+from geomtact.cli import app
 from geomtact.sensing.flicker import without_flicker
-from geomtact.sensing.image_file import read_image
+from geomtact.sensing.image_file import read_image, write_image
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.render import Lamps, render
 
@@ -176,3 +180,174 @@ def test_flickering_light_is_a_warning_of_the_reading(real):
     assert plain.warnings == [] and overlap(seen.contact.mask, plain.contact.mask) > 0.97
     untouched = read_observation(striped(rest, 0.05, bands=5, phase=1), "gelsight-mini", "reading", rest)
     assert not untouched.contact.mask.any()
+
+
+MOUNTINGS = [(turn, mirrored) for turn in (0, 90, 180, 270) for mirrored in (False, True)]
+
+
+def mounted(sensor, turn, mirrored):
+    return replace(Sensor.load(sensor), camera_rotation_deg=turn, camera_mirrored=mirrored)
+
+
+def as_camera(image, turn, mirrored):
+    """What a camera so mounted delivers of an ``image`` in the sensor frame."""
+    image = np.rot90(image, -turn // 90)
+    return np.ascontiguousarray(image[:, ::-1] if mirrored else image)
+
+
+@pytest.mark.parametrize("mounting", MOUNTINGS)
+def test_a_mounted_camera_shows_the_same_contact(simulated, mounting, tmp_path):
+    image, rest = simulated[0]
+    sensor = mounted("gelsight-mini", *mounting)
+    assert Sensor.from_toml(sensor.to_toml()) == sensor and Sensor.from_toml(sensor.to_toml()).turned == sensor.turned
+    seen, background = (as_camera(each, *mounting) for each in (image, rest))
+    assert np.array_equal(sensor.upright(seen), image)
+    plain = read_observation(image, "gelsight-mini", background=rest).contact.mask
+    assert plain.any() and np.array_equal(contact_mask(seen, background, sensor), plain)
+    write_image(tmp_path / "seen.png", seen)
+    for each in (seen, tmp_path / "seen.png"):
+        observed = read_observation(each, sensor, background=background)
+        assert np.array_equal(observed.contact.mask, plain) and np.array_equal(observed.image, image)
+        assert observed.warnings == []
+
+
+def test_masks_are_in_the_sensor_frame_unless_the_sensor_says_otherwise(simulated, tmp_path):
+    sensor = mounted("gelsight-mini", 180, True)
+    mask = contact_mask(*simulated[0], "gelsight-mini")
+    assert np.array_equal(read_observation(mask, sensor).contact.mask, mask)
+    write_image(tmp_path / "mask.png", mask)
+    observed = read_observation(tmp_path / "mask.png", sensor)
+    assert np.array_equal(observed.contact.mask, mask) and "camera_masks" in observed.warnings[0]
+    all_turned = replace(sensor, camera_masks=True)
+    seen = as_camera(mask, 180, True)
+    assert np.array_equal(read_observation(seen, all_turned).contact.mask, mask)
+    # what simulate writes is in the sensor frame for sure
+    write_image(tmp_path / "made.png", mask, {"sensor": "gelsight-mini"})
+    made = read_observation(tmp_path / "made.png", all_turned)
+    assert np.array_equal(made.contact.mask, mask) and made.warnings == []
+
+
+def test_a_turn_that_is_none_is_refused():
+    text = Sensor.load("gelsight-mini").to_toml()
+    for line, what in (("camera_rotation_deg = 45", "0, 90, 180 or 270"), ('camera_mirrored = "no"', "true or false")):
+        with pytest.raises(SensorError, match=what):
+            Sensor.from_toml(f"{text}{line}\n")
+    with pytest.raises(ImageError, match="image_size_px is that after it"):
+        read_observation(
+            np.zeros((240, 320, 3), np.uint8) + np.arange(3, dtype=np.uint8), mounted("gelsight-mini", 90, False)
+        )
+
+
+def test_what_a_digit_delivers_is_turned_as_its_driver_does(real):
+    """digit_interface transposes a frame, then flips it top to bottom: a quarter turn counter-clockwise."""
+    rest, images = real["digit"]
+    sensor = Sensor.load("digit")
+    for upright in (rest, images[0]):
+        raw = np.ascontiguousarray(np.rot90(upright, -1))
+        assert raw.shape == (240, 320, 3)
+        assert np.array_equal(cv2.flip(cv2.transpose(raw), 0), upright)
+        assert np.array_equal(sensor.upright(raw), upright) and np.array_equal(sensor.upright(upright), upright)
+    raw, background = (np.ascontiguousarray(np.rot90(each, -1)) for each in (images[0], rest))
+    seen = read_observation(raw, sensor, background=background)
+    plain = read_observation(images[0], sensor, background=rest)
+    assert plain.warnings == [] and plain.contact.mask.any()
+    assert np.array_equal(seen.contact.mask, plain.contact.mask)
+    assert all("straight from the camera: turned by 90 degrees counter-clockwise" in each for each in seen.warnings)
+    # a mask that lies on its side may be transposed, which would mirror it
+    with pytest.raises(ImageError, match="width and height are exchanged"):
+        read_observation(plain.contact.mask.T, sensor)
+
+
+def test_a_camera_of_another_size_is_refused_before_anything_is_prepared(monkeypatch, tmp_path):
+    """As are the first images of folders and videos; what a DIGIT delivers by default is not."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "frames").mkdir()
+    frames = np.random.default_rng(0).integers(0, 255, (2, 480, 640, 3), np.uint8)
+    write_image(tmp_path / "frames" / "1.png", frames[0])
+    for name, shown in (("film.avi", frames), ("digit.avi", frames[:, :240, :320])):
+        video = cv2.VideoWriter(name, cv2.VideoWriter_fourcc(*"MJPG"), 10, shown.shape[2:0:-1])
+        for image in shown:
+            video.write(np.ascontiguousarray(image))
+        video.release()
+    from geomtact.inference.localizer import Localizer
+
+    class Prepared(Exception):
+        pass
+
+    def prepare(*_, **__):
+        raise Prepared
+
+    monkeypatch.setattr(Localizer, "prepare", prepare)
+    part = ["--object", "pin", "--sensor", "digit"]
+    localize, track = ["localize", "--camera"], ["track"]
+    for command, source in ((localize, "film.avi"), (track, "film.avi"), (track, "frames")):
+        result = CliRunner().invoke(app, [*command, source, *part])
+        assert result.exit_code == 3 and "expected 240 x 320 px for sensor digit" in " ".join(result.output.split())
+    result = CliRunner().invoke(app, [*localize, "digit.avi", *part])
+    assert isinstance(result.exception, Prepared)
+    said = "320 x 240 px are turned by 90 degrees counter-clockwise, as the driver of digit does"
+    assert said in " ".join(result.output.split())
+    result = CliRunner().invoke(app, [*localize, "digit.avi", *part, "--rotate", "45"])
+    assert result.exit_code == 2 and "expected 0, 90, 180 or 270 degrees" in " ".join(result.output.split())
+
+
+BALL = 6.31e-3
+BOTH = {
+    "red and blue seem to be exchanged": lambda image: image[..., ::-1],
+    "turned by 180 degrees": lambda image: image[::-1, ::-1],
+    "mirrored left to right": lambda image: image[:, ::-1],
+    "mirrored top to bottom": lambda image: image[::-1],
+    "30 % darker than when": lambda image: np.rint(0.7 * image.astype(float)).astype(np.uint8),
+}
+
+
+@pytest.fixture(scope="module")
+def calibrated_mini(data_folder):
+    """A calibrated GelSight Mini, its background and the presses of another ball."""
+    folder = data_folder / "gelslam_gsmini_balls"
+    presses = sorted((folder / "6.310mm").glob("*.png"))[::3]
+    rest = read_image(folder / "background.png")[..., :3]
+    sensor = calibrate(presses, BALL, rest, sensor="gelsight-mini")
+    return sensor, rest, [read_image(path)[..., :3] for path in sorted((folder / "9.500mm").glob("*.png"))[::2]]
+
+
+def test_a_calibration_keeps_its_background(calibrated_mini):
+    sensor, rest, _ = calibrated_mini
+    again = Sensor.from_toml(sensor.to_toml())
+    assert again.colour.background == sensor.colour.background and again.colour.rest.shape == (9, 12, 3)
+    assert again.colour.rest.mean((0, 1)) == pytest.approx(rest.mean((0, 1)) / 255, abs=0.002)
+    without = replace(sensor, colour=replace(sensor.colour, background=None))
+    assert Sensor.from_toml(without.to_toml()).colour.background is None
+
+
+@pytest.mark.parametrize("fault", BOTH)
+def test_what_image_and_background_share_is_found_by_the_calibration(calibrated_mini, fault):
+    sensor, rest, images = calibrated_mini
+    for image in images:
+        assert read_observation(image, sensor, background=rest).warnings == []
+        both = (np.ascontiguousarray(BOTH[fault](each)) for each in (image, rest))
+        (said,) = read_observation(next(both), sensor, background=next(both)).warnings
+        assert fault in said
+
+
+def test_heights_do_not_depend_on_the_exposure(calibrated_mini):
+    sensor, rest, images = calibrated_mini
+    for image in images[:4]:
+        plain = contact_height(image, rest, sensor)
+        dark = contact_height(*(BOTH["30 % darker than when"](each) for each in (image, rest)), sensor)
+        assert dark.max() == pytest.approx(plain.max(), rel=0.05)
+        assert np.corrcoef(dark.ravel(), plain.ravel())[0, 1] > 0.99
+
+
+def test_a_mounted_sensor_is_calibrated_alike(calibrated_mini, data_folder):
+    sensor, rest, images = calibrated_mini
+    way = (90, True)
+    presses = sorted((data_folder / "gelslam_gsmini_balls" / "6.310mm").glob("*.png"))[::3]
+    seen = [as_camera(read_image(path)[..., :3], *way) for path in presses]
+    again = calibrate(seen, BALL, as_camera(rest, *way), sensor=mounted("gelsight-mini", *way))
+    assert again.colour == sensor.colour
+    plain, turned_too = (
+        contact_height(images[0], rest, sensor),
+        contact_height(*(as_camera(e, *way) for e in (images[0], rest)), again),
+    )
+    assert np.array_equal(plain, turned_too)

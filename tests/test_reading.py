@@ -240,7 +240,7 @@ def test_a_background_for_a_mask_is_said_to_be_unused(background):
 @pytest.mark.parametrize(
     ("array", "message"),
     [
-        (MASK.T, "(width x height), got 240 x 320 px; the image is transposed: transpose it (array.T)"),
+        (MASK.T, "(width x height), got 240 x 320 px; width and height are exchanged: say how the camera is mounted"),
         (MASK[:, :300], "expected 320 x 240 px for sensor gelsight-mini (width x height), got 300 x 240 px; name the sen"),
         (MASK[::2, ::2], "got 160 x 120 px; the shape agrees: scale a mask to that"),
         (np.zeros((0, 320)), "expected (H, W) or (H, W, 3), got an array of shape (0, 320)"),
@@ -273,7 +273,7 @@ def test_eight_bit_heights_have_no_unit():
 
 def test_a_background_of_another_size_is_refused(background, tmp_path):
     with pytest.raises(
-        ImageError, match=r"background: expected 320 x 240 px .* transpose it \(array.swapaxes\(0, 1\)\)"
+        ImageError, match=r"background: expected 320 x 240 px .* width and height are exchanged: .* --rotate 90 or 270"
     ):
         read_observation(background, MINI, background=background.swapaxes(0, 1))
     path = write(tmp_path / "untouched.png", background[:200])
@@ -282,10 +282,9 @@ def test_a_background_of_another_size_is_refused(background, tmp_path):
     with pytest.raises(ImageError, match="background: expected the size of the image, 320 x 240 px, got 320 x 200 px"):
         contact_mask(background, background[:200])
     with pytest.raises(
-        ImageError,
-        match="expected 240 x 320 px for sensor digit .*, got 320 x 240 px; the image is transposed",
+        ImageError, match="expected 240 x 320 px for sensor digit-hsp .*, got 320 x 240 px; width and height"
     ):
-        contact_mask(background, background, "digit")
+        contact_mask(background, background, "digit-hsp")
     with pytest.raises(ImageError, match=r"image: expected an RGB image \(H, W, 3\)"):
         contact_mask(background[..., 0])
     with pytest.raises(ImageError, match=r"image: expected an RGB image \(H, W, 3\) or its path, got none; give it"):

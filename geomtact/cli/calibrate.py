@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from geomtact.cli.options import SensorName
+from geomtact.cli.options import Mirror, Mounting, Rotate, SensorName
 from geomtact.cli.shell import tell
 from geomtact.errors import UsageError
 from geomtact.files import write_bytes, write_text
@@ -41,6 +41,8 @@ def calibrate(
     ] = None,
     other_ball_mm: Annotated[float | None, typer.Option("--other-ball-mm", help="Diameter of that ball.")] = None,
     sensor: SensorName = None,
+    rotate: Rotate = None,
+    mirror: Mirror = None,
     name: Annotated[str | None, typer.Option(help="Name of the new sensor.")] = None,
     out: Annotated[Path, typer.Option(help="Sensor file to write.")] = Path("sensor.toml"),
     plot: Annotated[Path | None, typer.Option(help="PNG to write: how well the presses fit.")] = None,
@@ -53,6 +55,7 @@ def calibrate(
     from geomtact.report.calibration_plot import draw_calibration
     from geomtact.sensing.calibrate import calibrated
 
+    mounting = Mounting(rotate, mirror)
     for path, suffix in ((out, ".toml"), (plot, ".png")):
         if path is not None and path.suffix != suffix:
             raise UsageError(f"{path}: expected a name that ends in {suffix}; give one")
@@ -76,6 +79,8 @@ def calibrate(
                 "--pins and --pin-spacing-mm belong together, and stand in place of --pitch-mm; give these two"
             )
         pitch = _pitch_of(pins, background, 1e-3 * pin_spacing_mm)
+        if _quarter_turned(sensor, mounting):
+            pitch = pitch[::-1]
     if (other_presses is None) != (other_ball_mm is None):
         raise UsageError("--other-presses and --other-ball-mm belong together; give both")
     if other_presses is not None and not other_presses.is_dir():
@@ -83,11 +88,16 @@ def calibrate(
     if presses[0].suffix == ".npz":
         if len(presses) > 1 or ball_mm is not None or plot is not None or other_presses is not None:
             raise UsageError(f"{presses[0]}: a table of Taxim stands alone; leave out other presses, balls and --plot")
+        if mounting.said:
+            raise UsageError(
+                f"{presses[0]}: a table of Taxim is of images as they were taken for it; leave --rotate and --mirror out"
+            )
         _write(_of_taxim(presses[0], background, pitch, sensor, name or out.stem), sensor, out)
         return
     if ball_mm is None:
         raise UsageError("--ball-mm: expected the ball's diameter in millimetres, got none; give it")
-    found = calibrated(presses, 1e-3 * ball_mm, background, pitch, sensor, name or out.stem)
+    mounted = _mounted(sensor, background, pitch, mounting)
+    found = calibrated(presses, 1e-3 * ball_mm, background, pitch, mounted, name or out.stem)
     for why in dict.fromkeys(found.left_out.values()):
         names = [name for name, reason in found.left_out.items() if reason == why]
         tell(f"warning: left out ({why}): {', '.join(names)}")
@@ -113,12 +123,39 @@ def _write(calibrated: Sensor, geometry: str | None, out: Path) -> None:
         )
 
 
+def _quarter_turned(sensor: str | None, mounting: Mounting) -> bool:
+    """Whether the camera's columns are the sensor's rows."""
+    from geomtact.sensing.sensor import Sensor
+
+    if mounting.rotate is not None or sensor is None:
+        return mounting.rotate in (90, 270)
+    return Sensor.load(sensor).camera_rotation_deg in (90, 270)
+
+
+def _mounted(
+    sensor: str | None, background: Path, pitch: tuple[float, float] | None, mounting: Mounting
+) -> Sensor | str | None:
+    """The sensor whose geometry to keep, mounted as the command line says; where it names none, one of the background's size."""
+    from geomtact.sensing.image_file import read_image
+    from geomtact.sensing.sensor import Sensor
+
+    if not mounting.said or (sensor is None and pitch is None):
+        return sensor
+    if sensor is not None:
+        return mounting.of(sensor, masks=False)
+    height, width = read_image(background).shape[:2]
+    size = (height, width) if _quarter_turned(None, mounting) else (width, height)
+    return mounting.of(Sensor("calibrated", size, pitch or (0.0, 0.0), 0.0, 2e-3), masks=False)
+
+
 def _of_taxim(
     table: Path, background: Path, pitch: tuple[float, float] | None, sensor: str | None, name: str
 ) -> Sensor:
     """The sensor whose colours a table of Taxim tells."""
     from dataclasses import replace
 
+    from geomtact.sensing.change import as_unit_rgb
+    from geomtact.sensing.colour import kept
     from geomtact.sensing.image_file import read_image
     from geomtact.sensing.sensor import Sensor
     from geomtact.sensing.taxim import colours_of_taxim
@@ -132,7 +169,11 @@ def _of_taxim(
             f"--sensor {sensor}: has {base.image_size_px[0]} x {base.image_size_px[1]} px, the background {width} x {height}; "
             "name the sensor that took it"
         )
-    colour = colours_of_taxim(table, (height, width))
+    if base.turned:
+        raise UsageError(
+            f"--sensor {sensor}: its camera is turned, and a table of Taxim is of images as they were taken; name one that is not"
+        )
+    colour = replace(colours_of_taxim(table, (height, width)), background=kept(as_unit_rgb(background, "background")))
     typer.echo(
         f"slopes of up to 30 degrees that the table shows are told to {colour.slope_rms:.3f} rms (1 is 45 degrees)"
     )

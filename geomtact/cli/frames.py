@@ -5,15 +5,19 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from geomtact.cli.frame_order import doubt, in_order
 from geomtact.cli.shell import tell
 from geomtact.errors import InputError, UsageError
 from geomtact.files import printable
+
+if TYPE_CHECKING:
+    from geomtact.sensing.sensor import Sensor
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy")
 State = tuple[int, int]  # when a file was last written to [ns], and its size
@@ -36,12 +40,18 @@ class Frame:
     passed_over: int = 0
 
 
-def all_frames(source: str, follow: bool = False, sensor: str | None = None, masks: bool = False) -> Iterator[Frame]:
+def all_frames(
+    source: str,
+    follow: bool = False,
+    sensor: Sensor | None = None,
+    check: Callable[[Iterable[Any]], None] = lambda first: None,
+    masks: bool = False,
+) -> Iterator[Frame]:
     """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
 
-    ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`; ``masks`` says that a video is of
-    contact masks: what is over half bright in it counts as contact. Names that leave the order of a folder's images open bring a
-    warning.
+    ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`; ``check`` is given the first image
+    of a folder or a video; ``masks`` says that a video is of contact masks: what is over half bright in it counts as contact.
+    Names that leave the order of a folder's images open bring a warning.
 
     Raises
     ------
@@ -57,6 +67,7 @@ def all_frames(source: str, follow: bool = False, sensor: str | None = None, mas
             raise InputError(f"{path}: no image in this folder; expected {', '.join(_IMAGES)}")
         if (open_question := doubt(images)) is not None:
             tell(f"warning: {path}: {open_question}")
+        check(map(str, images[:1]))
         return _followed(path) if follow else (Frame(str(image)) for image in images)
     if path.is_char_device() or (source.isdigit() and not path.exists()):
         return camera_frames(source, sensor)
@@ -66,7 +77,25 @@ def all_frames(source: str, follow: bool = False, sensor: str | None = None, mas
         )
     if path.suffix.lower() in _IMAGES:
         raise UsageError(f"{path}: is one image; give its folder, or use 'geomtact localize'")
-    return _filmed(path, masks)
+    frames = _filmed(path, masks)
+    first = next(frames, None)
+    if first is None:
+        raise InputError(f"{path}: holds no image; give a whole video, or a folder of images")
+    check([first.image])
+    return chain([first], frames)
+
+
+def check_first(images: Iterable[Any], sensor: Sensor, kind: str, background: str | None) -> None:
+    """Refuse a first image that the sensor cannot have made, or that cannot be read, before minutes go into an index.
+
+    Raises
+    ------
+    ImageError
+    """
+    from geomtact.sensing.reading import read_observation
+
+    for image in images:
+        read_observation(image, sensor, kind, background)
 
 
 def listed(folder: Path) -> list[Path]:
@@ -91,44 +120,69 @@ def newest_in(folder: Path) -> Generator[Frame, None, None]:
             time.sleep(_POLL)
 
 
-def camera_frames(source: str, sensor: str | None = None) -> Generator[Frame, None, None]:
+def camera_frames(source: str, sensor: Sensor | None = None) -> Generator[Frame, None, None]:
     """The newest frame of a camera each time it is asked for, until there are no more; none waits in a queue.
 
     Parameters
     ----------
     source : number of the camera, its device, or a URL
-    sensor : name or file of the one whose size of image the camera is asked for, and whose border is cut off
+    sensor : whose size of image the camera is asked for; what comes straight from the camera is turned as the maker's driver
+        does, and its border is cut off
 
     Raises
     ------
-    SensorError, InputError
-        There is no such sensor; or the camera cannot be opened, or gives no image.
+    InputError
+        The camera cannot be opened, gives no image, or (ImageError) one of another size than the sensor's.
     """
     import cv2
 
-    from geomtact.sensing.sensor import Sensor
-
-    taken_by = None if sensor is None else Sensor.load(sensor)
+    size = None if sensor is None or sensor.border_fraction else sensor.camera_size_px
+    if size is not None and sensor is not None and sensor.driver_rotation_deg in (90, 270):
+        size = size[::-1]
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(int(source) if source.isdigit() else _name_for_opencv(source))
     if not capture.isOpened():
         raise InputError(
             f"camera {source}: cannot be opened; give the number of a camera of this computer, its device, or a URL"
         )
-    if taken_by is not None:
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, taken_by.image_size_px[0])
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, taken_by.image_size_px[1])
+    if size is not None:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
 
-    def read() -> Any:
-        image = _next_rgb(capture)
-        if image is None or taken_by is None or not taken_by.border_fraction:
-            return image
-        return cv2.resize(image[taken_by.cut(image.shape)], taken_by.image_size_px, interpolation=cv2.INTER_AREA)
-
-    first = [read()]
+    first = [_next_rgb(capture)]
     if first[0] is None:
         raise InputError(f"camera {source}: gives no image; does another program use it?")
-    return newest(lambda: first.pop() if first else read(), capture.release)
+    if sensor is not None:
+        _check_camera(first[0], sensor, source)
+    return newest(lambda: _driven(first.pop() if first else _next_rgb(capture), sensor), capture.release)
+
+
+def _check_camera(image: Any, sensor: Sensor, source: str) -> None:
+    """Refuse a camera's image (H, W, 3) of another size than the sensor's; say whether it is turned."""
+    from geomtact.sensing.change import check_size
+
+    check_size(sensor.upright(_driven(image, sensor)), sensor, f"camera {source}")
+    if sensor.straight_from_camera(image):
+        tell(
+            f"camera {source}: {image.shape[1]} x {image.shape[0]} px are turned by {sensor.driver_rotation_deg} degrees "
+            f"counter-clockwise, as the driver of {sensor.name} does"
+        )
+
+
+def _driven(image: Any, sensor: Sensor | None) -> Any:
+    """A camera's image (H, W, 3), or None, as the maker's driver gives it: turned, or without its border."""
+    if image is None or sensor is None:
+        return image
+    import cv2
+    import numpy as np
+
+    from geomtact.sensing.change import has_aspect_of
+
+    if sensor.straight_from_camera(image):
+        image = np.rot90(image, sensor.driver_rotation_deg // 90)
+    if sensor.border_fraction and has_aspect_of(image.shape, sensor):
+        image = cv2.resize(image[sensor.cut(image.shape)], sensor.camera_size_px, interpolation=cv2.INTER_AREA)
+    return image
 
 
 def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) -> Generator[Frame, None, None]:

@@ -38,7 +38,7 @@ def localize_live(
                 continue
             touched |= posterior.contact
             if background is None and not posterior.contact and posterior.observation.kind == "reading":
-                background = posterior.observation.image
+                background = frame.image
             line = line_of(n, posterior)
             own = {
                 "image": frame.image if isinstance(frame.image, str) else None,

@@ -19,6 +19,9 @@ from geomtact.cli.options import (
     Kind,
     KindName,
     MaxPoses,
+    Mirror,
+    Mounting,
+    Rotate,
     ScorerName,
     Seed,
     SensorName,
@@ -77,6 +80,8 @@ def localize(
     effort: EffortName = None,
     scorer: ScorerName = None,
     seed: Seed = 0,
+    rotate: Rotate = None,
+    mirror: Mirror = None,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -143,7 +148,8 @@ def localize(
     if len(parts) == 1:
         values["object"] = parts[0]
 
-    asked = _Asked(images, kind, values, sources, prior, sides, scorer, seed, max_poses, cache_dir)
+    mounting = Mounting(rotate, mirror)
+    asked = _Asked(images, kind, values, sources, prior, sides, scorer, seed, max_poses, cache_dir, mounting)
     if live:
         _follow(asked, camera)
         return
@@ -191,6 +197,7 @@ class _Asked:
     seed: int
     max_poses: int | None
     cache_dir: Path | None
+    mounting: Mounting
 
     def opened(self, own: dict[str, Any], quiet: bool = False, frame: str = "sensor") -> Localizer:
         """The localizer of what is asked for, with ``own`` values in the place of those; ``quiet``: where values come from is not
@@ -198,17 +205,28 @@ class _Asked:
         sources = {} if quiet else self.sources
         values = {**self.values, **own}
         return open_localizer(
-            values, sources, self.scorer, self.cache_dir, self.max_poses, self.prior, frame, self.approach
+            values,
+            sources,
+            self.scorer,
+            self.cache_dir,
+            self.max_poses,
+            self.prior,
+            frame,
+            self.approach,
+            mounting=self.mounting,
         )
 
 
 def _follow(asked: _Asked, camera: str | None) -> None:
     """Localize the newest image of a camera, or of a folder, again and again."""
-    from geomtact.cli.frames import camera_frames, newest_in
+    from geomtact.cli.frames import camera_frames, check_first, listed, newest_in
     from geomtact.cli.live import localize_live
 
     # a camera that is not there is told before minutes go into an index
-    frames = newest_in(asked.images[0]) if camera is None else camera_frames(camera, asked.values["sensor"])
+    sensor = asked.values["sensor"] and asked.mounting.of(asked.values["sensor"])
+    frames = newest_in(asked.images[0]) if camera is None else camera_frames(camera, sensor)
+    if camera is None and sensor is not None:
+        check_first(map(str, listed(asked.images[0])[:1]), sensor, asked.kind, asked.values["background"])
     options = {"kind": asked.kind, "prior": asked.prior, "effort": asked.values["effort"], "seed": asked.seed}
     if not localize_live(asked.opened({}), frames, asked.values["background"], options):
         raise typer.Exit(NO_CONTACT)
@@ -228,7 +246,7 @@ def _identified(asked: _Asked, parts: Sequence[str | None], placed: SensorPoses 
     for image, gel in zip(images, gels, strict=True):
         if gel is not None:
             # a bad image is told before minutes go into an index
-            read_observation(image, gel, asked.kind, values["background"])
+            read_observation(image, asked.mounting.of(gel), asked.kind, values["background"])
     frame = "sensor" if placed is None else "world"
     took, units = 0.0, dict(zip(parts, units_of(parts, values["unit"]), strict=True))
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from geomtact.errors import InputError, UsageError, nearest_name
+
+if TYPE_CHECKING:
+    from geomtact.sensing.sensor import Sensor
 
 
 class Kind(StrEnum):
@@ -60,6 +64,23 @@ EffortName = Annotated[
         show_default=False,
     ),
 ]
+Rotate = Annotated[
+    int | None,
+    typer.Option(
+        "--rotate",
+        metavar="0|90|180|270",
+        help="Degrees by which images are turned, counter-clockwise, as the camera is mounted; else as the sensor's file says.",
+        show_default=False,
+    ),
+]
+Mirror = Annotated[
+    bool | None,
+    typer.Option(
+        "--mirror/--no-mirror",
+        help="Whether images are mirrored left to right before that; else as the sensor's file says.",
+        show_default=False,
+    ),
+]
 Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of all randomness.")]
 CacheDir = Annotated[
     Path | None,
@@ -94,6 +115,41 @@ def approach_from(sides: list[str] | None) -> list[tuple[list[float], float]] | 
             raise UsageError(f"--approach: expected a direction, got {side!r}, which has no length")
         out.append(([x, y, z], math.radians(degrees)))
     return out
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the command line says that the camera is mounted; None where it does not say it.
+
+    Raises
+    ------
+    UsageError
+        It cannot be turned so.
+    """
+
+    rotate: int | None = None
+    mirror: bool | None = None
+
+    def __post_init__(self) -> None:
+        if self.rotate not in (None, 0, 90, 180, 270):
+            raise UsageError(f"--rotate: expected 0, 90, 180 or 270 degrees, counter-clockwise, got {self.rotate}")
+
+    @property
+    def said(self) -> bool:
+        """Whether the command line says it at all."""
+        return self.rotate is not None or self.mirror is not None
+
+    def of(self, sensor: str | Path | Sensor, masks: bool = True) -> Sensor:
+        """The sensor, mounted so; with ``masks`` every image is turned, be it a mask or a depth map."""
+        from geomtact.sensing.sensor import Sensor
+
+        found = Sensor.load(sensor)
+        if not self.said:
+            return found
+        rotation = found.camera_rotation_deg if self.rotate is None else self.rotate
+        mirrored = found.camera_mirrored if self.mirror is None else self.mirror
+        turned = replace(found, camera_rotation_deg=rotation, camera_mirrored=mirrored)
+        return replace(turned, camera_masks=True) if masks else turned
 
 
 def check_name(option: str, name: str, known: type[StrEnum], file: str | None = None) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, parts_of_tasks
-from geomtact.cli.options import Approaches, CacheDir, MaxPoses, ScorerName, SensorName, Unit, approach_from
+from geomtact.cli.options import Approaches, CacheDir, MaxPoses, Mounting, ScorerName, SensorName, Unit, approach_from
 from geomtact.cli.shell import progress_bar, tell
 from geomtact.errors import UsageError
 
@@ -135,12 +135,12 @@ def open_localizer(
     frame: str = "sensor",
     approach: Approach | None = None,
     given: str | None = None,
+    mounting: Mounting | None = None,
 ) -> Localizer:
     """The localizer for resolved options, with a progress bar where its index has to be built first.
 
     A ``prior`` of another object, or not in ``frame``, is refused before that. ``approach`` is as of ``Localizer.prepare``,
-    ``given`` how the object is named on the
-    command line, if not by --object.
+    ``given`` how the object is named on the command line, if not by --object; the camera's ``mounting`` as that says.
     """
     from geomtact.cli.project import require
     from geomtact.geometry.catalogue import catalogue
@@ -160,7 +160,7 @@ def open_localizer(
 
     scorer = scorer or DEFAULT_SCORER
     check_name(scorer)  # a wrong name is told before minutes go into an index
-    gel = Sensor.load(sensor)
+    gel = Sensor.load(sensor) if mounting is None else mounting.of(sensor)
     mesh = load_mesh(object_name, values["unit"], sensor=gel)
     if prior is not None:
         check_same(heading(prior), mesh, frame)

@@ -96,7 +96,7 @@ def simulate(
         ]
         rng = np.random.default_rng([seed, 2])
         background, *shown = (example_reading(h, pressed.pixel_pitch, SPOILT[noise.value], rng) for h in heights)
-        write_image(out / "background.png", background)
+        write_image(out / "background.png", background, metadata)
     for k, touch in enumerate(touches, 1):
         stem = f"{mesh.name}_{k}"
         truth = {

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.frames import Frame, all_frames, listed
+from geomtact.cli.frames import Frame, all_frames, check_first, listed
 from geomtact.cli.lines import line_of, to_line
 from geomtact.cli.options import (
     Background,
@@ -19,6 +19,9 @@ from geomtact.cli.options import (
     Kind,
     KindName,
     MaxPoses,
+    Mirror,
+    Mounting,
+    Rotate,
     ScorerName,
     Seed,
     SensorName,
@@ -72,6 +75,8 @@ def track(
     ] = None,
     follow: Follow = False,
     skip_broken: SkipBroken = False,
+    rotate: Rotate = None,
+    mirror: Mirror = None,
     tum: Annotated[
         Path | None, typer.Option(help="Write the first modes as a TUM trajectory: timestamp tx ty tz qx qy qz qw.")
     ] = None,
@@ -90,6 +95,7 @@ def track(
     check_file(report, "--report")
     given = given_of(object_name, unit, sensor, background, effort)
     options: dict[str, Any] = {"kind": kind, "prior": prior, "most": most, "skip_broken": skip_broken, "seed": seed}
+    options["mounting"] = Mounting(rotate, mirror)
     localizer, posteriors = open_track(source, given, follow, motion_mm, scorer, max_poses, cache_dir, **options)
 
     from geomtact.report.exchange import tum_line
@@ -135,6 +141,7 @@ def open_track(
     kind: str,
     skip_broken: bool,
     seed: int,
+    mounting: Mounting,
     prior: Path | None = None,
     most: int | None = None,
 ) -> tuple[Localizer, Iterator[tuple[float | None, Posterior]]]:
@@ -147,8 +154,14 @@ def open_track(
     values, sources = resolve(given, _metadata(source))
     effort = values["effort"] or Effort.balanced.value
     check_name("effort", effort, Effort, sources.get("effort"))
-    frames = all_frames(source, follow, values["sensor"], masks=kind == Kind.mask.value)
-    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior)
+    sensor = mounting.of(values["sensor"]) if values["sensor"] else None
+
+    def check(first: Iterable[Any]) -> None:
+        if sensor is not None and not skip_broken:
+            check_first(first, sensor, kind, values["background"])
+
+    frames = all_frames(source, follow, sensor, check, masks=kind == Kind.mask.value)
+    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior, mounting=mounting)
 
     from geomtact.inference.motion import UniformBall
     from geomtact.inference.sequence import track as followed

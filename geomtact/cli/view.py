@@ -14,6 +14,9 @@ from geomtact.cli.options import (
     Kind,
     KindName,
     MaxPoses,
+    Mirror,
+    Mounting,
+    Rotate,
     ScorerName,
     Seed,
     SensorName,
@@ -45,6 +48,8 @@ def view(
     motion_mm: MotionMm = MOTION_MM,
     follow: Follow = False,
     skip_broken: SkipBroken = False,
+    rotate: Rotate = None,
+    mirror: Mirror = None,
     host: Annotated[
         str, typer.Option(help="Address to serve the page at; 0.0.0.0 lets other machines look.")
     ] = "127.0.0.1",
@@ -64,7 +69,17 @@ def view(
     check_viewer(host)  # before minutes go into an index
     given = given_of(object_name, unit, sensor, background, effort)
     localizer, posteriors = open_track(
-        source, given, follow, motion_mm, scorer, max_poses, cache_dir, kind=kind, skip_broken=skip_broken, seed=seed
+        source,
+        given,
+        follow,
+        motion_mm,
+        scorer,
+        max_poses,
+        cache_dir,
+        kind=kind,
+        skip_broken=skip_broken,
+        seed=seed,
+        mounting=Mounting(rotate, mirror),
     )
 
     viewer, touched = Viewer(localizer.mesh, host, port), False

@@ -352,8 +352,7 @@ class Localizer:
 
 def _calibrated_as(localizer: Localizer, sensor: Sensor) -> Localizer:
     """``localizer`` on another sensor of the same geometry, whose readings are read in its own way."""
-    held, wanted = ((s.colour, s.height_noise, s.contact_method) for s in (localizer.sensor, sensor))
-    if held == wanted:
+    if all(getattr(localizer.sensor, f.name) == getattr(sensor, f.name) for f in fields(Sensor) if f.name != "note"):
         return localizer
     return replace(localizer, index=replace(localizer.index, sensor=sensor))
 

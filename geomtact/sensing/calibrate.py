@@ -20,7 +20,7 @@ from geomtact.errors import InputError, UsageError
 from geomtact.se3 import Array
 from geomtact.sensing.ball import OnBall, from_middle
 from geomtact.sensing.change import check_size
-from geomtact.sensing.colour import ColourTable, fit_weights, terms
+from geomtact.sensing.colour import ColourTable, fit_weights, kept, terms
 from geomtact.sensing.height import relief
 from geomtact.sensing.press import SAME, Press, find_presses, named_image
 from geomtact.sensing.sensor import Sensor
@@ -104,10 +104,10 @@ def calibrated(
         )
     if not (np.isfinite(ball_diameter) and 1e-4 < ball_diameter < 0.1):
         raise UsageError(f"ball_diameter: expected metres, 0.0001 to 0.1, got {ball_diameter}; 6.31 mm is 0.00631")
-    reference = named_image(background, "background")[1]
     known = None if sensor is None else Sensor.load(sensor)
+    reference = named_image(background, "background", known)[1]
     pitch = known.pixel_pitch if pixel_pitch is None and known is not None else pixel_pitch
-    found, left_out = find_presses(presses, reference, None if pitch is None else _pair(pitch))
+    found, left_out = find_presses(presses, reference, None if pitch is None else _pair(pitch), known)
     radius = 0.5 * ball_diameter
     # the pitch with which no imprint is wider than the ball
     most = radius / max((press.radius for press in found), default=np.inf)
@@ -130,6 +130,8 @@ def calibrated(
     base = known or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
     check_size(reference, base, "background")
     sensor, diameters = _fitted(found, replace(base, name=name or base.name, pixel_pitch=pitch), radius)
+    assert sensor.colour is not None
+    sensor = replace(sensor, colour=replace(sensor.colour, background=kept(reference)))
     off = float(np.nanmedian(diameters)) / ball_diameter - 1 if np.isfinite(diameters).any() else np.inf
     if not abs(off) < _HOPELESS:
         raise InputError(

@@ -17,13 +17,14 @@ from geomtact.sensing.pixels import Mask, blurred, closed, every, filled, median
 from geomtact.sensing.sensor import Sensor
 
 GRID = 120  # smoothing lengths along an image's shorter side
+Image = NDArray[np.floating]  # (H, W, 3) of 0..1
 _GREY = 1 / 255
 _ALIKE = 0.02  # by which a camera's frame may be wider or narrower than the image that is cut out of it
 _APART = 3  # pixels from one to the next that a smooth background is fitted to
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 
 
-def colour_change(image: NDArray[np.floating], background: NDArray[np.floating]) -> tuple[Array, Mask]:
+def colour_change(image: Image, background: Image) -> tuple[Array, Mask]:
     """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it is felt."""
     image, _ = without_flicker(image, background)
     change, felt, _, _ = change_from(image, background, min(image.shape[:2]) / GRID)
@@ -31,7 +32,7 @@ def colour_change(image: NDArray[np.floating], background: NDArray[np.floating])
 
 
 def change_from(
-    image: Array, background: Array, sigma: float, estimated: bool = False
+    image: Image, background: Image, sigma: float, estimated: bool = False
 ) -> tuple[Array, Mask, Mask, float]:
     """The smoothed change (H, W, 3) from the background, which may be ``estimated``, where it is felt and where strongly so, and
     its noise."""
@@ -64,10 +65,10 @@ def smooth_background(image: Array) -> Array:
 def _without_light_drift(image: Array, reference: Array, step: int) -> Array:
     """``image`` minus the background, whose brightness is fitted per channel (gain, offset) to the calmer half of one in
     ``step`` pixels each way."""
-    some = [every(step, n) for n in image.shape[:2]]
+    rows, columns = (every(step, n) for n in image.shape[:2])
     gains, offsets = np.empty(3, image.dtype), np.empty(3, image.dtype)
     for c in range(3):
-        x, y = (each[*some, c].ravel() for each in (reference, image))
+        x, y = (each[rows, columns, c].ravel() for each in (reference, image))
         calm_x, calm_y = x, y
         for _ in range(6):
             mean_x, mean_y = calm_x.sum() / calm_x.size, calm_y.sum() / calm_y.size
@@ -132,20 +133,24 @@ def as_unit_rgb(image: Any, name: str) -> Array:
 
 
 def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = None) -> None:
-    """Refuse an image (H, W, ...) of another size than the sensor's; ``do`` says what to do, where it is not transposed."""
+    """Refuse an image (H, W, ...) of another size than the sensor's; ``do`` says what to do, unless it is turned."""
     height, width = array.shape[:2]
     if (width, height) == sensor.image_size_px:
         return
     wanted, given = "{} x {} px".format(*sensor.image_size_px), f"{width} x {height} px"
-    if (height, width) == sensor.image_size_px:
-        turned = "array.T" if array.ndim == 2 else "array.swapaxes(0, 1)"
+    if (height, width) == sensor.image_size_px and sensor.camera_rotation_deg in (90, 270):
         hint = (
-            f"the image is transposed: transpose it ({turned}) or rotate it by 90 degrees, as it was taken; or name the sensor "
-            "that took it, whose image_size_px is the width, then the height"
+            f"it was turned by {sensor.camera_rotation_deg} degrees, and image_size_px is that after it: write it so into a "
+            "sensor file of its own, or leave the turn out"
+        )
+    elif (height, width) == sensor.image_size_px:
+        hint = (
+            "width and height are exchanged: say how the camera is mounted (--rotate 90 or 270, or camera_rotation_deg in the "
+            "sensor's file), or name the sensor that took it; an array has rows first, (height, width)"
         )
     elif do is not None:
         hint = do
-    elif sensor.border_fraction and width > sensor.image_size_px[0] and _alike(array.shape, sensor):
+    elif sensor.border_fraction and width > sensor.image_size_px[0] and has_aspect_of(array.shape, sensor):
         rows, columns = sensor.cut(array.shape)
         hint = (
             f"of the camera's whole frame give image[{rows.start}:{rows.stop}, {columns.start}:{columns.stop}] scaled to "
@@ -162,7 +167,7 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
     raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
 
 
-def _alike(shape: tuple[int, ...], sensor: Sensor) -> bool:
+def has_aspect_of(shape: tuple[int, ...], sensor: Sensor) -> bool:
     """Whether an image (h, w, ...) is about as wide for its height as the sensor's."""
     width, height = sensor.image_size_px
     return abs(shape[1] * height / (shape[0] * width) - 1) < _ALIKE

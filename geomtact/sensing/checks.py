@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.se3 import Array
+from geomtact.sensing.colour import ColourTable, coarse
 
 _COARSE = 48  # pixels along the shorter side
 _DARK, _DARK_SHARE = 0.02, 0.5  # all channels below this, in more than this share of the pixels
@@ -23,13 +24,13 @@ _DRIFT = 0.2  # change of brightness since the background
 # not so bright around, and the share of an image that is so
 _AROUND, _HOLE, _WHITE, _GREY, _TORN_SHARE = 29, 0.4, 0.9, 0.7, 0.002
 
-_FAULTS = {
-    "channels": "red and blue seem to be exchanged: the image's channels fit the background's in the order BGR; give RGB",
-    "half": "the image fits the background turned by 180 degrees; give both as the camera made them",
-    "mirror": "the image fits the background mirrored left to right; give both as the camera made them",
-    "upside": "the image fits the background mirrored top to bottom; give both as the camera made them",
-    "left": "the image fits the background turned by 90 degrees to the left; give both as the camera made them",
-    "right": "the image fits the background turned by 90 degrees to the right; give both as the camera made them",
+_CHANNELS = "channels"
+_WAYS = {
+    "half": "turned by 180 degrees",
+    "mirror": "mirrored left to right",
+    "upside": "mirrored top to bottom",
+    "left": "turned by 90 degrees to the left",
+    "right": "turned by 90 degrees to the right",
 }
 
 
@@ -49,26 +50,62 @@ def faults(image: Array, background: Array | None) -> list[str]:
     seen, rest = _coarse(image), _coarse(background)
     gain = float(np.median(seen.mean(-1)) / max(float(np.median(rest.mean(-1))), 1e-6))
     seen /= max(gain, 1e-6)
-    off = _off(seen, rest)
-    if off < _LEAST:
-        return _background_outdated(rest, seen, gain)
-    others = {
-        "channels": seen[..., ::-1],
-        "half": seen[::-1, ::-1],
-        "mirror": seen[:, ::-1],
-        "upside": seen[::-1],
-    }
-    if seen.shape[0] == seen.shape[1]:
-        others |= {"left": np.rot90(seen, -1), "right": np.rot90(seen)}
-    best, least = min(((name, _off(other, rest)) for name, other in others.items()), key=lambda found: found[1])
-    if least < _BETTER * off:
-        return [_FAULTS[best]]
+    off, other = _likelier(seen, rest)
+    if other == _CHANNELS:
+        return [
+            "red and blue seem to be exchanged: the image's channels fit the background's in the order BGR; give RGB"
+        ]
+    if other:
+        return [f"the image fits the background {_WAYS[other]}; give both as the camera made them"]
     if off > _UNLIKE:
         return [
             f"the background seems to be of another sensor or light: half of the image is off by more than {100 * off:.0f} % of "
             "full brightness; take one with this sensor, untouched, now"
         ]
     return _background_outdated(rest, seen, gain)
+
+
+def unlike_calibrated(background: Array, colour: ColourTable) -> list[str]:
+    """What seems wrong with readings of a calibrated sensor whose background is (H, W, 3), 0..1, in the sensor frame: it is held
+    against the one that the ``colour`` was fitted with, where that was kept."""
+    if colour.rest is None:
+        return []
+    gain = colour.brighter(background)
+    off, other = _likelier(coarse(background, colour.rest.shape) / gain, colour.rest)
+    if other == _CHANNELS:
+        return [
+            "red and blue seem to be exchanged in the image and its background alike: the background fits that of the sensor's "
+            "calibration in the order BGR; give RGB"
+        ]
+    if other:
+        return [
+            f"image and background seem to be {_WAYS[other]} since the sensor was calibrated: give them as the presses were, or "
+            "say how the camera is mounted (--rotate, --mirror, or camera_rotation_deg in the sensor's file)"
+        ]
+    if off > _UNLIKE:
+        return [
+            f"the background is unlike that of the sensor's calibration: half of it is off by more than {100 * off:.0f} % of "
+            "full brightness; calibrate the sensor again, with this gel and light"
+        ]
+    if abs(gain - 1) <= _DRIFT:
+        return []
+    way = "brighter" if gain > 1 else "darker"
+    return [
+        f"image and background are {100 * abs(gain - 1):.0f} % {way} than when the sensor was calibrated: heights are scaled for "
+        "that; better set the light and the exposure as they were"
+    ]
+
+
+def _likelier(seen: NDArray[np.floating], rest: NDArray[np.floating]) -> tuple[float, str | None]:
+    """By how much an image (h, w, 3) is off one at rest, and what was done to it if it is off far less when that is undone."""
+    off = _off(seen, rest)
+    if off < _LEAST:
+        return off, None
+    others = {_CHANNELS: seen[..., ::-1], "half": seen[::-1, ::-1], "mirror": seen[:, ::-1], "upside": seen[::-1]}
+    if seen.shape[0] == seen.shape[1]:
+        others |= {"left": np.rot90(seen, -1), "right": np.rot90(seen)}
+    best, least = min(((name, _off(other, rest)) for name, other in others.items()), key=lambda found: found[1])
+    return off, best if least < _BETTER * off else None
 
 
 def exposure(image: Array, name: str) -> list[str]:

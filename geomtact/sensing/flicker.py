@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from geomtact.se3 import Array
 from geomtact.sensing.pixels import median_of
@@ -17,7 +18,7 @@ _LESS, _LESS_IN_STRIP, _LESS_IN_COLOUR = 1.1, 1.0, 0.95
 _DARKEST, _BRIGHTEST = 1 / 255, 0.98  # brightness between which a camera counts light
 
 
-def without_flicker(image: Array, background: Array) -> tuple[Array, float]:
+def without_flicker(image: NDArray[np.floating], background: NDArray[np.floating]) -> tuple[Array, float]:
     """An image (H, W, 3) of 0..1 whose rows, or columns, are as bright as those of its background, where the change is stripes of
     light; and how bright these were, rms, relative: 0 where there are none, and the image is as it was.
 
@@ -27,14 +28,14 @@ def without_flicker(image: Array, background: Array) -> tuple[Array, float]:
     down, across = _stripes(image, background), _stripes(image.swapaxes(0, 1), background.swapaxes(0, 1))
     rms = [float(np.sqrt((each**2).mean())) for each in (down, across)]
     if not any(rms):
-        return image, 0.0
+        return np.asarray(image), 0.0
     evened = np.minimum(image * np.exp(-(down[:, None, None] if rms[0] >= rms[1] else across[:, None])), 1)
     # what is blown out is as bright as that at least
     evened = np.where(image < _BRIGHTEST, evened, np.maximum(evened, np.minimum(background, image)))
     return evened.astype(image.dtype), max(rms)
 
 
-def _stripes(image: Array, background: Array) -> Array:
+def _stripes(image: NDArray[np.floating], background: NDArray[np.floating]) -> Array:
     """Log of the brightness of each row (H,), 0 where there are no stripes along rows."""
     h, none = len(image), np.zeros(len(image))
     seen, rest = (

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import SensorError
 from geomtact.se3 import Array
-from geomtact.sensing.change import as_unit_rgb, background_of, check_size, colour_change
+from geomtact.sensing.change import as_unit_rgb, check_size, colour_change, same_size
 from geomtact.sensing.colour import ColourTable
 from geomtact.sensing.sensor import Sensor
 from geomtact.sensing.slope import integrate
@@ -28,7 +28,8 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
 
     Returns
     -------
-    (H, W) metres, >= 0; 0 where nothing is felt
+    (H, W) metres, >= 0, in the sensor frame; 0 where nothing is felt. Where image and background are darker or brighter than when
+    the sensor was calibrated, that is made up for
 
     Raises
     ------
@@ -43,9 +44,18 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
             f"sensor {sensor.name}: its colours are not calibrated, so a reading has no heights; press a ball of known "
             "diameter and run 'geomtact calibrate', or use contact_mask"
         )
-    image = as_unit_rgb(image, "image")
+    image = sensor.upright(as_unit_rgb(image, "image"))
     check_size(image, sensor, "image")
-    change, felt = colour_change(image, background_of(background, image))
+    return height_of(
+        image, same_size(sensor.upright(as_unit_rgb(background, "background")), image, "background", "image"), sensor
+    )
+
+
+def height_of(image: Array, background: Array, sensor: Sensor) -> NDArray[np.float32]:
+    """As :func:`contact_height`, of images (H, W, 3) of 0..1 in the frame of a calibrated sensor."""
+    assert sensor.colour is not None
+    change, felt = colour_change(image, background)
+    change = change / sensor.colour.brighter(background)
     return (np.maximum(relief(change, felt, sensor.colour, sensor.pixel_pitch), 0) * felt).astype(np.float32)
 
 

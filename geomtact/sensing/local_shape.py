@@ -71,7 +71,8 @@ def contact_mask(
     image : (H, W, 3) uint8 or float 0..1, RGB; or a path
     background : (H, W, 3) the same sensor without contact, or a path; None: a smooth one is estimated from the image itself,
         which serves for contacts much smaller than the window
-    sensor : gives the pixel pitch where columns and rows differ, and the size to check; None: square pixels
+    sensor : gives the pixel pitch where columns and rows differ, the size to check, and how the camera is mounted; None: square
+        pixels
     method : "classical": within the rim where the gel is steepest, by its slope, which colours tell up to a factor; "pressure":
         where, by that slope, a thick elastic gel is pressed on; "learned": by a network trained on simulated readings alone;
         or "auto": learned where more than a hundredth of what changes is blown out, else classical. On a white gel, all of
@@ -80,7 +81,7 @@ def contact_mask(
 
     Returns
     -------
-    (H, W) bool; all False where nothing stands out of the image's own noise
+    (H, W) bool, in the sensor frame where a sensor is given; all False where nothing stands out of the image's own noise
 
     Raises
     ------
@@ -89,13 +90,17 @@ def contact_mask(
     UsageError
         There is no such ``method``.
     """
+    if sensor is not None:
+        sensor = Sensor.load(sensor)
+        image = sensor.upright(as_unit_rgb(image, "image"))
+        background = None if background is None else sensor.upright(as_unit_rgb(background, "background"))
     return find_contact(image, background, sensor, method).mask
 
 
 def find_contact(
     image: Any, background: Any = None, sensor: Sensor | str | None = None, method: str | None = None
 ) -> FoundContact:
-    """As :func:`contact_mask`, with what else is known of how it was found."""
+    """As :func:`contact_mask`, of images in the sensor frame, with what else is known of how it was found."""
     if method is not None and method not in CONTACT_METHODS:
         raise UsageError(f"contact_mask: no method named {method!r}{nearest_name(str(method), CONTACT_METHODS)}")
     image = as_unit_rgb(image, "image")

@@ -13,7 +13,7 @@ from geomtact.se3 import Array
 Mask = NDArray[np.bool_]
 
 
-def blurred(image: Array, sigma: float) -> Any:
+def blurred(image: NDArray[np.floating], sigma: float) -> Any:
     """``image`` (H, W) or (H, W, C) smoothed by ``sigma`` [px], in single precision."""
     return cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
 

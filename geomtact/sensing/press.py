@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from geomtact.se3 import Array
 from geomtact.sensing.change import as_unit_rgb, colour_change, same_size
 from geomtact.sensing.local_shape import contact_of
+from geomtact.sensing.sensor import Sensor
 
 SAME = "it is the same image as one before"
 _ROUND = 0.05  # of the radius that half of an outline may stray from its circle
@@ -41,14 +42,14 @@ class Press:
 
 
 def find_presses(
-    images: Sequence[Any], reference: Array, pitch: tuple[float, float] | None
+    images: Sequence[Any], reference: Array, pitch: tuple[float, float] | None, sensor: Sensor | None = None
 ) -> tuple[list[Press], dict[str, str]]:
-    """Those of the images that show a ball, and why the others do not."""
+    """Those of the images of a ``sensor`` that show a ball, and why the others do not."""
     found, left_out = [], {}
     seen: list[Array] = []
     stretch = 1.0 if pitch is None else pitch[1] / pitch[0]
     for number, source in enumerate(images, 1):
-        name, image = named_image(source, f"press {number}")
+        name, image = named_image(source, f"press {number}", sensor)
         same_size(image, reference, name, "background")
         if any(np.array_equal(image, other) for other in seen):
             left_out[name] = SAME
@@ -94,6 +95,7 @@ def _circle(mask: NDArray[np.bool_], stretch: float) -> tuple[Array, float] | st
     return np.array([solved[0], solved[1] / stretch]), radius + 0.5  # a contour runs through the middles of its pixels
 
 
-def named_image(source: Any, role: str) -> tuple[str, Array]:
-    """The name of an image, and it (H, W, 3) as 0..1."""
-    return str(source) if isinstance(source, str | Path) else role, as_unit_rgb(source, role)
+def named_image(source: Any, role: str, sensor: Sensor | None = None) -> tuple[str, Array]:
+    """The name of an image, and it (H, W, 3) as 0..1, turned as the ``sensor`` is mounted."""
+    image = as_unit_rgb(source, role)
+    return str(source) if isinstance(source, str | Path) else role, image if sensor is None else sensor.upright(image)

@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.sensing.change import as_unit_rgb, check_size
-from geomtact.sensing.checks import faults
+from geomtact.sensing.checks import faults, unlike_calibrated
 from geomtact.sensing.contact import FAINT, Contact
 from geomtact.sensing.depth_map import depths_of
 from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
 from geomtact.sensing.flicker import without_flicker
-from geomtact.sensing.height import contact_height
+from geomtact.sensing.height import height_of
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 from geomtact.sensing.local_shape import contact_mask, find_contact
 from geomtact.sensing.sensor import Sensor
@@ -81,11 +81,12 @@ def read_observation(
     warnings: list[str] = []
     method = None
     name, array = _load(image, "image", warnings)
-    check_size(array, sensor, name)
     if kind in ("auto", "mask"):
         array = without_two_colours(array, name)
     if kind == "auto":
         kind = _decide(array, name, background is not None, warnings)
+    array = _in_sensor_frame(array, image, name, kind, sensor, warnings)
+    check_size(array, sensor, name)
     if kind != "reading":
         array = _grey(array)
     if background is not None and kind != "reading":
@@ -146,6 +147,32 @@ def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any
     if array.dtype.kind != "f":
         array = _grey(array)
     return name, array
+
+
+def _in_sensor_frame(
+    array: NDArray[Any], source: Any, name: str, kind: str, sensor: Sensor, warnings: list[str]
+) -> NDArray[Any]:
+    """An image (H, W, ...) of a ``source``, turned as the sensor's camera is mounted. Masks and depth maps are in the sensor
+    frame already, unless the sensor says that they are not; so is what ``simulate`` wrote."""
+    straight = sensor.straight_from_camera(array)
+    if not (sensor.turned or straight):
+        return array
+    from_file = isinstance(source, str | Path)
+    if from_file and "geomtact:sensor" in read_metadata(source):
+        return array
+    if kind != "reading" and not sensor.camera_masks:
+        if from_file and sensor.turned:
+            warnings.append(
+                f"{name}: a {kind} is taken to be in the sensor frame, so it is not turned as the camera's images are; if it is "
+                "as the camera sees, set camera_masks = true in the sensor's file, or give --rotate"
+            )
+        return array
+    if straight:
+        warnings.append(
+            f"{name}: {array.shape[1]} x {array.shape[0]} px, straight from the camera: turned by {sensor.driver_rotation_deg} "
+            f"degrees counter-clockwise, as the driver of {sensor.name} does"
+        )
+    return sensor.upright(array)
 
 
 def _grey(array: NDArray[Any]) -> NDArray[Any]:
@@ -231,6 +258,7 @@ def _reading(
         warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself{untold}")
     else:
         label, reference = _load(background, "background", warnings)
+        reference = _in_sensor_frame(reference, background, label, "reading", sensor, warnings)
         check_size(reference, sensor, label, "take it with the camera settings of the reading")
         _check_light(reference, label)
         reference = _rgb(reference, label)
@@ -260,7 +288,8 @@ def _reading(
         if grey:
             warnings.append(f"{name}: the image is grey, so the sensor's colours tell no heights: give it in colour")
         else:
-            height = contact_height(seen, reference, sensor)
+            height = height_of(seen, reference, sensor)
+            warnings.extend(f"{name}: {fault}" for fault in unlike_calibrated(reference, sensor.colour))
     return Contact(touch.mask, height, probability=touch.probability), touch.method
 
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import SensorError, did_you_mean, nearest_name
 from geomtact.files import read_text
@@ -23,6 +24,9 @@ from geomtact.sensing.colour import ColourTable
 _OTHERS = (".yaml", ".yml", ".json")  # of files that other makers' programs read
 HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
 CONTACT_METHODS = ("auto", "classical", "pressure", "learned")  # of finding the contact in a reading, the default first
+
+
+ROTATIONS = (0, 90, 180, 270)  # degrees by which a camera may be turned
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,12 @@ class Sensor:
     housing_depth : how far the object may reach below z = 0 outside the window; None rules nothing out
     height_noise : standard deviation of its heights, beside a twentieth of each
     contact_method : one of ``CONTACT_METHODS``, which finds the contact in its readings
+    camera_rotation_deg : by which an image of the camera is turned to be one of the sensor, counter-clockwise: 0, 90, 180 or 270;
+        image_size_px is that after it
+    camera_mirrored : whether it is mirrored left to right before that
+    camera_masks : whether masks and depth maps are given as the camera sees them, too, and not in the sensor frame
+    driver_rotation_deg : by which the maker's driver turns what the camera delivers; images with width and height exchanged are
+        taken to come straight from the camera, and are turned so before all else
     note : where the figures come from
     colour : how its colours tell the gel's slope; None where that is not calibrated
     border_fraction : share of the camera's frame that is cut off at each side before it is scaled to the image
@@ -54,6 +64,10 @@ class Sensor:
     housing_depth: float | None = None
     height_noise: float = field(default=HEIGHT_NOISE, compare=False)
     contact_method: str = field(default=CONTACT_METHODS[0], compare=False)
+    camera_rotation_deg: int = field(default=0, compare=False)
+    camera_mirrored: bool = field(default=False, compare=False)
+    camera_masks: bool = field(default=False, compare=False)
+    driver_rotation_deg: int = field(default=0, compare=False)
     note: str = field(default="", compare=False)
     colour: ColourTable | None = field(default=None, compare=False)
     border_fraction: float = field(default=0.0, compare=False)
@@ -109,6 +123,11 @@ class Sensor:
             f"contact_method must be one of {', '.join(CONTACT_METHODS)}, got {self.contact_method!r}"
             f"{did_you_mean(str(self.contact_method), CONTACT_METHODS)}",
         )
+        for name in ("camera_rotation_deg", "driver_rotation_deg"):
+            need(
+                getattr(self, name) in ROTATIONS,
+                f"{name} must be 0, 90, 180 or 270, counter-clockwise, got {getattr(self, name)!r}",
+            )
 
     @classmethod
     def load(cls, source: str | Path | Sensor) -> Sensor:
@@ -158,6 +177,30 @@ class Sensor:
         """Hash of the geometry (not of the note, nor of how its readings are read)."""
         geometry = [getattr(self, f.name) for f in fields(self) if f.compare]
         return hashlib.sha256(repr(geometry).encode()).hexdigest()
+
+    @property
+    def turned(self) -> bool:
+        """Whether images of the camera are turned or mirrored to be the sensor's."""
+        return self.camera_mirrored or self.camera_rotation_deg != 0
+
+    @property
+    def camera_size_px(self) -> tuple[int, int]:
+        """(width, height) of the camera's images, before they are turned by ``camera_rotation_deg``."""
+        width, height = self.image_size_px
+        return (height, width) if self.camera_rotation_deg in (90, 270) else (width, height)
+
+    def straight_from_camera(self, image: NDArray[Any]) -> bool:
+        """Whether the maker's driver has not turned an image (H, W, ...): its width and height are exchanged."""
+        width, height = self.camera_size_px
+        return self.driver_rotation_deg in (90, 270) and image.shape[:2] == (width, height) and width != height
+
+    def upright(self, image: NDArray[Any]) -> NDArray[Any]:
+        """An image (H, W, ...) of the camera, mirrored and turned as the sensor is mounted: one in the sensor frame."""
+        if self.straight_from_camera(image):
+            image = np.rot90(image, self.driver_rotation_deg // 90)
+        if self.camera_mirrored:
+            image = image[:, ::-1]
+        return np.ascontiguousarray(np.rot90(image, self.camera_rotation_deg // 90))
 
     @property
     def half_window(self) -> Array:

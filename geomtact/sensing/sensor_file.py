@@ -23,7 +23,9 @@ _PAIRS, _TEXTS = ("image_size_px", "pixel_pitch"), ("name", "contact_method", "n
 _KEYS = {f"{f.name}_mm" if f.name in _LENGTHS else f.name: f for f in fields(Sensor)}
 _REQUIRED = [key for key, f in _KEYS.items() if f.default is MISSING]
 _ALWAYS = (*_REQUIRED, "membrane_radius_mm")  # others are written where they are not the default
+_SWITCHES, _WHOLE = ("camera_mirrored", "camera_masks"), ("camera_rotation_deg", "driver_rotation_deg")
 _COLOUR_KEYS = ("weights", "slope_rms", "height_rms_mm", "contact_depth_mm")
+_BACKGROUND = "background"  # in [colour], which files of before do not hold
 
 
 def sensor_of_toml(text: str, origin: str) -> Sensor:
@@ -61,7 +63,7 @@ def toml_of_sensor(sensor: Sensor) -> str:
         values = value if f.name in _PAIRS else [value]
         if f.name in _LENGTHS:
             values = [_mm(v) for v in values]
-        text = ", ".join(_toml_string(v) if f.name in _TEXTS else f"{v}" for v in values)
+        text = ", ".join(_toml_string(v) if f.name in _TEXTS else str(v).lower() for v in values)
         lines.append(f"{key} = [{text}]" if f.name in _PAIRS else f"{key} = {text}")
     if sensor.colour is not None:
         lines += [
@@ -73,6 +75,9 @@ def toml_of_sensor(sensor: Sensor) -> str:
         ]
         rows = ("  [" + ", ".join(f"{w:.9g}" for w in row) + "]," for row in sensor.colour.weights)
         lines += ["weights = [", *rows, "]"]
+        if sensor.colour.background is not None:
+            rows = ("  [" + ", ".join(f"{v:.3g}" for v in row) + "]," for row in sensor.colour.background)
+            lines += [f"{_BACKGROUND} = [", *rows, "]"]
     return "\n".join(lines) + "\n"
 
 
@@ -97,27 +102,41 @@ def _value(key: str, value: Any) -> Any:
                 raise SensorError(f"{key} must be whole numbers, got {value}")
             return int(value[0]), int(value[1])
         return value[0] / 1e3, value[1] / 1e3
+    if name in _SWITCHES:
+        if not isinstance(value, bool):
+            raise SensorError(f"{key} must be true or false, got {value!r}")
+        return value
     if not _number(value):
         raise SensorError(f"{key} must be a number, such as 20.0, got {value!r}")
+    if name in _WHOLE:
+        return int(value) if value == int(value) else value
     return value / 1e3 if name in _LENGTHS else value
 
 
 def _colour(data: dict[str, Any]) -> ColourTable:
     """The table of a sensor file's [colour]."""
     for key in data:
-        if key not in _COLOUR_KEYS:
-            raise SensorError(f"unknown key {key!r} in [colour]{nearest_name(key, _COLOUR_KEYS)}")
+        if key not in (*_COLOUR_KEYS, _BACKGROUND):
+            raise SensorError(f"unknown key {key!r} in [colour]{nearest_name(key, (*_COLOUR_KEYS, _BACKGROUND))}")
     for key in _COLOUR_KEYS:
         if key not in data:
             raise SensorError(f"the key {key!r} is missing in [colour]; calibrate the sensor again")
     numbers = [data[key] for key in _COLOUR_KEYS[1:]]
-    rows = data["weights"] if isinstance(data["weights"], list) else []
-    lists = len(rows) == 2 and all(isinstance(row, list) for row in rows)
-    if not lists or not all(_number(v) for v in (*numbers, *rows[0], *rows[1])):
-        raise SensorError("[colour] must hold numbers, and weights two lists of them; calibrate the sensor again")
-    x, y = (tuple(map(float, row)) for row in rows)
+    rows = _rows(data["weights"])
+    background = _rows(data.get(_BACKGROUND, []))
+    if rows is None or len(rows) != 2 or background is None or not all(map(_number, numbers)):
+        raise SensorError(
+            "[colour] must hold numbers, weights two lists of them, and background lists of them; calibrate the sensor again"
+        )
     slope, height, depth = map(float, numbers)
-    return ColourTable((x, y), slope, 1e-3 * height, 1e-3 * depth)
+    return ColourTable((rows[0], rows[1]), slope, 1e-3 * height, 1e-3 * depth, background or None)
+
+
+def _rows(value: Any) -> tuple[tuple[float, ...], ...] | None:
+    """Lists of numbers; None where it is no such thing."""
+    if not isinstance(value, list) or not all(isinstance(row, list) and all(map(_number, row)) for row in value):
+        return None
+    return tuple(tuple(map(float, row)) for row in value)
 
 
 def _number(value: Any) -> bool:
