@@ -413,7 +413,7 @@ def command(flat_nut, monkeypatch, tmp_path):
     module = importlib.import_module("geomtact.cli.track")  # the package has the command itself by this name
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "open_localizer", lambda *_: flat_nut)
+    monkeypatch.setattr(module, "open_localizer", lambda *_, **__: flat_nut)
     app = typer.Typer()
     app.command()(one_line_errors(module.track))
 

@@ -87,7 +87,7 @@ def test_the_command_shows_every_image(flat_nut, a_touch, tmp_path, monkeypatch,
     seen = []
     monkeypatch.setattr(Viewer, "show", lambda self, n, posterior: seen.append((n, posterior.contact)))
     module = importlib.import_module("geomtact.cli.track")  # the package has the command itself by this name
-    monkeypatch.setattr(module, "open_localizer", lambda *_: flat_nut)
+    monkeypatch.setattr(module, "open_localizer", lambda *_, **__: flat_nut)
     width, height = flat_nut.sensor.image_size_px
     write_image(tmp_path / "0.png", np.zeros((height, width), bool))
     words = [
@@ -96,7 +96,7 @@ def test_the_command_shows_every_image(flat_nut, a_touch, tmp_path, monkeypatch,
         "--object",
         "hex_nut",
         "--sensor",
-        "gelslim",
+        "gelsight-mini",
         "--kind",
         "mask",
         "--no-stay",

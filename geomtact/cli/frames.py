@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -44,7 +44,7 @@ def all_frames(
     source: str,
     follow: bool = False,
     sensor: Sensor | None = None,
-    check: Callable[[Iterable[Any]], None] = lambda first: None,
+    check: Callable[[Any], None] = lambda image: None,
     masks: bool = False,
 ) -> Iterator[Frame]:
     """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
@@ -67,7 +67,8 @@ def all_frames(
             raise InputError(f"{path}: no image in this folder; expected {', '.join(_IMAGES)}")
         if (open_question := doubt(images)) is not None:
             tell(f"warning: {path}: {open_question}")
-        check(map(str, images[:1]))
+        if images:
+            check(str(images[0]))
         return _followed(path) if follow else (Frame(str(image)) for image in images)
     if path.is_char_device() or (source.isdigit() and not path.exists()):
         return camera_frames(source, sensor)
@@ -81,21 +82,8 @@ def all_frames(
     first = next(frames, None)
     if first is None:
         raise InputError(f"{path}: holds no image; give a whole video, or a folder of images")
-    check([first.image])
+    check(first.image)
     return chain([first], frames)
-
-
-def check_first(images: Iterable[Any], sensor: Sensor, kind: str, background: str | None) -> None:
-    """Refuse a first image that the sensor cannot have made, or that cannot be read, before minutes go into an index.
-
-    Raises
-    ------
-    ImageError
-    """
-    from geomtact.sensing.reading import read_observation
-
-    for image in images:
-        read_observation(image, sensor, kind, background)
 
 
 def listed(folder: Path) -> list[Path]:

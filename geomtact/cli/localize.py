@@ -219,14 +219,12 @@ class _Asked:
 
 def _follow(asked: _Asked, camera: str | None) -> None:
     """Localize the newest image of a camera, or of a folder, again and again."""
-    from geomtact.cli.frames import camera_frames, check_first, listed, newest_in
+    from geomtact.cli.frames import camera_frames, newest_in
     from geomtact.cli.live import localize_live
 
     # a camera that is not there is told before minutes go into an index
     sensor = asked.values["sensor"] and asked.mounting.of(asked.values["sensor"])
     frames = newest_in(asked.images[0]) if camera is None else camera_frames(camera, sensor)
-    if camera is None and sensor is not None:
-        check_first(map(str, listed(asked.images[0])[:1]), sensor, asked.kind, asked.values["background"])
     options = {"kind": asked.kind, "prior": asked.prior, "effort": asked.values["effort"], "seed": asked.seed}
     if not localize_live(asked.opened({}), frames, asked.values["background"], options):
         raise typer.Exit(NO_CONTACT)
@@ -288,6 +286,8 @@ def _give(
         "image": str(images[0]) if len(images) == 1 else [str(image) for image in images],
         "kind": asked.kind,
         "prior": asked.prior and str(asked.prior),
+        "rotate": asked.mounting.rotate,
+        "mirror": asked.mounting.mirror,
         **asked.values,
         "taken_from": asked.sources,
         "cache_dir": asked.cache_dir and str(asked.cache_dir),

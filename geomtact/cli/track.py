@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.frames import Frame, all_frames, check_first, listed
+from geomtact.cli.frames import Frame, all_frames, listed
 from geomtact.cli.lines import line_of, to_line
 from geomtact.cli.options import (
     Background,
@@ -147,6 +147,8 @@ def open_track(
 ) -> tuple[Localizer, Iterator[tuple[float | None, Posterior]]]:
     """The localizer, and the time, if the source tells one, and the posterior of each frame; parameters as of :func:`track`."""
 
+    from geomtact.sensing.reading import read_observation
+
     check_name("kind", kind, Kind)
     prior = prior and posterior_file(prior, "--prior")
     if follow and not Path(source).is_dir():
@@ -156,9 +158,9 @@ def open_track(
     check_name("effort", effort, Effort, sources.get("effort"))
     sensor = mounting.of(values["sensor"]) if values["sensor"] else None
 
-    def check(first: Iterable[Any]) -> None:
+    def check(image: Any) -> None:
         if sensor is not None and not skip_broken:
-            check_first(first, sensor, kind, values["background"])
+            read_observation(image, sensor, kind, values["background"])
 
     frames = all_frames(source, follow, sensor, check, masks=kind == Kind.mask.value)
     localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior, mounting=mounting)
