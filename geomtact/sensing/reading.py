@@ -163,8 +163,9 @@ def _in_sensor_frame(
     if kind != "reading" and not sensor.camera_masks:
         if from_file and sensor.turned:
             warnings.append(
-                f"{name}: a {kind} is taken to be in the sensor frame, so it is not turned as the camera's images are; if it is "
-                "as the camera sees, set camera_masks = true in the sensor's file, or give --rotate"
+                f"{name}: a {'depth map' if kind == 'height' else kind} is taken to be in the sensor frame, so it is not turned "
+                "as the camera's images are; if it is as the camera sees, set camera_masks = true in the sensor's file, or give "
+                "--rotate"
             )
         return array
     if straight:
