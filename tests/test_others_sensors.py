@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -151,11 +152,19 @@ def test_a_live_frame_is_cut_as_the_sensors_images_are(monkeypatch, size):
             return lambda *_: True
 
     monkeypatch.setattr(cv2, "VideoCapture", Capture)
-    image = next(camera_frames("0", "gelsight-mini")).image
+    image = next(camera_frames("0", Sensor.load("gelsight-mini"))).image
     assert image.shape == (240, 320, 3)
     np.testing.assert_allclose(image[0, 0, :2], 255 / 7, atol=3)
     np.testing.assert_allclose(image[-1, -1, :2], 255 * 6 / 7, atol=3)
     assert next(camera_frames("0")).image.shape == frame.shape
+
+
+def test_a_live_frame_of_another_aspect_is_refused(monkeypatch):
+    """A wide frame, squeezed to the sensor's size, would show every contact too narrow."""
+    monkeypatch.setattr("geomtact.cli.frames._next_rgb", lambda capture: np.zeros((720, 1280, 3), np.uint8))
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: SimpleNamespace(isOpened=lambda: True))
+    with pytest.raises(ImageError, match="expected 320 x 240 px"):
+        camera_frames("0", Sensor.load("gelsight-mini"))
 
 
 def test_it_may_be_written_out_as_toml(tmp_path):
