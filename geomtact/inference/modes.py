@@ -85,11 +85,21 @@ def mode_at(posterior: Posterior, cell: int, mass: float) -> Mode:
     """The mode with its heart at ``cell`` that holds ``mass``, in the posterior's frame."""
     found = posterior.refined.get(cell)
     if found is None:
-        T = posterior._poses_of_cells(np.array([cell]))[0]
+        T = _touching_pose(posterior, cell)
         found = Refined(T, posterior.index.cell_covariance(T), np.zeros((0, 6)), posterior.mesh.radius_rms, False)
     found = carried(found, posterior.nearest_images(found.T[None])[0])
     T = posterior.T_frame_sensor @ found.T
     return Mode(T, mass, found.covariance, found.observable, found.length, found.moved)
+
+
+def _touching_pose(posterior: Posterior, cell: int) -> Array:
+    """The pose (4, 4) of ``cell`` in the sensor frame, moved along z where it presses too deep: the index measures depths on
+    height maps, which miss what lies between their pixels."""
+    T = posterior._poses_of_cells(np.array([cell]))
+    if np.isnan(posterior.space.penetration(T)[0]):
+        settled, ok = posterior.space.settle(T, posterior.index.resolution.penetrations[cell // posterior.index.places])
+        T = np.where(ok, settled, T)
+    return np.asarray(T[0])
 
 
 def carried(found: Refined, T: Array) -> Refined:
