@@ -447,7 +447,10 @@ def test_what_a_rig_leaves_open_of_a_pose_is_what_its_errors_make_of_it(rng):
 
 
 def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
-    """Each of the sensors but the first off by 5 mm, in a direction of its own: unless the rig is said to be known no better."""
+    """Each of the sensors but the first off by 5 mm, in a direction of its own: unless the rig is said to be known no better.
+
+    Were one right rig in ten warned of, three of six would be once in 63 times.
+    """
     rng = np.random.default_rng(5)
     told, last = {"right": 0, "off": 0, "known to be": 0}, {}
     for scene in make_scenes(plug, 6, 9, MODERATE, None, 3):
@@ -466,7 +469,7 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
             except NoPoseAgreesError:
                 continue
             told[name] += any("agree badly" in warning for warning in posterior.warnings)
-    assert told["right"] <= 1 and told["off"] >= 4 and told["known to be"] == 0, told
+    assert told["right"] <= 2 and told["off"] >= told["right"] + 3 and told["known to be"] == 0, told
     exact = plug.localize(masks, "mask", T_world_sensor=off, rig=RigStd())
     assert np.array_equal(exact.log_prob, last["off"].log_prob)
     # a mode is told no better than the rig

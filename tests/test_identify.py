@@ -185,7 +185,8 @@ def test_the_study_tells_what_identify_does(drawer):
     told = list(identify_scenes(drawer[1], drawer, 2, 3, MODERATE, "fast", first=1))
     assert [[each.touches for each in some] for some in told] == [[1, 2, 3]]
     assert all(each.scene == 1 and set(each.log_probability) == {"rod", "ball", "block"} for each in told[0])
-    assert told[0][0].log_probability["ball"] > told[0][0].log_probability["rod"]
+    last = told[0][-1].log_probability  # one touch may suit either; after three the ball is 1.9 nats ahead
+    assert last["ball"] > max(last["rod"], last["block"])
 
 
 def test_figures_of_the_study_follow_from_what_was_told():
