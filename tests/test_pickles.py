@@ -67,6 +67,14 @@ def test_a_pickle_refers_to_the_cache_which_a_process_reads_once(flat_nut, a_tou
     assert pickle.loads(pickle.dumps(posterior)).index is pickle.loads(text).index
 
 
+def test_sensors_that_only_differ_in_how_their_images_are_read_stay_apart(flat_nut):
+    """They share an index, and are equal as far as contacts go."""
+    turned = replace(flat_nut.sensor, camera_rotation_deg=180)
+    other = replace(flat_nut, index=replace(flat_nut.index, sensor=turned))
+    loaded = [pickle.loads(pickle.dumps(each)).sensor.camera_rotation_deg for each in (flat_nut, other, flat_nut)]
+    assert loaded == [0, 180, 0]
+
+
 @pytest.mark.parametrize("start", ["spawn", "fork"])
 def test_a_pool_of_processes_localizes(flat_nut, a_touch, start):
     mask = a_touch(flat_nut)[1]

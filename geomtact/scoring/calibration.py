@@ -34,7 +34,7 @@ _SPREAD_TOUCHES = 10  # that the spread of the scores is taken from
 FLOORS = np.geomspace(1e-3, 0.5, 16)
 _SHAPE = (72, 96)  # of the simulated touches
 _TRIES = 20  # draws for each simulated touch, at most
-_BATCH = 8  # poses tried at once for one that touches a sensor with a housing
+_BATCH = 4  # poses tried at once for one that touches a sensor with a housing
 
 
 @dataclass(frozen=True)
