@@ -462,6 +462,28 @@ def test_what_is_folded_back_is_refused(how, tmp_path):
         load_mesh(tmp_path / "a.stl", "mm")
 
 
+@pytest.mark.parametrize(("radius", "n"), [(3, 64), (3, 256), (5, 256)])
+def test_all_of_a_fold_is_found_however_many_faces_it_has(radius, n):
+    """A plate with a round notch, its two caps cut up by fans: what a fan covers beyond the cap, it covers twice more."""
+    turn = np.linspace(0, np.pi, n + 1)
+    notch = np.stack([12 + radius * np.cos(turn), 18 - radius * np.sin(turn)], 1)
+    ring = np.concatenate([[[0, 0], [24, 0], [24, 18]], notch, [[0, 18]]])
+    m = len(ring)
+    vertices = np.concatenate([np.c_[ring, np.zeros(m)], np.c_[ring, np.full(m, 5)]])
+    k, after = np.arange(m), np.roll(np.arange(m), -1)
+    fan = np.stack([0 * k[1:-1], k[1:-1], k[2:]], 1)
+    walls = np.concatenate([np.stack([k, after, m + after], 1), np.stack([k, m + after, m + k], 1)])
+    faces = np.concatenate([fan[:, ::-1], m + fan, walls])
+
+    def area(of):
+        a, b, c = np.moveaxis(vertices[of], 1, 0)
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+    x, y = ring.T
+    cap = 0.5 * abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
+    assert area(faces[folded_faces(vertices, faces)]) == pytest.approx(area(fan) - cap, rel=1e-9)
+
+
 def test_a_thin_blade_is_no_fold():
     """Two faces that meet at half a degree, and two sides of a foil, near the origin and far from it."""
     foil = np.array([(0, 0), (30, 0), (30, 0.01), (0, 0.01)], float)

@@ -16,7 +16,8 @@ _ANGLE = 1e-3
 
 
 def folded_faces(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.intp]:
-    """The smaller face (n,) of each two that lie in one plane on the same side of an edge they share, and look opposite ways.
+    """The faces (n,) that are folded over their neighbours in one plane: of each two coplanar pieces of surface that lie on the
+    same side of a shared edge and look opposite ways, the one with less area.
 
     Edges of more than two faces are where bodies touch: nothing is a fold there. Faces without width are looked across.
 
@@ -25,6 +26,9 @@ def folded_faces(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.intp
     vertices : (V, 3)
     faces : (F, 3) indices into vertices, wound alike
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     corners = vertices[faces]
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double = np.linalg.norm(crosses, axis=1)
@@ -33,15 +37,28 @@ def folded_faces(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.intp
     has_width = double > longest * max(rounding, 1e-300)
     normals = crosses / np.where(double > 0, double, 1)[:, None]
     one, two = _neighbours(faces, has_width)
-    opposite = np.linalg.norm(normals[one] + normals[two], axis=1) < _ANGLE
-    one, two = one[opposite], two[opposite]
-    # both in both planes: the larger one's corners decide
-    apart = [
-        np.abs(np.einsum("ikj,ij->ik", corners[b] - corners[a][:, :1], normals[a])).max(1)
-        for a, b in ((one, two), (two, one))
-    ]
-    smaller = np.where(double[one] < double[two], one, two)
-    return np.unique(smaller[np.maximum(*apart) <= rounding])
+
+    def coplanar(sign: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Neighbours that lie in one plane, their normals alike (1) or opposite (-1)."""
+        found = np.linalg.norm(normals[one] - sign * normals[two], axis=1) < _ANGLE
+        a, b = one[found], two[found]
+        # each in the plane of the other: the larger one's corners decide
+        apart = [
+            np.abs(np.einsum("ikj,ij->ik", corners[there] - corners[here][:, :1], normals[here])).max(1)
+            for here, there in ((a, b), (b, a))
+        ]
+        flat = np.maximum(*apart) <= rounding
+        return a[flat], b[flat]
+
+    folded, onto = coplanar(-1)
+    if not len(folded):
+        return folded
+    joined = coplanar(1)
+    graph = coo_array((np.ones(len(joined[0])), joined), shape=(len(faces),) * 2)
+    _, piece = connected_components(graph, directed=False)
+    area = np.bincount(piece, double)
+    a, b = piece[folded], piece[onto]
+    return np.flatnonzero(np.isin(piece, np.where(area[a] < area[b], a, b)))
 
 
 def _neighbours(faces: NDArray[np.integer], has_width: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
