@@ -44,8 +44,8 @@ class Sensor:
     housing_depth : how far the object may reach below z = 0 outside the window; None rules nothing out
     height_noise : standard deviation of its heights, beside a twentieth of each
     contact_method : one of ``CONTACT_METHODS``, which finds the contact in its readings
-    camera_rotation_deg : by which an image of the camera is turned to be one of the sensor, counter-clockwise: 0, 90, 180 or 270;
-        image_size_px is that after it
+    camera_rotation_deg : counter-clockwise rotation from the camera's image to the sensor's: 0, 90, 180 or 270; image_size_px is
+        the size after it
     camera_mirrored : whether it is mirrored left to right before that
     camera_masks : whether masks and depth maps are given as the camera sees them, too, and not in the sensor frame
     driver_rotation_deg : by which the maker's driver turns what the camera delivers; images with width and height exchanged are
