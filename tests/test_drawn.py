@@ -1,6 +1,7 @@
 """Masks as people keep them: palettes, two colours, compressed TIFF, and videos."""
 
 import io
+import struct
 
 import cv2
 import numpy as np
@@ -48,6 +49,74 @@ def test_a_palette_of_two_colours_is_a_mask(tmp_path, suffix, mask, colours, bac
     for kind in ("auto", "mask"):
         seen = read_observation(tmp_path / f"mask.{suffix}", MINI, kind=kind)
         assert seen.kind == "mask" and seen.warnings == [] and np.array_equal(seen.contact.mask, mask)
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tif"])
+@pytest.mark.parametrize("mask", [MASK, NOTHING, ~NOTHING])
+@pytest.mark.parametrize("colours", [None, [0, 0, 0], [0] * 6, [9, 9, 9] * 2], ids=["none", "one", "black", "grey"])
+def test_a_palette_that_does_not_tell_its_colours_apart_counts_by_index(tmp_path, suffix, mask, colours):
+    image = Image.fromarray(mask.astype(np.uint8), "P")
+    if colours is not None:
+        image.putpalette(colours)
+    image.save(tmp_path / f"mask.{suffix}")
+    if suffix == "bmp" and (colours is None or len(colours) == 3):
+        with pytest.raises(ImageError, match="mask.bmp: its palette has one colour only; save it as a grey PNG"):
+            read_observation(tmp_path / "mask.bmp", MINI)
+        return
+    seen = read_observation(tmp_path / f"mask.{suffix}", MINI, kind="mask")
+    assert np.array_equal(seen.contact.mask, mask)
+
+
+def test_a_palette_of_many_colours_is_an_image(tmp_path):
+    """Two of which may be alike."""
+    image = Image.fromarray(COLOUR).quantize(200)
+    image.putpalette([*image.getpalette()[:597], *image.getpalette()[:3]])
+    image.save(tmp_path / "image.png")
+    assert np.array_equal(read_image(tmp_path / "image.png"), np.asarray(image.convert("RGB")))
+
+
+def test_indices_that_a_palette_does_not_tell_apart_are_refused_without_a_0(tmp_path):
+    palette(MASK, [0] * 9, 1, 2).save(tmp_path / "mask.png")
+    with pytest.raises(ImageError, match="got nothing but 1 and 2; draw contact white"):
+        read_observation(tmp_path / "mask.png", MINI)
+
+
+@pytest.mark.parametrize("suffix", ["gif", "png", "webp"])
+def test_several_frames_in_one_file_are_refused(tmp_path, suffix):
+    path, (first, *others) = tmp_path / f"frames.{suffix}", [Image.fromarray(np.roll(COLOUR, i)) for i in range(3)]
+    first.save(path, save_all=True, append_images=others)
+    with pytest.raises(ImageError, match=f"frames.{suffix}: expected one image, got 3 frames; save one frame"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+@pytest.mark.parametrize("orientation", [0, *range(1, 10)])
+def test_an_orientation_tag_is_refused_unless_it_says_upright(tmp_path, suffix, orientation):
+    path, exif = tmp_path / f"turned.{suffix}", Image.Exif()
+    exif[274] = orientation
+    Image.fromarray(COLOUR).save(path, exif=exif)
+    if orientation in (0, 1, 9):
+        assert read_image(path).shape == COLOUR.shape
+        return
+    message = (
+        f"its orientation tag, {orientation}, turns or mirrors the stored pixels; save them as the camera gives them, and "
+        "remove the tag or set it to 1"
+    )
+    with pytest.raises(ImageError, match=f"turned.{suffix}: {message}"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int64])
+def test_whole_numbers_of_0_and_one_below_are_a_mask(tmp_path, dtype):
+    array = -MASK.astype(dtype)
+    np.save(tmp_path / "mask.npy", array)
+    tifffile.imwrite(tmp_path / "mask.tif", array)
+    for given in (array, tmp_path / "mask.npy", tmp_path / "mask.tif"):
+        for kind in ("auto", "mask"):
+            seen = read_observation(given, MINI, kind=kind)
+            assert seen.kind == "mask" and seen.warnings == [] and np.array_equal(seen.contact.mask, MASK)
+    with pytest.raises(ImageError, match="image: .*nothing but -3 and 5"):
+        read_observation(np.where(MASK, 5, -3).astype(dtype), MINI)
 
 
 @pytest.mark.parametrize("colour", [(255, 0, 0), (0, 128, 0), (200, 200, 255)])
@@ -114,6 +183,20 @@ def with_0_white(data):
         return out.getvalue()
 
 
+def packed(indices, bits, photometric):
+    """An uncompressed TIFF file of whole numbers (240, 320) of less than 8 bits, with the palette RED if it is one."""
+    bytes_ = np.packbits(np.unpackbits(indices.astype(np.uint8)[..., None], -1)[..., 8 - bits :].reshape(240, -1), 1)
+    tags = {256: 320, 257: 240, 258: bits, 259: 1, 262: photometric, 273: 2000, 277: 1, 278: 240, 279: bytes_.size}
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    colours = RED[:, : 2**bits].astype("<u2").tobytes() if photometric == 3 else b""
+    entries += struct.pack("<HHII", 320, 3, len(colours) // 2, 500) if colours else b""
+    head = b"II*\0" + struct.pack("<IH", 8, len(entries) // 12) + entries + bytes(4)
+    return (head.ljust(500, b"\0") + colours).ljust(2000, b"\0") + bytes_.tobytes()
+
+
+RED = np.zeros((3, 256), np.uint16)
+RED[0, 1] = 128
+COLOURED = np.dstack([MASK * np.uint8(128), 0 * GREY, 0 * GREY])
 WIDE = COLOUR.astype(np.uint16) * 257 + 3
 TIFFS = {
     "LZW": (tiff(GREY, compression="tiff_lzw"), GREY),
@@ -135,7 +218,20 @@ TIFFS = {
     "planes": (tiff(np.moveaxis(COLOUR, -1, 0), "tifffile", planarconfig="separate", photometric="rgb"), COLOUR),
     "bool of tifffile": (tiff(MASK, "tifffile"), MASK),
     "0 is white": (tiff(255 - GREY, "tifffile", photometric="miniswhite"), GREY),
-    "0 is white, 1 bit": (tiff(~MASK, "tifffile", photometric="miniswhite", software="a scanner"), MASK),
+    "0 is white, 1 bit": (tiff(MASK, tiffinfo={262: 0}), MASK),
+    "0 is white, 1 bit of LZW": (with_0_white(tiff(~MASK, compression="tiff_lzw")), MASK),
+    "0 is white, float": (with_0_white(tiff(HEIGHT, "tifffile")), HEIGHT),
+    "bool of tifffile, named": (tiff(MASK, "tifffile", software="a lab"), MASK),
+    "bool of tifffile, bare": (tiff(MASK, "tifffile", metadata=None, software=False), MASK),
+    "bool of tifffile, tiles": (tiff(MASK, "tifffile", tile=(16, 32), software="a lab"), MASK),
+    "2 bits": (packed(MASK, 2, 1), MASK * np.uint8(85)),
+    "4 bits": (packed(MASK, 4, 1), MASK * np.uint8(17)),
+    "1 bit of a palette": (packed(MASK, 1, 3), COLOURED),
+    "2 bits of a palette": (packed(MASK, 2, 3), COLOURED),
+    "4 bits of a palette": (packed(MASK, 4, 3), COLOURED),
+    "8 bits of a palette of 8 bits": (tiff(MASK.astype(np.uint8), "tifffile", photometric="palette", colormap=RED), COLOURED),
+    "8 bits of a palette of 16 bits": (
+        tiff(MASK.astype(np.uint8), "tifffile", photometric="palette", colormap=RED * 257), COLOURED),
     "0 is white, Group 4": (with_0_white(tiff(~MASK, compression="group4")), MASK),
     "0 is white, LZW": (with_0_white(tiff(255 - GREY, compression="tiff_lzw")), GREY),
 }  # fmt: skip
@@ -153,6 +249,17 @@ def test_every_usual_tiff_is_read(tmp_path, form):
     path.write_bytes(data[: len(data) * 2 // 3])
     with pytest.raises(ImageError, match="image.tif: "):
         read_image(path)
+
+
+def test_a_tiff_of_other_bits_is_refused_in_plain_words(tmp_path):
+    path = tmp_path / "image.tif"
+    path.write_bytes(packed(MASK, 3, 1))
+    with pytest.raises(ImageError) as error:
+        read_image(path)
+    assert (
+        str(error.value)
+        == f"{path}: a TIFF file of 3 bits (uint8) that is not read; save 8 or 16 bits, or float32, uncompressed"
+    )
 
 
 def test_the_samples_are_masks(data_folder):

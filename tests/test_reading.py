@@ -340,7 +340,7 @@ def test_missing_files_folders_pickles_and_stacks_are_refused(tmp_path, monkeypa
     with pytest.raises(ImageError, match="got a folder"):
         read_observation(tmp_path, MINI)
     np.save(tmp_path / "object.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(ImageError, match="not a whole .npy array of numbers"):
+    with pytest.raises(ImageError, match="object.npy: expected numbers, got an array of Python objects; save an"):
         read_observation(tmp_path / "object.npy", MINI)
     with pytest.raises(ImageError, match="expected one image, got 2 pages"):
         read_observation(write(tmp_path / "stack.tif", np.zeros((2, *SHAPE), np.float32)), MINI)

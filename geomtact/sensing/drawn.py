@@ -17,11 +17,13 @@ _DARK, _BRIGHT, _CLEAR = 32, 223, 0.95
 
 
 def two_valued(array: NDArray[Any]) -> bool:
-    """Whether an image (H, W) has zeros and one other value; a single value counts if it is how masks say yes or no."""
-    top = array.max()
-    if top == array.min():
+    """Whether an image (H, W) has zeros and one other value, below 0 only of whole numbers; a single value counts if it is how
+    masks say yes or no."""
+    low, top = array.min(), array.max()
+    if top == low:
         return bool(top in (0, 1, 255))
-    return bool(array.min() == 0 and ((array == 0) | (array == top)).all())
+    other = low if top == 0 and array.dtype.kind == "i" else top
+    return bool(((array == 0) | (array == other)).all())
 
 
 def without_two_colours(array: NDArray[Any], name: str) -> NDArray[Any]:
@@ -32,7 +34,7 @@ def without_two_colours(array: NDArray[Any], name: str) -> NDArray[Any]:
     ImageError
         It is drawn in other colours than two, or in two of which none is black; or (H, W) in two whole numbers, none of them 0.
     """
-    if array.ndim == 2 and array.min() == 0:
+    if array.ndim == 2 and not array.all():
         return array
     if array.ndim == 3 and array.dtype == np.uint8 and array.max() <= _UNLIT:
         return array

@@ -17,6 +17,8 @@ SUPPORTED = "give a PNG, JPEG, BMP, TIFF or .npy file"
 # floats), and photometric interpretations
 _OWN_COMPRESSIONS, _FLOATS = (1, 8, 32946, 32773, 34925), 3
 _ZERO_IS_WHITE, _PALETTE = 0, 3
+_BITS_PER_SAMPLE, _ORIENTATION, _PLANAR = 258, 274, 284  # numbers of tags
+_FEW = 16  # colours that a camera's image has at least
 _MODES = ("1", "L", "I", "F", "I;16", "I;16B", "LA", "RGB", "RGBA")  # of Pillow, whose pixels are what they say
 
 
@@ -36,6 +38,10 @@ def decoded(data: bytes, path: Path) -> NDArray[Any]:
 
 
 def _read_npy(data: bytes, path: Path) -> NDArray[Any]:
+    if b"'|O'" in data[:128]:
+        raise ImageError(
+            f"{path}: expected numbers, got an array of Python objects; save an array of bool, int or float"
+        )
     try:
         return np.load(io.BytesIO(data), allow_pickle=False)
     except Exception as error:  # noqa: BLE001 -- the header is parsed as Python, which fails in more ways than are told
@@ -55,11 +61,13 @@ def _read_tiff(data: bytes, path: Path) -> NDArray[Any]:
                 raise ImageError(f"{path}: expected one image, got {len(file.pages)} pages; save one page")
             page: Any = file.pages[0]
             _check_pixels(path, page.imagewidth, page.imagelength)
-            if page.photometric <= _PALETTE and page.compression in _OWN_COMPRESSIONS and page.predictor != _FLOATS:
+            _check_upright(path, page.tags.valueof(_ORIENTATION, 1))
+            own = page.compression in _OWN_COMPRESSIONS and page.predictor != _FLOATS
+            if page.photometric <= _PALETTE and own and page.bitspersample in (1, 8, 16, 32, 64):
                 return _as_meant(page)
             # the other libraries decode the rest, but Pillow rounds colours to 8 bits
             by_opencv = page.samplesperpixel > 1 and page.bitspersample > 8
-            return _by_opencv(data, path) if by_opencv else _by_pillow(data, path)
+            return _by_opencv(data, path) if by_opencv else _by_pillow(data, path, page)
     except ImageError:
         raise
     except Exception as error:  # noqa: BLE001  (tifffile raises whatever its codecs raise)
@@ -74,21 +82,34 @@ def _as_meant(page: Any) -> NDArray[Any]:
     if image.ndim == 3 and page.planarconfig == 2:
         return np.moveaxis(image, 0, -1)
     if page.photometric == _PALETTE:
-        return _in_colours(image, (page.colormap.T >> 8).astype(np.uint8))
-    # where it writes bool arrays, tifffile calls True black, which means contact here
-    if page.photometric == _ZERO_IS_WHITE and not (page.bitspersample == 1 and page.software == "tifffile.py"):
-        return np.asarray(~image if image.dtype == bool else np.iinfo(image.dtype).max - image)
+        return _in_colours(image, _palette(page))
+    # in bool arrays tifffile calls True black, which means contact here; it leaves out both tags, libtiff none, Pillow one
+    by_tifffile = page.bitspersample == 1 and not {_BITS_PER_SAMPLE, _PLANAR} & {tag.code for tag in page.tags}
+    if page.photometric == _ZERO_IS_WHITE and not by_tifffile and image.dtype.kind in "bu":
+        return np.asarray(~image)
     return np.asarray(image)
 
 
+def _palette(page: Any) -> NDArray[np.uint8]:
+    """The colours (n, 3) of a TIFF page's palette, which has 16 bits, but where some programs write 8."""
+    return np.asarray((page.colormap >> (8 if page.colormap.max() > 255 else 0)).T.astype(np.uint8))
+
+
 def _in_colours(indices: NDArray[Any], palette: NDArray[np.uint8]) -> NDArray[Any]:
-    """The colours (H, W, 3) of indices (H, W) into a palette (n, 3); but the indices, where they are 0 and at most one other, and
-    neither is black: then 0 is what the other is drawn on."""
+    """The colours (H, W, 3) of indices (H, W) into a palette (n, 3).
+
+    The indices themselves, 0 for no contact, where these are 0 and at most one other, and neither is black; where the palette
+    lacks some; or where it is of few colours and shows another index like 0, or all alike.
+    """
+    indices = indices.astype(np.intp)
     used = np.unique(indices)
-    colours = np.zeros((max(256, len(palette)), 3), np.uint8)
+    colours = np.zeros((max(256, len(palette), used[-1] + 1), 3), np.uint8)
     colours[: len(palette)] = palette
+    n_colours = len(np.unique(colours[used], axis=0))
     drawn = used[0] == 0 and len(used) <= 2 and colours[used].any(1).all()
-    return indices if drawn else colours[indices]
+    like_0 = (colours[used[used > 0]] == colours[0]).all(1).any()
+    lost = used[-1] >= len(palette) or (n_colours < _FEW and (like_0 or len(used) > n_colours == 1))
+    return indices if drawn or lost else colours[indices]
 
 
 def _read_coded(data: bytes, path: Path) -> NDArray[Any]:
@@ -100,6 +121,13 @@ def _read_coded(data: bytes, path: Path) -> NDArray[Any]:
             _check_pixels(path, *header.size)
             # OpenCV fills what is missing of a truncated file with grey and says nothing
             header.load()
+            if (n_frames := getattr(header, "n_frames", 1)) > 1:
+                raise ImageError(f"{path}: expected one image, got {n_frames} frames; save one frame")
+            _check_upright(path, header.getexif().get(_ORIENTATION, 1))
+            if (
+                header.format == "BMP" and data[46:50] == b"\1\0\0\0"
+            ):  # biClrUsed; Pillow and OpenCV then read all as black
+                raise ImageError(f"{path}: its palette has one colour only; save it as a grey PNG")
             if header.mode == "P" and "transparency" not in header.info:
                 palette = np.array(header.getpalette("RGB"), np.uint8).reshape(-1, 3)
                 return _in_colours(np.asarray(header), palette)
@@ -110,15 +138,21 @@ def _read_coded(data: bytes, path: Path) -> NDArray[Any]:
     return _by_opencv(data, path)
 
 
-def _by_pillow(data: bytes, path: Path) -> NDArray[Any]:
-    """What Pillow reads of a TIFF file."""
-    from PIL import Image
+def _by_pillow(data: bytes, path: Path, page: Any) -> NDArray[Any]:
+    """What Pillow reads of a TIFF file with one ``page``."""
+    from PIL import Image, UnidentifiedImageError
 
-    with Image.open(io.BytesIO(data)) as image:
-        image.load()
-        if image.mode == "P":
-            return _in_colours(np.asarray(image), np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3))
-        return np.array(image if image.mode in _MODES else image.convert("RGB"))
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            image.load()
+            if image.mode == "P":
+                return _in_colours(np.asarray(image), _palette(page))
+            return np.array(image if image.mode in _MODES else image.convert("RGB"))
+    except UnidentifiedImageError:
+        raise ImageError(
+            f"{path}: a TIFF file of {page.bitspersample} bits ({page.dtype or 'no type'}) that is not read; save 8 or 16 bits, "
+            "or float32, uncompressed"
+        ) from None
 
 
 def _by_opencv(data: bytes, path: Path) -> NDArray[Any]:
@@ -140,4 +174,13 @@ def _check_pixels(path: Path, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
         raise ImageError(
             f"{path}: {width} x {height} px is more than {MAX_PIXELS // 2**20} million; is it a sensor image?"
+        )
+
+
+def _check_upright(path: Path, orientation: Any) -> None:
+    """Refuse an image that viewers show turned or mirrored: whether its pixels are as the sensor saw them stays open."""
+    if orientation in range(2, 9):
+        raise ImageError(
+            f"{path}: its orientation tag, {orientation}, turns or mirrors the stored pixels; save them as the camera gives "
+            "them, and remove the tag or set it to 1"
         )
