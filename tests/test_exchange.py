@@ -24,6 +24,17 @@ def test_a_trajectory_comes_back(poses, tmp_path):
     np.testing.assert_allclose(back, poses, atol=1e-8)
 
 
+def test_three_digits_and_comments_are_read(poses, tmp_path):
+    lines = [" ".join(f"{x:.3f}" for x in (k, *T[:3, 3], *se3.quat_xyzw(T))) for k, T in enumerate(poses)]
+    text = "  # an indented comment\n\n" + "".join(f"{line} # a trailing one\n" for line in lines) + "#\n"
+    (tmp_path / "a.txt").write_text(text)
+    times, back = from_tum(tmp_path / "a.txt")
+    assert times.tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose(back, poses, atol=4e-3)
+    (tmp_path / "empty.txt").write_text("# nothing\n")
+    assert [each.shape for each in from_tum(tmp_path / "empty.txt")] == [(0,), (0, 4, 4)]
+
+
 def test_bop_results_come_back(poses, tmp_path):
     rows = [{"scene_id": 1, "im_id": i, "obj_id": 3, "score": 0.25, "time": 0.1, "T": T} for i, T in enumerate(poses)]
     to_bop(tmp_path / "a.csv", rows)
@@ -68,8 +79,18 @@ def test_a_table_has_a_row_for_each_mode(poses):
 @pytest.mark.parametrize(
     ("read", "text", "told"),
     [
-        (from_tum, "0 1 2 3\n", "eight numbers each"),
-        (from_tum, "0 1 2 3 0 0 0 0\n", "eight numbers each"),
+        (from_tum, "0 1 2 3\n", "line 1: expected timestamp tx ty tz qx qy qz qw, eight numbers"),
+        (from_tum, "# t\n\n0 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 x\n", "line 4: expected timestamp .*, eight numbers"),
+        (from_tum, "1_0 1 2 3 0 0 0 1\n", "line 1: expected timestamp .*, eight numbers"),
+        (
+            from_tum,
+            "0 1 2 3 0 0 0 0\n",
+            "line 1: expected a quaternion qx qy qz qw of norm 1, got norm 0; check the columns",
+        ),
+        (from_tum, "0 1 2 3 0 0 0 1\n0 1 2 3 0 0 60 1\n", "line 2: expected a quaternion .* of norm 1, got norm 60.01"),
+        (from_tum, "0 1 2 3 0 0 0 1.02\n", "line 1: expected a quaternion .* of norm 1, got norm 1.02"),
+        (from_bop, BOP_LINE.format("1_0", "0 0 0", 1), "line 2: expected scene_id"),
+        (from_bop, BOP_LINE.format(1, "0 1_0 0", 1), "line 2: expected scene_id"),
         *((from_tum, f"# t\n0 1 2 3 0 0 0 1\n{line}\n", "line 3: expected finite numbers") for line in INFINITE),
         (from_bop, BOP_LINE.format("nan", "0 0 0", 1), "line 2: expected a finite score and time, got nan and 1"),
         (from_bop, BOP_LINE.format(0.5, "0 0 0", "inf"), "line 2: expected a finite score and time, got 0.5 and inf"),

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from geomtact.inference.posterior import Posterior
 
 BOP = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+_NORM = 0.01  # by which a quaternion's norm may be off 1: three digits of each number leave 0.001
 
 
 def to_tum(path: str | Path, times: Iterable[float], T: Any) -> None:
@@ -33,26 +34,33 @@ def tum_line(time: float, T: Array) -> str:
 
 
 def from_tum(path: str | Path) -> tuple[Array, Array]:
-    """Times (n,) [s] and poses (n, 4, 4) [m] of a TUM file; lines that begin with # are left out.
+    """Times (n,) [s] and poses (n, 4, 4) [m] of a TUM file; what follows # is left out.
 
     Raises
     ------
     InputError
-        It cannot be read, or has a line of other than eight finite numbers, the last four a quaternion.
+        It cannot be read, or has a line of other than eight finite numbers, the last four a quaternion of norm 0.99 to 1.01.
     """
-    lines = enumerate(_text(path).splitlines(), 1)
-    rows = {number: line.split() for number, line in lines if line.strip() and not line.startswith("#")}
-    try:
-        values = np.array(list(rows.values()), float).reshape(len(rows), 8)
-        infinite = ~np.isfinite(values).all(1)
-        if infinite.any():
-            first = list(rows)[int(np.argmax(infinite))]
+    rows = []
+    for number, line in enumerate(_text(path).splitlines(), 1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        where = f"{path}: line {number}:"
+        try:
+            row = _numbers(words).reshape(8)
+        except ValueError:
+            raise InputError(f"{where} expected timestamp tx ty tz qx qy qz qw, eight numbers") from None
+        if not np.isfinite(row).all():
+            raise InputError(f"{where} expected finite numbers, got NaN or infinity; leave such lines out")
+        norm = float(np.linalg.norm(row[4:]))
+        if abs(norm - 1) > _NORM:
             raise InputError(
-                f"{path}: line {first}: expected finite numbers, got NaN or infinity; leave such lines out"
+                f"{where} expected a quaternion qx qy qz qw of norm 1, got norm {norm:.4g}; check the columns"
             )
-        R = Rotation.from_quat(values[:, 4:]).as_matrix() if len(rows) else np.zeros((0, 3, 3))
-    except ValueError:
-        raise InputError(f"{path}: expected lines of timestamp tx ty tz qx qy qz qw, eight numbers each") from None
+        rows.append(row)
+    values = np.array(rows).reshape(-1, 8)
+    R = Rotation.from_quat(values[:, 4:]).as_matrix() if rows else np.zeros((0, 3, 3))
     return values[:, 0], transform(R, values[:, 1:4])
 
 
@@ -84,10 +92,10 @@ def from_bop(path: str | Path) -> list[dict[str, Any]]:
     out = []
     for number, row in enumerate(found, 2):
         try:
-            R, t = (np.array(row[key].split(), float) for key in ("R", "t"))
+            R, t = (_numbers(row[key].split()) for key in ("R", "t"))
             T = check_transforms(transform(R.reshape(3, 3), 1e-3 * t.reshape(3)), f"{path}: line {number}")
-            ids = {key: int(row[key]) for key in BOP[:3]}
-            score, time = float(row["score"]), float(row["time"])
+            ids = {key: int(_numbers([row[key]], int)[0]) for key in BOP[:3]}
+            score, time = _numbers([row["score"], row["time"]]).tolist()
             if not np.isfinite([score, time]).all():
                 raise InputError(f"{path}: line {number}: expected a finite score and time, got {score:g} and {time:g}")
             out.append(ids | {"score": score, "time": time, "T": T})
@@ -131,6 +139,13 @@ def to_table(modes: Sequence[Mode], posterior: Posterior) -> dict[str, list[Any]
     numbers = np.concatenate([1e3 * T[:, :3, 3], quat, std], 1)
     names = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw", "shift_std_mm", "turn_std_deg")
     return columns | {name: numbers[:, k].tolist() for k, name in enumerate(names)}
+
+
+def _numbers(words: Sequence[str], dtype: type = float) -> Array:
+    """Written numbers (n,); ValueError of others, and of 1_0, which Python reads as 10."""
+    if any("_" in word for word in words):
+        raise ValueError
+    return np.array([dtype(word) for word in words])
 
 
 def _text(path: str | Path) -> str:

@@ -62,10 +62,10 @@ def sensor_of_others(text: str, origin: str) -> Sensor:
 
 
 def _of_gs_sdk(data: Mapping[str, Any], name: str) -> Sensor:
-    pitch = 1e-3 * float(data["ppmm"])
+    pitch = 1e-3 * _number(data["ppmm"])
     if pitch > 1e-3:
         raise SensorError(f"ppmm is millimetres per pixel in gs_sdk, and {data['ppmm']} are too many; give 1 over it")
-    if not (isinstance(data["imgw"], int) and isinstance(data["imgh"], int)):
+    if type(data["imgw"]) is not int or type(data["imgh"]) is not int:
         raise SensorError(f"imgw and imgh must be whole numbers, got {data['imgw']} and {data['imgh']}")
     named = data.get("device_name")
     return Sensor(
@@ -83,13 +83,18 @@ def _of_tacto(data: Mapping[str, Any], name: str) -> Sensor:
     if gel.get("mesh") or (isinstance(camera, list) and len(camera) != 1):
         raise SensorError("expected one camera before a flat or spherical gel; write a TOML file for others")
     camera = camera[0] if isinstance(camera, list) else camera
-    distance = float(gel["origin"][0]) - float(camera["position"][0])  # it looks along x
+    distance = _number(gel["origin"][0]) - _number(camera["position"][0])  # it looks along x
     if not distance > 0:
         raise SensorError(f"expected the gel before the camera, along x, got {distance:g} m; write a TOML file")
     width, height = _TACTO_SIZE
-    pitch = 2 * distance * float(np.tan(np.radians(float(camera["yfov"])) / 2)) / height
-    fall = float(gel.get("curvatureMax", 0)) if gel.get("curvature") else 0.0
-    corner2 = (float(gel["width"]) ** 2 + float(gel["height"]) ** 2) / 4
+    view = _number(camera["yfov"])
+    if not np.pi < view < 180:  # up to pi it may be in radians
+        raise SensorError(
+            f"yfov is in degrees in TACTO, 3.2 to 180, got {view:g}; of radians give {np.degrees(view):.4g}"
+        )
+    pitch = 2 * distance * float(np.tan(np.radians(view) / 2)) / height
+    fall = _number(gel.get("curvatureMax", 0)) if gel.get("curvature") else 0.0
+    corner2 = (_number(gel["width"]) ** 2 + _number(gel["height"]) ** 2) / 4
     return Sensor(
         name,
         (width, height),
@@ -99,6 +104,13 @@ def _of_tacto(data: Mapping[str, Any], name: str) -> Sensor:
         membrane_radius=(corner2 + fall**2) / (2 * fall) if fall > 0 else 0.0,
         note=f"From TACTO's file {name}, which says nothing of the gel's depth: 2 mm. The picture is taken as 240 x 320 px.",
     )
+
+
+def _number(value: Any) -> float:
+    """A number of a YAML file, which takes 1e-3 for a text; ValueError of a truth value, as yes is there."""
+    if isinstance(value, bool):
+        raise ValueError(f"expected a number, got {value}")
+    return float(value)
 
 
 def _of_gsrobotics(data: Mapping[str, Any], name: str) -> Sensor:
