@@ -1,5 +1,6 @@
 """The order of a folder's images by their names: time stamps by value, counters as they count, and a word where it is open."""
 
+import os
 import random
 from decimal import Decimal
 from pathlib import Path
@@ -77,6 +78,80 @@ def test_names_that_leave_the_order_open_bring_a_warning(names, why):
         f"the names do not settle the order of the images: {why}; taken is {', '.join(f'{name}.png' for name in names)}; "
         "to give another, write their paths to standard input, and - for the folder"
     )
+
+
+@pytest.mark.parametrize(
+    ("names", "why"),
+    [
+        (["0p041", "0p57", "0p073"], "041 and 57 may be the digits after a point"),
+        (["1_042", "1_308", "1_0755"], "0755 and 042 may be the digits after a point"),
+        (["01-02-2024_00-00-00", "31-01-2024_23-59-59"], "dates with the year last, 01-02-2024 and 31-01-2024, do not sort"),
+        (["01.01.2024", "12.31.2023"], "dates with the year last, 01.01.2024 and 12.31.2023, do not sort"),
+        (["00-00-00", "00-00-01", "23-59-58", "23-59-59"], "23 may come before 00, where a counter or a clock starts anew"),
+        (["img_0000", "img_0001", "img_9998", "img_9999"], "9999 may come before 0000, where a counter or a clock starts"),
+        (["17000000005", "1700000000123456789"], "1700000000123456789 and 17000000005 may be seconds and what follows"),
+        (["cam0_1", "cam0_2", "cam0_3", "cam1_1", "cam1_2", "cam1_3"], "the numbers after 0 and after 1 run alike"),
+    ],
+)  # fmt: skip
+def test_numbers_that_do_not_sort_by_time_bring_a_warning(names, why):
+    taken, said = ordered(names)
+    assert taken == names and f"the names do not settle the order of the images: {why}" in said and "\n" not in said
+
+
+def test_a_comma_is_a_point():
+    names = ["0,041", "0,073", "0,57", "1,2"]
+    assert ordered(names) == (names, None)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"img_{k:04}" for k in range(0, 10000, 9)],
+        [f"{k:03}" for k in range(1000)],
+        [f"10-{m:02}-{s:02}" for m in range(3) for s in range(0, 60, 5)],
+        [f"{h:02}-{m:02}-00" for h in range(24) for m in (0, 59)],
+        ["2024-01-31_23-59-59", "2024-02-01_00-00-00"],
+        [f"touch{k}_{frame}" for k in range(20) for frame in range(5)],
+        [f"cam0_{k}" for k in range(20)],
+        ["27-11-2026_10-00-00", "27-11-2026_10-00-01"],
+        [str(10**11 + k * 10**10) for k in range(100)],
+        ["touch-1_0", "touch-1_9", "touch-1_10"],
+    ],
+)
+def test_numbers_that_sort_bring_none(names):
+    assert ordered(names) == (names, None)
+
+
+def warned(folder, names, times):
+    """What is said of files written in a folder at times [s]."""
+    for name, at in zip(names, times, strict=True):
+        (folder / name).touch()
+        os.utime(folder / name, (at, 1.7e9 + at))
+    return doubt(in_order(folder.iterdir()))
+
+
+NAMES = [f"{k}.png" for k in range(8, 16)]
+
+
+@pytest.mark.parametrize("step", [1 / 5, 1, 60])
+def test_files_written_in_another_order_bring_a_warning(tmp_path, rng, step):
+    times = np.roll(np.arange(8), 3) * step * rng.uniform(0.99, 1.01)
+    assert "images: 10.png was written after 11.png; taken is 8.png, 9.png" in warned(tmp_path, NAMES, times)
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        pytest.param(range(8), id="as named"),
+        pytest.param([6, 7, 0, 1, 2, 3, 4, 5], id="as texts sort, by a copy or git"),
+        pytest.param([0] * 8, id="at once"),
+        pytest.param([0, 0, 0, 5, 0, 0, 3, 0], id="unpacked, two later"),
+        pytest.param(np.array([5, 1, 4, 2, 3, 0, 7, 6]) / 100, id="in any order, quickly"),
+        pytest.param([2.9, 0.3, 2.31, 0.31, 1.2, 0.9, 1.19, 2.1], id="in any order, within seconds"),
+    ],
+)
+def test_copied_files_bring_none(tmp_path, times):
+    assert warned(tmp_path, NAMES, times) is None
 
 
 def test_a_folder_is_given_in_order_with_the_doubt_on_standard_error(tmp_path, capsys):

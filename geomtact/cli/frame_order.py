@@ -9,9 +9,13 @@ from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 
-# A number in a name: two joined by one point are one, 1.25, but three are three, as in a date. Ten digits that begin with 1 are
-# seconds since 1970: what follows them after _ or - is joined to them too.
-_NUMBER = re.compile(r"((?<![0-9])1[0-9]{9}[_-][0-9]+|(?<![0-9])(?<![0-9]\.)[0-9]+\.[0-9]+(?![0-9])(?!\.[0-9])|[0-9]+)")
+from geomtact.cli.frame_times import misleading
+
+# A number in a name: two joined by one point or comma are one, 1.25, but three are three, as in a date. Ten digits that begin
+# with 1 are seconds since 1970: what follows them after _ or - is joined to them too.
+_NUMBER = re.compile(
+    r"((?<![0-9])1[0-9]{9}[_-][0-9]+|(?<![0-9])(?<![0-9][.,])[0-9]+[.,][0-9]+(?![0-9])(?![.,][0-9])|[0-9]+)"
+)
 _DIGITS = 17  # that Python writes a float with at most, zeros before them aside
 _SHOWN = 3  # names of the order taken that a warning gives
 
@@ -32,24 +36,27 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
 
 def doubt(paths: list[Path]) -> str | None:
     """What the names of images :func:`in_order` leave open, in a line; None where they settle the order."""
-    keys, unsure = _keys(paths)
-    for path, following in pairwise(paths):
-        if keys[path] == keys[following]:
-            why = f"{path.name} and {following.name} have the same number"
-        elif keys[path][::2] != keys[following][::2]:
-            why = f"{path.name} and {following.name} differ by more than their numbers"
-        else:
-            continue
-        break
-    else:
-        if not unsure:
-            return None
-        why = "a number with a point may be a decimal, or two counters"
+    why = _unsettled(paths)
+    if why is None:
+        return None
     shown = ", ".join(path.name for path in paths[:_SHOWN]) + (", ..." if len(paths) > _SHOWN else "")
     return (
         f"the names do not settle the order of the images: {why}; taken is {shown}; to give another, write their paths to "
         "standard input, and - for the folder"
     )
+
+
+def _unsettled(paths: list[Path]) -> str | None:
+    """Why the order of images by their names is not sure."""
+    keys, unsure = _keys(paths)
+    for path, following in pairwise(paths):
+        if keys[path] == keys[following]:
+            return f"{path.name} and {following.name} have the same number"
+        if keys[path][::2] != keys[following][::2]:
+            return f"{path.name} and {following.name} differ by more than their numbers"
+    if unsure:
+        return "a number with a point may be a decimal, or two counters"
+    return misleading(paths, list(zip(*(_NUMBER.split(path.stem)[1::2] for path in paths), strict=True)))
 
 
 def _keys(paths: list[Path]) -> tuple[dict[Path, Key], bool]:
@@ -86,5 +93,5 @@ def _counters(numbers: set[tuple[str, str]]) -> tuple[bool, bool]:
 
 def _halves(number: str) -> tuple[str, str]:
     """The digits before and after what joins a number, none after where nothing does."""
-    whole, *rest = re.split("[._-]", number)
+    whole, *rest = re.split("[.,_-]", number)
     return whole, "".join(rest)
