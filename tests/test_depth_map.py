@@ -2,6 +2,7 @@
 
 import re
 
+import cv2
 import numpy as np
 import pytest
 
@@ -36,11 +37,13 @@ def read(array, kind="auto"):
         (1e-3, "millimetres by 0.001"),
         (1e-6, "micrometres by 1e-06"),
         (PITCH, "pixels (of gs_sdk) by 6.34e-05"),
+        (1e-2, "centimetres by 0.01"),
+        (25.4e-3, "inches by 0.0254"),
     ],
 )
 def test_another_unit_is_refused_with_its_conversion(depth, unit, conversion):
     """Of the conversions that are named, one is right, and each makes a touch that the gel can feel."""
-    given = ball(depth) / unit
+    given = ball(max(depth, 20e-3 * 1.01 * unit)) / unit  # deep enough to be over 10 max_penetration
     for array in (given, given.astype(np.float32)):
         with pytest.raises(ImageError, match=re.escape(conversion)) as error:
             read(array)
@@ -68,6 +71,79 @@ def test_contact_below_a_rest_of_0_is_refused(unit):
             read(array / unit)
         assert (unit == 1) == ("multiply" not in str(error.value))
         assert unit != PITCH or "pixels (of gs_sdk) by 6.34e-05" in str(error.value)
+
+
+@pytest.mark.parametrize("unit", [1e-2, 25.4e-3])
+def test_heights_a_little_too_large_may_be_in_centimetres_or_inches(unit):
+    """Their size does not settle which: all that make a touch are listed."""
+    (warning,) = (said for said in read(ball(1e-4) / unit).warnings if "exceed" in said)
+    assert "exceed the sensor's max_penetration_mm, 2; if they are pixels times 0.001, multiply by 0.0634" in warning
+    assert "or else centimetres by 0.01, or inches by 0.0254" in warning
+
+
+def test_no_unit_is_named_that_makes_no_touch():
+    with pytest.raises(
+        ImageError, match="the largest is 1e[+]09; no usual unit makes a touch of them: give metres; or is"
+    ):
+        read(ball(1e-3) * 1e12)
+
+
+def correlated(rng, sigma, width):
+    noise = cv2.GaussianBlur(rng.normal(size=(240, 320)), (0, 0), width) if width else rng.normal(size=(240, 320))
+    return sigma * noise / noise.std()
+
+
+@pytest.mark.parametrize("width", [0, 3, 10])
+def test_noise_about_the_gel_at_rest_is_no_contact(rng, width):
+    touch = ball(8e-4)
+    given = touch + correlated(rng, 5e-6, width)
+    assert -3e-5 < given.min() < -1e-5
+    seen = read(given)
+    assert not any("were set to 0" in said for said in seen.warnings)
+    np.testing.assert_array_equal(seen.contact.height, np.maximum(given, 0).astype(np.float32))
+    assert not seen.contact.mask[touch == 0].any()
+
+
+def test_large_noise_is_read_with_a_warning(rng):
+    seen = read(ball(1.2e-3) + correlated(rng, 3e-5, 0))
+    assert any(re.search(r"heights down to -1\.\de\+02 micrometres were set to 0", said) for said in seen.warnings)
+    assert not seen.contact.mask[ball(1.2e-3) == 0].any()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        pytest.param(ball(8e-4) - 2e-5, id="the gel at rest lies lower"),
+        pytest.param(ball(8e-4) - ball(8e-4).mean(), id="its mean is 0"),
+        pytest.param(ball(3e-4) - np.roll(ball(2e-4), 90), id="as low as a touch"),
+        pytest.param(np.where(ball(8e-4) > 0, -4e-5, 0) + 2e-5, id="contact is negative"),
+        pytest.param(ball(2e-3) - np.roll(ball(6e-4), 90), id="lower than the sensor's noise makes any"),
+    ],
+)
+def test_negative_heights_that_are_no_noise_are_refused_with_what_to_do(given, rng):
+    for noisy in (given, given + correlated(rng, 2e-6, 2)):
+        with pytest.raises(
+            ImageError, match=r"set the gel at rest to 0; clip noise that is left below it, numpy\.maximum"
+        ):
+            read(noisy)
+
+
+@pytest.mark.parametrize("rest", [8e-4, 2e-3, 2.9e-3])
+@pytest.mark.parametrize("noise", [0, 5e-6])
+def test_distances_to_the_gel_are_suspected(rest, noise, rng):
+    given = rest - ball(8e-4) + correlated(rng, noise, 2) + 4 * noise
+    (warning,) = (said for said in read(given).warnings if "distances" in said)
+    assert warning == (
+        "image: the border is as deep as anything, and the inside is not, as in a map of distances to the gel; if it is one, "
+        f"give the distances at rest less these, as {given.max():.4g} - heights"
+    )
+    back = read(np.maximum(given.max() - given, 0))
+    assert not any("distances" in said for said in back.warnings)
+
+
+def test_a_plate_that_fills_the_window_is_no_map_of_distances(rng):
+    for plate in (5e-4 + 0 * ROWS, 5e-4 + 1e-6 * ROWS, 5e-4 + correlated(rng, 5e-6, 0)):
+        assert not any("distances" in said for said in read(plate).warnings)
 
 
 @pytest.mark.parametrize("rest", [20e-3, 10e-3, 22e-3 + FAR2 / 70e-3])

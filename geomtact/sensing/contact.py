@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -81,3 +82,8 @@ class Contact:
         """Where (H, W) the contact is deeper than ``depth`` [m]."""
         assert self.height is not None
         return self.mask & (self.height > depth)
+
+
+def border_of(image: NDArray[Any]) -> NDArray[Any]:
+    """The outermost pixels (n,) of an image (H, W), each once."""
+    return np.concatenate([image[[0, -1]].ravel(), image[1:-1, [0, -1]].ravel()])

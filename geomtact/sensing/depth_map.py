@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.errors import ImageError
-from geomtact.sensing.contact import FAINT
+from geomtact.sensing.contact import FAINT, HALF, border_of
 from geomtact.sensing.sensor import Sensor
 
 _DEEPEST, _SHALLOWEST = 1.5, 0.01  # of max_penetration, between which the deepest point of a touch is expected
@@ -17,6 +17,8 @@ _LEAST = 1e-6  # m that no indentation is as shallow as, so that its unit is wro
 # Slope that half of a contact of this area [m2] or more does not exceed: of 1196 simulated rigid contacts of 23 objects, 0.03 to
 # 1.5 mm deep, the median slope is 1.79 at most, of 360 elastic ones 0.06
 _STEEP, _AREA = 3.0, 1e-6
+_NEGATIVE = 0.75  # share of what is near 0 that is negative at most, where half is in noise about 0
+_BORDER, _NEAR_HIGHEST = 0.8, 0.1  # share of the border, and of the range of heights, by which distances are suspected
 
 
 def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str]) -> NDArray[np.float32]:
@@ -38,13 +40,14 @@ def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str
     lowest, highest = float(height.min()), float(height.max())
     most = sensor.max_penetration
     expected = f"{name}: expected heights in metres up to about {most:g}"
-    if lowest < -1e-6:
+    if lowest < -1e-6 and not _noise_below(height, sensor):
         deepest = max(-lowest, highest)
         raise ImageError(
             f"{name}: heights are depths of the gel's indentation, >= 0; the lowest is {lowest:.4g} m: where contact is negative "
-            f"negate them, and set the gel at rest to 0{f'; {_units(deepest, sensor)}' if deepest > _DEEPEST * most else ''}"
+            "negate them, and set the gel at rest to 0; clip noise that is left below it, numpy.maximum(heights, 0)"
+            + (f"; {_units(deepest, sensor)}" if deepest > _DEEPEST * most else "")
         )
-    if lowest < 0:
+    if -lowest > sensor.height_noise:
         warnings.append(f"{name}: heights down to {lowest * 1e6:.2g} micrometres were set to 0")
     if highest > _DEEPEST * most and lowest > highest / 2:
         raise ImageError(
@@ -61,10 +64,16 @@ def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str
         raise ImageError(
             f"{expected}, the largest is {highest:.4g}; these look divided by 1000 once too often{counted}"
         )
+    if _like_distances(height, sensor):
+        warnings.append(
+            f"{name}: the border is as deep as anything, and the inside is not, as in a map of distances to the gel; if it is "
+            f"one, give the distances at rest less these, as {highest:.4g} - heights"
+        )
     as_pixels = f"if they are pixels times 0.001, multiply by {1e3 * sensor.pixel_pitch[0]:.4g}, pixel_pitch_mm"
     if highest > _DEEPEST * most:
         warnings.append(
             f"{name}: heights up to {1e3 * highest:.2f} mm exceed the sensor's max_penetration_mm, {1e3 * most:g}; {as_pixels}"
+            f"{', or else ' + units if (units := _likely_units(highest, sensor)) else ''}"
         )
     elif _too_steep(height, sensor):
         warnings.append(
@@ -78,11 +87,42 @@ def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str
 
 
 def _units(highest: float, sensor: Sensor) -> str:
-    """How to make metres of heights up to ``highest``, of the units in which that is a touch; of all, where it is in none."""
-    units = {"millimetres": 1e-3, "micrometres": 1e-6, "pixels (of gs_sdk)": sensor.pixel_pitch[0]}
+    """How to make metres of heights up to ``highest``."""
+    likely = _likely_units(highest, sensor)
+    return f"multiply {likely}" if likely else "no usual unit makes a touch of them: give metres"
+
+
+def _likely_units(highest: float, sensor: Sensor) -> str:
+    """The units in which heights up to ``highest`` are a touch, with what makes metres of them."""
+    units = {
+        "millimetres": 1e-3,
+        "centimetres": 1e-2,
+        "inches": 25.4e-3,
+        "micrometres": 1e-6,
+        "pixels (of gs_sdk)": sensor.pixel_pitch[0],
+    }
     most = sensor.max_penetration
     likely = {unit: to for unit, to in units.items() if _SHALLOWEST * most <= highest * to <= _DEEPEST * most}
-    return "multiply " + ", or ".join(f"{unit} by {to:.4g}" for unit, to in (likely or units).items())
+    return ", or ".join(f"{unit} by {to:.4g}" for unit, to in likely.items())
+
+
+def _noise_below(height: NDArray[np.floating], sensor: Sensor) -> bool:
+    """Whether what is negative in heights (H, W) [m] is noise of the gel at rest, about 0.
+
+    Then it is no lower than the sensor's noise makes any of as many pixels; its like above 0 is no contact; and what is as
+    near to 0 as it is not mostly negative, as the gel at rest is that lies lower.
+    """
+    below = -float(height.min())
+    near = height[np.abs(height) <= below]
+    extreme = sensor.height_noise * float(np.sqrt(2 * np.log(height.size)))
+    return below <= min(extreme, HALF * float(height.max())) and float((near < 0).mean()) <= _NEGATIVE
+
+
+def _like_distances(height: NDArray[np.floating], sensor: Sensor) -> bool:
+    """Whether most of the border of heights (H, W) [m] is about as high as any, and something inside is lower by a touch."""
+    lowest, highest = float(height.min()), float(height.max())
+    high = border_of(height) >= highest - (highest - lowest) * _NEAR_HIGHEST
+    return highest - lowest > _SHALLOWEST * sensor.max_penetration and float(high.mean()) >= _BORDER
 
 
 def _too_steep(height: NDArray[np.floating], sensor: Sensor) -> bool:

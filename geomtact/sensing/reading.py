@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.sensing.change import as_unit_rgb, check_size
 from geomtact.sensing.checks import faults, unlike_calibrated
-from geomtact.sensing.contact import FAINT, Contact
+from geomtact.sensing.contact import FAINT, Contact, border_of
 from geomtact.sensing.depth_map import depths_of
 from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
 from geomtact.sensing.flicker import without_flicker
@@ -204,7 +204,7 @@ def _specks(mask: NDArray[np.bool_], sensor: Sensor) -> int:
 
 def _perhaps_negative(mask: NDArray[np.bool_], share: float) -> bool:
     """Whether a mask of which a ``share`` is set may show where nothing touches: its border is set, too."""
-    border = float(np.concatenate([mask[[0, -1]].ravel(), mask[1:-1, [0, -1]].ravel()]).mean())
+    border = float(border_of(mask).mean())
     return border >= (_BORDER if share > _NEGATIVE_MOST else 1.0) and share > _NEGATIVE
 
 
