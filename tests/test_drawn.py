@@ -75,6 +75,17 @@ def test_a_palette_of_many_colours_is_an_image(tmp_path):
     assert np.array_equal(read_image(tmp_path / "image.png"), np.asarray(image.convert("RGB")))
 
 
+def test_two_indices_of_the_colour_of_no_contact_are_refused(tmp_path):
+    image = Image.fromarray((MASK + 2 * (COLUMNS < 20)).astype(np.uint8), "P")
+    image.putpalette([0, 0, 0, 255, 255, 255, 0, 0, 0])
+    for suffix in ("png", "tif"):
+        image.save(tmp_path / f"mask.{suffix}")
+        with pytest.raises(
+            ImageError, match=f"mask.{suffix}: its palette shows the indices 0 and 2 alike; save a grey PNG"
+        ):
+            read_image(tmp_path / f"mask.{suffix}")
+
+
 def test_indices_that_a_palette_does_not_tell_apart_are_refused_without_a_0(tmp_path):
     palette(MASK, [0] * 9, 1, 2).save(tmp_path / "mask.png")
     with pytest.raises(ImageError, match="got nothing but 1 and 2; draw contact white"):
@@ -104,6 +115,13 @@ def test_an_orientation_tag_is_refused_unless_it_says_upright(tmp_path, suffix, 
     )
     with pytest.raises(ImageError, match=f"turned.{suffix}: {message}"):
         read_image(path)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize("exif", [b"Exif\0\0no such thing", b"Exif\0\0II*\0", b"Exif\0\0"])
+def test_damaged_metadata_are_overlooked(tmp_path, suffix, exif):
+    Image.fromarray(COLOUR).save(tmp_path / f"image.{suffix}", exif=exif)
+    assert read_image(tmp_path / f"image.{suffix}").shape == COLOUR.shape
 
 
 @pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int64])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import ImageError
 
-_SEEN = 16  # colours that a camera's image has at least; of 178 in colour the poorest has 1043
+SEEN = 16  # colours that a camera's image has at least; of 178 in colour the poorest has 1043
 _UNLIT = 5  # up to which a camera counts without light
 _EVERY = 16  # px between those looked at first
 # grey values near black and near white, and the share of an image that is either
@@ -68,6 +68,6 @@ def _few_colours(array: NDArray[Any]) -> NDArray[Any] | None:
     pixels = array[..., None] if array.ndim == 2 else array
     for some in (pixels[::_EVERY, ::_EVERY], pixels):
         colours = np.unique(some.reshape(-1, some.shape[-1]), axis=0)
-        if len(colours) >= _SEEN:
+        if len(colours) >= SEEN:
             return None
     return colours

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.errors import ImageError
+from geomtact.sensing.drawn import SEEN
 
 MAX_PIXELS = 64 * 2**20
 SUPPORTED = "give a PNG, JPEG, BMP, TIFF or .npy file"
@@ -18,7 +19,6 @@ SUPPORTED = "give a PNG, JPEG, BMP, TIFF or .npy file"
 _OWN_COMPRESSIONS, _FLOATS = (1, 8, 32946, 32773, 34925), 3
 _ZERO_IS_WHITE, _PALETTE = 0, 3
 _BITS_PER_SAMPLE, _ORIENTATION, _PLANAR = 258, 274, 284  # numbers of tags
-_FEW = 16  # colours that a camera's image has at least
 _MODES = ("1", "L", "I", "F", "I;16", "I;16B", "LA", "RGB", "RGBA")  # of Pillow, whose pixels are what they say
 
 
@@ -64,7 +64,7 @@ def _read_tiff(data: bytes, path: Path) -> NDArray[Any]:
             _check_upright(path, page.tags.valueof(_ORIENTATION, 1))
             own = page.compression in _OWN_COMPRESSIONS and page.predictor != _FLOATS
             if page.photometric <= _PALETTE and own and page.bitspersample in (1, 8, 16, 32, 64):
-                return _as_meant(page)
+                return _as_meant(page, path)
             # the other libraries decode the rest, but Pillow rounds colours to 8 bits
             by_opencv = page.samplesperpixel > 1 and page.bitspersample > 8
             return _by_opencv(data, path) if by_opencv else _by_pillow(data, path, page)
@@ -76,13 +76,13 @@ def _read_tiff(data: bytes, path: Path) -> NDArray[Any]:
         ) from None
 
 
-def _as_meant(page: Any) -> NDArray[Any]:
+def _as_meant(page: Any, path: Path) -> NDArray[Any]:
     """The pixels that a page of a TIFF file, read by tifffile, means by what it stores."""
     image = page.asarray()
     if image.ndim == 3 and page.planarconfig == 2:
         return np.moveaxis(image, 0, -1)
     if page.photometric == _PALETTE:
-        return _in_colours(image, _palette(page))
+        return _in_colours(image, _palette(page), path)
     # in bool arrays tifffile calls True black, which means contact here; it leaves out both tags, libtiff none, Pillow one
     by_tifffile = page.bitspersample == 1 and not {_BITS_PER_SAMPLE, _PLANAR} & {tag.code for tag in page.tags}
     if page.photometric == _ZERO_IS_WHITE and not by_tifffile and image.dtype.kind in "bu":
@@ -95,21 +95,33 @@ def _palette(page: Any) -> NDArray[np.uint8]:
     return np.asarray((page.colormap >> (8 if page.colormap.max() > 255 else 0)).T.astype(np.uint8))
 
 
-def _in_colours(indices: NDArray[Any], palette: NDArray[np.uint8]) -> NDArray[Any]:
+def _in_colours(indices: NDArray[Any], palette: NDArray[np.uint8], path: Path) -> NDArray[Any]:
     """The colours (H, W, 3) of indices (H, W) into a palette (n, 3).
 
-    The indices themselves, 0 for no contact, where these are 0 and at most one other, and neither is black; where the palette
-    lacks some; or where it is of few colours and shows another index like 0, or all alike.
+    The indices themselves, 0 for no contact, where these are 0 and at most one other, and neither is black; or where the palette
+    lacks some, or shows all alike.
+
+    Raises
+    ------
+    ImageError
+        Of a few colours, another index has that of 0.
     """
-    indices = indices.astype(np.intp)
+    if indices.dtype == bool:
+        indices = indices.view(np.uint8)
     used = np.unique(indices)
-    colours = np.zeros((max(256, len(palette), used[-1] + 1), 3), np.uint8)
+    colours = np.zeros((max(256, len(palette), int(used[-1]) + 1), 3), np.uint8)
     colours[: len(palette)] = palette
     n_colours = len(np.unique(colours[used], axis=0))
     drawn = used[0] == 0 and len(used) <= 2 and colours[used].any(1).all()
-    like_0 = (colours[used[used > 0]] == colours[0]).all(1).any()
-    lost = used[-1] >= len(palette) or (n_colours < _FEW and (like_0 or len(used) > n_colours == 1))
-    return indices if drawn or lost else colours[indices]
+    like_0 = used[(used > 0) & (colours[used] == colours[0]).all(1)]
+    alike = n_colours == 1 and len(used) + len(like_0) > 1
+    if drawn or alike or used[-1] >= len(palette):
+        return indices
+    if len(like_0) and n_colours < SEEN:
+        raise ImageError(
+            f"{path}: its palette shows the indices 0 and {like_0[0]} alike; save a grey PNG, contact white"
+        )
+    return colours[indices]
 
 
 def _read_coded(data: bytes, path: Path) -> NDArray[Any]:
@@ -123,14 +135,13 @@ def _read_coded(data: bytes, path: Path) -> NDArray[Any]:
             header.load()
             if (n_frames := getattr(header, "n_frames", 1)) > 1:
                 raise ImageError(f"{path}: expected one image, got {n_frames} frames; save one frame")
-            _check_upright(path, header.getexif().get(_ORIENTATION, 1))
-            if (
-                header.format == "BMP" and data[46:50] == b"\1\0\0\0"
-            ):  # biClrUsed; Pillow and OpenCV then read all as black
+            _check_upright(path, _orientation(header))
+            # of a BMP file with one colour (biClrUsed), Pillow and OpenCV read every index as that
+            if header.format == "BMP" and data[46:50] == b"\1\0\0\0":
                 raise ImageError(f"{path}: its palette has one colour only; save it as a grey PNG")
             if header.mode == "P" and "transparency" not in header.info:
                 palette = np.array(header.getpalette("RGB"), np.uint8).reshape(-1, 3)
-                return _in_colours(np.asarray(header), palette)
+                return _in_colours(np.asarray(header), palette, path)
     except UnidentifiedImageError:
         raise ImageError(f"{path}: not an image; {SUPPORTED}") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
@@ -146,7 +157,7 @@ def _by_pillow(data: bytes, path: Path, page: Any) -> NDArray[Any]:
         with Image.open(io.BytesIO(data)) as image:
             image.load()
             if image.mode == "P":
-                return _in_colours(np.asarray(image), _palette(page))
+                return _in_colours(np.asarray(image), _palette(page), path)
             return np.array(image if image.mode in _MODES else image.convert("RGB"))
     except UnidentifiedImageError:
         raise ImageError(
@@ -175,6 +186,14 @@ def _check_pixels(path: Path, width: int, height: int) -> None:
         raise ImageError(
             f"{path}: {width} x {height} px is more than {MAX_PIXELS // 2**20} million; is it a sensor image?"
         )
+
+
+def _orientation(image: Any) -> Any:
+    """The orientation tag of an image that Pillow has read; 1 where its metadata are damaged, which viewers overlook."""
+    try:
+        return image.getexif().get(_ORIENTATION, 1)
+    except Exception:  # noqa: BLE001  (the parser of EXIF data raises whatever it stumbles on)
+        return 1
 
 
 def _check_upright(path: Path, orientation: Any) -> None:
