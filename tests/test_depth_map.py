@@ -104,6 +104,32 @@ def test_noise_about_the_gel_at_rest_is_no_contact(rng, width):
     assert not seen.contact.mask[touch == 0].any()
 
 
+@pytest.mark.parametrize("sigma", [2e-6, 3e-5, 9e-5])
+@pytest.mark.parametrize("width", [0, 3, 10])
+def test_noise_about_0_alone_is_no_contact(rng, sigma, width):
+    given = correlated(rng, sigma, width)
+    seen = read(given)
+    assert not seen.contact.mask.any() and not seen.contact.height.any()
+    assert seen.warnings == [
+        f"image: heights of {1e6 * given.min():.2g} to {1e6 * given.max():.2g} micrometres are noise about 0: taken as no contact"
+    ]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        pytest.param(np.where(COLUMNS < 160, 2e-4, -2e-4), id="half of the gel is touched, the mean is 0"),
+        pytest.param(ball(2e-3, 2e-2) - ball(2e-3, 2e-2).mean(), id="a large touch, the mean is 0"),
+        pytest.param(1e-6 * (COLUMNS - 160), id="a slope"),
+        pytest.param(ball(1e-4) - np.roll(ball(1e-4), 90), id="as low as high"),
+    ],
+)
+def test_what_is_as_low_as_high_is_not_always_noise(given, rng):
+    for noisy in (given, given + correlated(rng, 2e-6, 2)):
+        with pytest.raises(ImageError, match="heights are depths of the gel's indentation, >= 0"):
+            read(noisy)
+
+
 def test_large_noise_is_read_with_a_warning(rng):
     seen = read(ball(1.2e-3) + correlated(rng, 3e-5, 0))
     assert any(re.search(r"heights down to -1\.\de\+02 micrometres were set to 0", said) for said in seen.warnings)

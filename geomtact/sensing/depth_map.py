@@ -17,7 +17,9 @@ _LEAST = 1e-6  # m that no indentation is as shallow as, so that its unit is wro
 # Slope that half of a contact of this area [m2] or more does not exceed: of 1196 simulated rigid contacts of 23 objects, 0.03 to
 # 1.5 mm deep, the median slope is 1.79 at most, of 360 elastic ones 0.06
 _STEEP, _AREA = 3.0, 1e-6
-_NEGATIVE = 0.75  # share of what is near 0 that is negative at most, where half is in noise about 0
+_MOST = (
+    0.75  # share that most of the values of noise have: half of it is negative, 0.9 and more less than half the largest
+)
 _BORDER, _NEAR_HIGHEST = 0.8, 0.1  # share of the border, and of the range of heights, by which distances are suspected
 
 
@@ -40,6 +42,11 @@ def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str
     lowest, highest = float(height.min()), float(height.max())
     most = sensor.max_penetration
     expected = f"{name}: expected heights in metres up to about {most:g}"
+    if lowest < -1e-6 and _all_noise(height, sensor):
+        warnings.append(
+            f"{name}: heights of {1e6 * lowest:.2g} to {1e6 * highest:.2g} micrometres are noise about 0: taken as no contact"
+        )
+        return np.zeros(height.shape, np.float32)
     if lowest < -1e-6 and not _noise_below(height, sensor):
         deepest = max(-lowest, highest)
         raise ImageError(
@@ -114,8 +121,24 @@ def _noise_below(height: NDArray[np.floating], sensor: Sensor) -> bool:
     """
     below = -float(height.min())
     near = height[np.abs(height) <= below]
-    extreme = sensor.height_noise * float(np.sqrt(2 * np.log(height.size)))
-    return below <= min(extreme, HALF * float(height.max())) and float((near < 0).mean()) <= _NEGATIVE
+    most = min(_extreme_noise(height, sensor), HALF * float(height.max()))
+    return below <= most and float((near < 0).mean()) <= _MOST
+
+
+def _all_noise(height: NDArray[np.floating], sensor: Sensor) -> bool:
+    """Whether heights (H, W) [m] are noise about 0 and nothing else: about as large above as below, mostly less than half of
+    that, and nowhere larger than noise of their own root mean square makes any of the square of as many pixels."""
+    below, above = -float(height.min()), float(height.max())
+    least, most = min(below, above), max(below, above)
+    small = np.abs(height) < HALF * least
+    own = float(np.sqrt(2 * np.mean(height**2) * 2 * np.log(height.size)))
+    alike = HALF * most <= least and most <= min(own, _extreme_noise(height, sensor))
+    return alike and float(small.mean()) >= _MOST and 1 - _MOST <= float((height < 0).mean()) <= _MOST
+
+
+def _extreme_noise(height: NDArray[np.floating], sensor: Sensor) -> float:
+    """The largest [m] of as many normally distributed heights (H, W) as these, as the sensor's noise makes them."""
+    return sensor.height_noise * float(np.sqrt(2 * np.log(height.size)))
 
 
 def _like_distances(height: NDArray[np.floating], sensor: Sensor) -> bool:
