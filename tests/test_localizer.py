@@ -298,15 +298,17 @@ def test_a_prior_that_cannot_be_is_refused_and_one_that_the_image_contradicts_is
     assert plug.localize(masks[0], "mask", prior=near, effort="fast").contact
 
 
-def test_a_gaussian_prior_is_the_density_of_what_it_draws(rng):
-    """What is drawn from it is turned as far, in the mean, as its density over evenly drawn poses says."""
-    prior = GaussianPrior(np.eye(4), np.diag([0.8**2] * 3 + [1.0] * 3))
+@pytest.mark.parametrize("width", [0.3, 0.8, 2.0, 6.0])
+def test_a_gaussian_prior_is_the_density_of_what_it_draws(rng, width):
+    """What is drawn from it is turned as far, in the mean, as its density over evenly drawn poses says; and the wider, the more."""
+    prior = GaussianPrior(np.eye(4), np.diag([width**2] * 3 + [1.0] * 3))
     even = transform(random_rotations(300_000, rng), rng.uniform(-3.5, 3.5, (300_000, 3)))
     weight = np.exp(prior(even))
     turned = np.linalg.norm(log(even)[:, :3], axis=1)
-    drawn = np.pad(rng.normal(0, 0.8, (20_000, 3)), ((0, 0), (0, 3)))
-    expected = np.linalg.norm(log(exp(drawn))[:, :3], axis=1).mean()
+    drawn = np.concatenate([prior.draw(10_000, rng) for _ in range(2 if width < 5 else 40)])
+    expected = np.linalg.norm(log(drawn)[:, :3], axis=1).mean()
     assert weight @ turned / weight.sum() == pytest.approx(expected, rel=0.04)
+    assert width < 2 or expected > 1.9
 
 
 @pytest.mark.parametrize("covariance", [np.eye(3), np.zeros((6, 6)), np.arange(36).reshape(6, 6)])

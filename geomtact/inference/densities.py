@@ -16,7 +16,7 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry, about
 from geomtact.inference.posterior import Posterior
-from geomtact.se3 import Array, check_pose, hat, inverse, log
+from geomtact.se3 import Array, check_pose, exp, hat, inverse, log
 
 LogDensity = Callable[[Array], Array]
 
@@ -26,7 +26,10 @@ _CLOSER = 0.125 * 0.5 ** np.arange(8)  # rad by which a continuous symmetry is s
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """A pose known with an uncertainty, T exp(xi^) with xi ~ N(0, covariance): a vision system's, or that of a ``Mode``.
+    """A pose known with an uncertainty, a vision system's or that of a ``Mode``: at T exp(xi^), with a rotation of half a turn at
+    most, the density relative to the uniform goes as that of xi ~ N(0, covariance).
+
+    So the wider its rotations, the less it knows of them; drawn as T exp(xi^), rotations by a whole turn would come home to T.
 
     Its share of a cell is that of poses drawn from it, of those that touch; where it covers too many cells for that, its density
     at the cell's pose, widened by a cell's own spread.
@@ -64,9 +67,15 @@ class GaussianPrior:
     def __call__(self, T: Array) -> Array:
         """Log density (n,), not normalised, at poses (n, 4, 4)."""
         xi = log(inverse(self.T) @ T)
+        return np.asarray(-0.5 * np.einsum("ni,ni->n", xi, np.linalg.solve(self.covariance, xi.T).T))
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """Up to ``n`` poses (m, 4, 4) from it: all of ``n`` draws of a narrow one, fewer of one with wide rotations."""
+        xi = rng.multivariate_normal(np.zeros(6), self.covariance, n)
+        angle = np.linalg.norm(xi[:, :3], axis=1)
         # the exponential takes less volume, the larger the angle (Barfoot, State Estimation for Robotics, ch. 7)
-        volume = 4 * np.log(np.sinc(np.linalg.norm(xi[:, :3], axis=1) / (2 * np.pi)))
-        return np.asarray(-0.5 * np.einsum("ni,ni->n", xi, np.linalg.solve(self.covariance, xi.T).T) - volume)
+        kept = (angle <= np.pi) & (rng.random(n) < np.sinc(angle / (2 * np.pi)) ** 4)
+        return self.T @ exp(xi[kept])
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from geomtact.inference.densities import (
 )
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring.calibration import normalised
-from geomtact.se3 import Array, exp, inverse
+from geomtact.se3 import Array, inverse
 from geomtact.sensing.sensor import Sensor
 
 _CHUNK = 1 << 16
@@ -123,8 +123,7 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     # a few rays leave out those that cannot touch: what lies between them is hidden, by about their distance at most
     hidden = 2 * float(max(index.sensor.half_window)) / max(_LOOK)
     for _ in range(_BATCHES):
-        xi = rng.multivariate_normal(np.zeros(6), prior.covariance, _DRAWN)
-        T = inverse(T_frame_sensor) @ prior.T @ exp(xi)
+        T = inverse(T_frame_sensor) @ prior.draw(_DRAWN, rng)
         seen = index.space.caster.depths(index.sensor, T, index.sensor.along(_LOOK)).max((1, 2))
         T = T[(seen >= -hidden) & (seen <= index.sensor.max_penetration)]
         depth = index.space.penetration(T)

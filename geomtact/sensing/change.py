@@ -133,7 +133,10 @@ def as_unit_rgb(image: Any, name: str) -> Array:
 
 
 def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = None) -> None:
-    """Refuse an image (H, W, ...) of another size than the sensor's; ``do`` is the advice, unless width and height are exchanged."""
+    """Refuse an image (H, W, ...) of another size than the sensor's.
+
+    ``do`` is the advice, unless width and height are exchanged.
+    """
     height, width = array.shape[:2]
     if (width, height) == sensor.image_size_px:
         return
