@@ -99,7 +99,7 @@ def as_obj(vertices, faces, rng=None):
     colour = " 0.5 0.5 0.5" if rng.random() < 0.5 else ""
     for face in sorted(faces, key=max):
         while given <= max(face):
-            lines.append(f"v{gap}{numbers[given].replace(' ', gap)}{colour}{rng.choice(['', ' # a corner', '#'])}")
+            lines.append(f"v{gap}{numbers[given].replace(' ', gap)}{colour}{rng.choice(['', ' # a corner', ' #'])}")
             given += 1
         words = []
         for k in face:
@@ -291,18 +291,98 @@ BOX_TRIANGLES = Polygons.of(*BOX).triangles()[0]
         "COFF # colours\n{} {} 0",
         "NOFF\n{} {} 0",
         "STOFF\n{} {} 0",
+        "NCOFF\n{} {} 0",
+        "CNOFF {} {}",
+        "STCNOFF\n{} {} 0",
         "OFF{} {} 0",
+        "off\n{} {} 0",
+        "coff\n{} {} 0",
+        "{} {} 12",
+        "{} {}",
     ],
 )
 def test_off_headers(head):
-    polygons = read_off(as_off(*BOX, head, " 0 0 1 0.5" if head[0] != "O" else ""))
+    polygons = read_off(as_off(*BOX, head, " 0 0 1 0.5" if "C" in head.upper() or "N" in head else ""))
     assert measured(polygons) == pytest.approx((376, 480)) and polygons.warnings == ()
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), head=st.sampled_from(["OFF ", "OFF\n", "off ", "OFF", ""]))
+def test_off_is_read_in_its_order_however_it_lies_on_lines(seed, head):
+    rng = np.random.default_rng(seed)
+    vertices, faces = prism(simple_polygon(int(rng.integers(3, 12)), rng), 6.0)
+    words = [len(vertices), len(faces), 0, *vertices.ravel().tolist(), *(k for f in faces for k in (len(f), *f))]
+    text = head + "".join(f"{word!r}{rng.choice([' ', chr(10), ' # 7' + chr(10)])}" for word in words)
+    polygons = read_off(text.encode())
+    np.testing.assert_array_equal(polygons.vertices, vertices)
+    np.testing.assert_array_equal(polygons.corners, np.concatenate(faces))
+    np.testing.assert_array_equal(polygons.sizes, [len(f) for f in faces])
+
+
+def test_off_with_colours_is_read_by_lines_alone():
+    text = as_off(*BOX)
+    for joined in (text.replace(b" 255 0 0\n", b" 255 0 0 "), as_off(*BOX, "COFF\n{} {} 0").replace(b"0.0\n", b"0.0 ")):
+        with pytest.raises(MeshError, match="is cut short: expected 8 vertices and 6 faces, a line each"):
+            read_off(joined)
+
+
+@pytest.mark.parametrize(
+    "word", ["1.#INF", "-1.#IND00", "1.#QNAN", "1.#J", "nan", "1_0", "1__0", "0x10", "1,5", "1d3", "1#"]
+)
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply", ".stl"])
+def test_a_word_that_is_no_finite_number_is_refused(word, suffix, tmp_path):
+    vertices = np.where(BOX[0] == 10, 777, BOX[0])
+    written = {".obj": as_obj, ".off": as_off, ".ply": as_ply}.get(suffix)
+    data = written(vertices, BOX[1]) if written else as_stl_text(vertices, BOX_TRIANGLES)
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(data.replace(b"777.0", b"777").replace(b"777", word.encode(), 1))
+    with pytest.raises(MeshError, match="three numbers|NaN, infinity|words among its numbers") as caught:
+        load_mesh(path, "mm")
+    if "." in word and suffix in (".obj", ".off"):
+        assert "vertices hold NaN, infinity" in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply"])
+def test_an_index_with_an_underscore_is_refused(suffix, tmp_path):
+    data = {".obj": as_obj, ".off": as_off, ".ply": as_ply}[suffix](*BOX)
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(data.replace(b"f 4 3", b"f 0_4 3").replace(b"4 3 2 1 0", b"4 0_3 2 1 0"))
+    assert b"_" in path.read_bytes().replace(b"end_header", b"").replace(b"vertex_indices", b"")
+    with pytest.raises(MeshError, match="whole numbers|words among"):
+        load_mesh(path, "mm")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_line_of_obj_is_continued_but_no_comment(end):
+    text = as_obj(*BOX).decode().splitlines()
+    lines = ["# C:\\parts\\", text[0] + " # \\", *text[1:8], "g a \\", "b", "#\\", text[8].replace(" ", " \\" + end)]
+    assert measured(read_obj(end.join([*lines, *text[9:]]).encode())) == pytest.approx((376, 480))
+    with pytest.raises(MeshError, match="line 3 cannot be read.*got 'v 1  2 x'"):
+        read_obj(b"# \\\nv 1 \\\n2 x")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply", ".stl"])
+def test_text_in_utf_16_is_named(encoding, suffix, tmp_path):
+    data = as_stl_text(BOX[0], BOX_TRIANGLES)
+    if suffix != ".stl":
+        data = {".obj": as_obj, ".off": as_off, ".ply": as_ply}[suffix](*BOX)
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"\xef\xbb\xbf" + data)
+    assert 1e6 * load_mesh(path, "mm").areas.sum() == pytest.approx(376)
+    path.write_bytes(data.decode().encode(encoding))
+    with pytest.raises(
+        MeshError, match=rf"a\{suffix}: is UTF-16 text, expected ASCII or UTF-8; save or export it as that"
+    ):
+        load_mesh(path, "mm")
 
 
 @pytest.mark.parametrize(
     ("reader", "data", "words"),
     [
         (read_off, b"4OFF\n1 0 0\n0 0 0 1\n", "another number of coordinates"),
+        (read_off, b"C4nOFF\n3\n1 0 0\n0 0 0 1\n", "another number of coordinates"),
+        (read_off, b"noff\n3\n1 0 0\n0 0 0 1\n", "another number of coordinates"),
         (read_off, b"OFF BINARY\n1 0 0\n", "in binary, which is not read"),
         (read_off, as_off(*BOX)[:-30], r"is cut short: expected 8 vertices and 6 faces"),
         (read_off, as_off(*BOX).replace(b"4 0 1 5", b"4 0 x 5"), "expected a face's number"),
@@ -444,6 +524,7 @@ def test_several_solids_of_text_are_one_mesh():
         (TEXT.replace(b"vertex 10 0 0", b"vertex 10 O 0"), "not three numbers"),
         (TEXT.replace(b"vertex 10 0 0\n", b"", 1), "expected three corners in each of 12 facets, found 35"),
         (b"x", "neither STL text nor"),
+        (b"; made by hand\n" + TEXT, "is neither STL text nor STL in binary"),
     ],
 )
 def test_stl_in_doubt_is_refused(data, words):

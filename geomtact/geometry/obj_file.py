@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from geomtact.errors import MeshError
 from geomtact.geometry.polygons import Polygons
+from geomtact.geometry.text_numbers import number, single_bytes, whole, without_comment
 
 _FREE_FORM = (b"curv", b"curv2", b"surf", b"bzp", b"bsp", b"cdc", b"cdp", b"res")  # curves and patches, old ones too
 
@@ -13,7 +16,8 @@ _FREE_FORM = (b"curv", b"curv2", b"surf", b"bzp", b"bsp", b"cdc", b"cdp", b"res"
 def read_obj(data: bytes) -> Polygons:
     """The polygons of an OBJ file, of all its objects and groups together.
 
-    Indices may be relative: -1 is the vertex given last before the face's own line.
+    Indices may be relative: -1 is the vertex given last before the face's own line. A backslash at its end continues any line,
+    those of names too, but no comment.
 
     Raises
     ------
@@ -23,19 +27,18 @@ def read_obj(data: bytes) -> Polygons:
     vertices: list[float] = []
     faces: list[list[int]] = []
     curves: set[str] = set()
-    data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
-    number, line = 0, b""
+    count, line = 0, b""
     try:
-        for number, line in enumerate(data.splitlines(), 1):  # noqa: B007 -- the message names it
-            words = (line.partition(b"#")[0] if b"#" in line else line).split()
+        for count, line in _lines(single_bytes(data)):  # noqa: B007 -- the message names it
+            words = line.split()
             if not words:
                 continue
             kind = words[0]
             if kind == b"v":
                 x, y, z = words[1:4]
-                vertices += (float(x), float(y), float(z))
+                vertices += (number(x), number(y), number(z))
             elif kind in (b"f", b"fo"):
-                face = [int(word.partition(b"/")[0]) for word in words[1:]]
+                face = [whole(word.partition(b"/")[0]) for word in words[1:]]
                 if min(face, default=1) < 1:
                     face = _counted_from_one(face, len(vertices) // 3)
                 faces.append(face)
@@ -46,7 +49,7 @@ def read_obj(data: bytes) -> Polygons:
     except ValueError:
         shown = line.decode("utf-8", "replace").strip()[:60]
         raise MeshError(
-            f"line {number} cannot be read: expected v with three numbers, or f with whole numbers from 1 or below 0 that are "
+            f"line {count} cannot be read: expected v with three numbers, or f with whole numbers from 1 or below 0 that are "
             f"there, got {shown!r}; export the mesh again"
         ) from None
     named = ", ".join(sorted(curves))
@@ -55,6 +58,20 @@ def read_obj(data: bytes) -> Polygons:
     warnings = (f"free-form curves or surfaces ({named}) are left out: polygons alone are read",) if curves else ()
     some = Polygons.of(np.array(vertices), faces, warnings)
     return Polygons(some.vertices, some.corners - 1, some.sizes, warnings)
+
+
+def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Each line without its comment, joined with those that continue it, and the number of the last of them."""
+    begun = b""
+    for count, line in enumerate(data.splitlines(), 1):
+        text = without_comment(line)
+        if text == line and text.endswith(b"\\"):
+            begun += text[:-1] + b" "
+            continue
+        yield count, begun + text
+        begun = b""
+    if begun:
+        yield count, begun
 
 
 def _counted_from_one(face: list[int], before: int) -> list[int]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from geomtact.errors import MeshError
 from geomtact.geometry.polygons import Indices, Polygons
+from geomtact.geometry.text_numbers import number, single_bytes
 from geomtact.se3 import Array
 
 _NAMES = {
@@ -53,11 +54,12 @@ def read_ply(data: bytes) -> Polygons:
     MeshError
         A file of another kind, cut short, or without what is due in it.
     """
+    data = single_bytes(data)
     form, elements, start = _header(data)
     order = _FORMATS[form]
     if form == "ascii":  # all numbers as doubles: from here on as binary
         try:
-            body = np.array([float(word) for word in data[start:].split()]).astype("<f8").tobytes()
+            body = np.array([number(word) for word in data[start:].split()]).astype("<f8").tobytes()
         except ValueError:
             raise MeshError("holds words among its numbers; export the mesh again") from None
     else:
@@ -100,7 +102,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
             match words:
                 case ["format", name, *_]:
                     form = name
-                case ["element", name, rows]:
+                case ["element", name, rows] if rows.isdecimal():
                     elements.append(_Element(name, int(rows), []))
                 case ["property", "list", count, kind, name]:
                     elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[count]))

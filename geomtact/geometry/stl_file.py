@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import MeshError
 from geomtact.geometry.polygons import Polygons
+from geomtact.geometry.text_numbers import number, single_bytes
 from geomtact.se3 import Array
 
 _HEAD, _EACH = 84, 50  # bytes of the header with the count, and of each triangle
@@ -27,10 +28,12 @@ def read_stl(data: bytes) -> Polygons:
         close a surface.
     """
     binary = len(data) >= _HEAD and len(data) == _HEAD + _EACH * int.from_bytes(data[80:_HEAD], "little")
-    text = data.removeprefix(b"\xef\xbb\xbf").lstrip().rstrip(b"\0")
-    if not binary and text[:5].lower() == b"solid" and b"\0" not in text:
+    if binary:
+        return _of_binary(data)
+    text = single_bytes(data).lstrip().rstrip(b"\0")
+    if text[:5].lower() == b"solid" and b"\0" not in text:
         return _of_text(text)
-    if len(data) < _HEAD:
+    if len(data) < _HEAD or b"\0" not in data[:_HEAD]:  # a count of less than 2^24 holds a zero byte
         raise MeshError("is neither STL text nor STL in binary; export the mesh again")
     return _of_binary(data)
 
@@ -71,9 +74,8 @@ def _of_text(text: bytes) -> Polygons:
     if facets != whole:
         raise MeshError(f"is cut short: {facets - whole} of {facets} facets are not ended; copy or export it again")
     try:
-        found = np.array([float(x) for part in text.split(b"vertex")[1:] for x in part.split(None, 3)[:3]]).reshape(
-            -1, 3
-        )
+        found = np.array([number(x) for part in text.split(b"vertex")[1:] for x in part.split(None, 3)[:3]])
+        found = found.reshape(-1, 3)
     except ValueError:
         raise MeshError("holds vertices that are not three numbers; export the mesh again") from None
     if len(found) != 3 * facets:
