@@ -62,6 +62,36 @@ def test_a_comment_of_another_form_states_nothing(tmp_path, suffix, comment):
     assert load_mesh(path, "cm").unit == "cm"
 
 
+@pytest.mark.parametrize(
+    ("suffix", "head"),
+    [
+        ("obj", "mtllib x.mtl\no part\n{}\n"),
+        ("obj", "\ufeff{}\n"),
+        ("obj", "# made by hand\n\ng a\nvn 0 0 1\n   {}\n"),
+        ("off", "OFF 8 12 18\n{}\n"),
+        ("off", "OFF # a box\n8 12 18 # its counts\n{}\n"),
+        ("off", "OFF\n8 12\n{}\n"),
+        ("off", "OFF8\n12\n18\n{}\n"),
+        ("off", "{}\noff\n8 12 18\n"),
+        ("off", "8 12 18\n{}\n"),
+        ("off", "\ufeff{}\nOFF\n8 12 18\n"),
+    ],
+)
+def test_a_comment_before_the_first_vertex_states_the_unit(tmp_path, suffix, head):
+    BOX.export(str(tmp_path / f"a.{suffix}"))
+    path = tmp_path / f"a.{suffix}"
+    lines = path.read_text().splitlines()
+    body = [line for line in lines if line and line[0] not in "#o"] if suffix == "obj" else lines[2:]
+    first, rest = body[0], "\n".join(body[1:])
+    path.write_text(f"{head.format('# unit: inch')}{first}\n{rest}\n", "utf-8")
+    assert load_mesh(path).unit == "inch" and len(load_mesh(path).faces) == 12
+    with pytest.raises(MeshError, match="states the unit inch, but the unit mm was given"):
+        load_mesh(path, "mm")
+    behind = head.replace("{}\n", "").format()
+    path.write_text(f"{behind}{first}\n# unit: inch\n{rest}\n", "utf-8")
+    assert stated_unit(path) is None and load_mesh(path, "mm").unit == "mm"
+
+
 def test_a_comment_behind_the_head_states_nothing(tmp_path):
     path = commented(tmp_path / "a.obj")
     path.write_text(path.read_text() + "\n# unit: mm\n")

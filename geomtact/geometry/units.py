@@ -6,6 +6,8 @@ import re
 from pathlib import Path
 
 from geomtact.errors import MeshError
+from geomtact.geometry.off_file import split_keyword
+from geomtact.geometry.text_numbers import without_comment
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 METRE_FORMATS = (".glb", ".gltf")
@@ -20,7 +22,7 @@ def unit_comment(unit: str) -> str:
 
 
 def stated_unit(path: Path) -> str | None:
-    """The unit that a mesh file states: metres for glTF, else by a comment before the first vertex.
+    """The unit that a mesh file states: metres for glTF, else by a comment before the first vertex, in its first 64 KiB.
 
     Only a whole line counts: ``comment unit: mm`` in PLY, ``# unit: mm`` in OBJ and OFF, and SketchUp's
     ``# File units = millimeters`` in OBJ.
@@ -52,9 +54,34 @@ def _comments(path: Path) -> list[str]:
     if suffix not in _COMMENTED_FORMATS:
         return []
     with open(path, "rb") as file:
-        lines = [line.strip() for line in file.read(_LONGEST_HEAD).decode("latin-1").splitlines()]
+        lines = [line.strip() for line in file.read(_LONGEST_HEAD).removeprefix(b"\xef\xbb\xbf").splitlines()]
     if suffix == ".ply":
-        head = lines[: lines.index("end_header")] if "end_header" in lines else []
-        return [line.removeprefix("comment ") for line in head if line.startswith("comment ")]
-    ends = (k for k, line in enumerate(lines) if line and not line.startswith("#") and not line.endswith("OFF"))
-    return [line[1:].strip() for line in lines[: next(ends, len(lines))] if line.startswith("#")]
+        head, mark = lines[: lines.index(b"end_header")] if b"end_header" in lines else [], b"comment "
+    else:
+        head, mark = lines[: (_first_of_obj if suffix == ".obj" else _first_of_off)(lines)], b"#"
+    return [line.removeprefix(mark).strip().decode("latin-1") for line in head if line.startswith(mark)]
+
+
+def _first_of_obj(lines: list[bytes]) -> int:
+    """Number of lines before the first vertex."""
+    return next((k for k, line in enumerate(lines) if line.split()[:1] == [b"v"]), len(lines))
+
+
+def _first_of_off(lines: list[bytes]) -> int:
+    """Number of lines before the first vertex, which follows the keyword, if there is one, and two counts or three."""
+    counts, begun = 0, False
+    for k, line in enumerate(lines):
+        words = without_comment(line).split()
+        if words and not begun:
+            words, begun = _behind_keyword(words), True
+        counts += len(words)
+        if counts > 3:
+            return k
+    return len(lines)
+
+
+def _behind_keyword(words: list[bytes]) -> list[bytes]:
+    try:
+        return split_keyword(words)[1]
+    except MeshError:  # which reading it tells
+        return words
