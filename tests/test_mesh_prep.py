@@ -342,7 +342,7 @@ def test_a_curved_step_file_is_localized_within_its_tessellation(few_touches, tm
         ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "NaN"),
         ("a.obj", b"v 0 0 3e38\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "beyond 1e9"),
         ("a.ply", b"ply\nformat", "mm", "expected a header from ply to end_header"),
-        ("a.stl", b"x", "mmm", "unknown unit 'mmm'; give --unit, one of mm, cm, m, inch"),
+        ("a.stl", b"x", "MMM", "unknown unit 'MMM'; give --unit, one of mm, cm, m, inch"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", None, "does not state its unit; give --unit"),
         ("a.obj", b"v 0 0 0\nv 10 0 0\nv 0 10 0\nf 1 2 3\n", "auto", "likely: 14.1 mm across in mm.*Give --unit"),
     ],
@@ -420,6 +420,12 @@ def test_a_unit_that_contradicts_the_file_is_refused(tmp_path):
         read(tmp_path / "box.glb", "mm", Sensor.load("gelslim"))
     with pytest.raises(Refused, match="no such file"):
         read(tmp_path / "none.stl", "mm", Sensor.load("gelslim"))
+
+
+def test_units_are_given_in_upper_or_lower_case(tmp_path):
+    BOX.export(tmp_path / "box.stl")
+    for unit in ("mm", "MM", "Inch"):
+        assert read(tmp_path / "box.stl", unit, Sensor.load("gelslim"))[1] == unit.lower()
 
 
 @pytest.fixture(scope="module")

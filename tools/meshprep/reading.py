@@ -39,7 +39,7 @@ def read(path: Path, unit: str | None, sensor: Sensor, of_several: bool = False)
 
     Parameters
     ----------
-    unit : "mm", "cm", "m", "inch" for files that state none; "auto" only proposes
+    unit : "mm", "cm", "m", "inch" in upper or lower case, for files that state none; "auto" only proposes
     sensor : by whose window "auto" judges
     of_several : whether ``unit`` is given for several files, and so for those that state none
 
@@ -49,8 +49,9 @@ def read(path: Path, unit: str | None, sensor: Sensor, of_several: bool = False)
         Unreadable, empty, without unit, or with another one than was given.
     """
     suffix = path.suffix.lower()
+    given, unit = unit, unit and unit.lower()
     if unit not in (None, "auto", *UNITS):
-        raise Refused(f"unknown unit {unit!r}; give --unit, one of {', '.join(UNITS)}, or auto for a proposal")
+        raise Refused(f"unknown unit {given!r}; give --unit, one of {', '.join(UNITS)}, or auto for a proposal")
     if suffix not in FORMATS:
         raise Refused(f"not a mesh format known here; give one of {' '.join(FORMATS)}")
     if not path.is_file():
