@@ -399,6 +399,59 @@ def test_points_on_polygons_are_spread_evenly_and_measured_exactly(rng, tmp_path
     )
 
 
+def obj_of(ring, height, turn=None):
+    """OBJ text of a prism of a convex polygon, its walls as quads."""
+    n = len(ring)
+    corners = np.concatenate([np.column_stack([ring, np.full(n, z)]) for z in (0.0, height)])
+    corners = corners if turn is None else corners @ turn.T
+    faces = [range(n)[::-1], range(n, 2 * n), *((k, (k + 1) % n, n + (k + 1) % n, n + k) for k in range(n))]
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in corners.tolist()]
+    return "\n".join([*lines, *("f " + " ".join(str(k + 1) for k in face) for face in faces)])
+
+
+PLATE = np.array([(0, 0), (100, 0), (100, 60), (0, 60)], float)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_distances_from_thin_plates_and_wedges_are_the_least_over_all_faces(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    thin = float(np.exp(rng.uniform(np.log(0.01), np.log(1))))
+    ring = PLATE if seed % 2 else np.array([(0, 0), (100, 0), (0, thin)], float)
+    turn = np.eye(3) if seed % 4 < 2 else se3.random_rotations(1, rng)[0]
+    (tmp_path / "a.obj").write_text(obj_of(ring, thin if seed % 2 else 60.0, turn))
+    surface, _ = read(tmp_path / "a.obj", "mm", Sensor.load("gelslim"))
+    on = points_on(surface.polygons, 2000)
+    near = on + rng.normal(size=on.shape) * rng.choice([1e-5, 0.01, 0.3, 10], len(on))[:, None]
+    points = np.concatenate([on, near])
+    n = len(surface.faces)
+    nearest = trimesh.triangles.closest_point(
+        np.tile(surface.corners, (len(points), 1, 1)), np.repeat(points, n, axis=0)
+    )
+    expected = np.linalg.norm(nearest - np.repeat(points, n, axis=0), axis=1).reshape(-1, n).min(1)
+    np.testing.assert_allclose(distance(surface, points), expected, rtol=1e-9, atol=1.1e-7 * surface.size)
+
+
+@pytest.mark.parametrize(
+    ("ring", "height"),
+    [(PLATE, 0.5), (PLATE, 0.2), ([(0, 0), (100, 0), (0, 0.3)], 60.0), ([(0, 0), (100, 0), (0, 0.2)], 20.0)]
+    + [([(0, 0), (10, 0), (10, 10), (10, 20), (10, 10), (0, 10)], 6.0)],
+)
+def test_thin_plates_wedges_and_spikes_are_clean(ring, height, command, tmp_path):
+    (tmp_path / "thin.obj").write_text(obj_of(np.array(ring, float), height))
+    done = command(tmp_path / "thin.obj", "--unit", "mm", "--out", tmp_path / "out", "--json")
+    (result,) = json.loads(done.stdout)["meshes"]
+    assert result["outcome"] != "refused" and result["deviation_mm"] < 1e-4, result
+
+
+def test_a_spike_without_area_is_no_deviation(tmp_path):
+    text = obj_of(np.array([(0, 0), (10, 0), (10, 10), (0, 10)], float), 6.0).replace("f 5 6 7 8", "f 5 6 7 9 10 9 7 8")
+    lines = text.splitlines()
+    (tmp_path / "a.obj").write_text("\n".join([*lines[:8], "v 10.0 15.0 6.0", "v 10.0 20.0 6.0", *lines[8:]]))
+    surface, _ = read(tmp_path / "a.obj", "mm", Sensor.load("gelslim"))
+    assert points_on(surface.polygons, 1000)[:, 1].max() == 10
+    assert prove(surface, repair(surface, options(surface))).largest < 1e-4
+
+
 def test_a_file_of_folded_triangles_is_refused_and_a_warning_is_told(command, tmp_path):
     ring = [(x, y, z) for z in (0.0, 6.0) for x, y in L_SHAPE]
     faces = [(0, k + 1, k) for k in range(1, 5)] + [(6, 6 + k, 7 + k) for k in range(1, 5)]

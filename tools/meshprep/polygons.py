@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,13 @@ from geomtact.geometry.polygons import Polygons
 from meshprep.surface import Array, Faces, Surface
 
 _AT_ONCE = 2_000_000  # corners that are looked at together
+_POINTS_AT_ONCE = 1000
+_EXACT = 1e-7  # of a surface's size: a distance below which no nearer polygon is looked for
+NO_AREA = 1e-12  # of the square of a surface's size: area below which nothing can be touched
 
 
 def points_on(polygons: Polygons, n: int) -> Array:
-    """All corners, and about ``n`` points spread evenly over the faces (m, 3)."""
+    """All corners but the tips of spikes, and about ``n`` points spread evenly over the faces (m, 3)."""
     corners = polygons.vertices[polygons.corners]
     normals, middle = _planes(polygons)
     u, v, w = _axes(normals)
@@ -33,22 +37,64 @@ def points_on(polygons: Polygons, n: int) -> Array:
     off = points - middle[face]
     slope = normals[face[:, None], np.stack([u, v], 1)] * off[row[:, None], np.stack([u, v], 1)]
     points[row, w] = middle[face][row, w] - slope.sum(1) / np.where(normals[face, w] == 0, 1, normals[face, w])
-    return np.concatenate([corners, points[_measure(polygons, face, points)[0]]])
+    blunt = _without_spikes(polygons)
+    return np.concatenate([blunt.vertices[blunt.corners], points[_measure(polygons, face, points)[0]]])
+
+
+def _without_spikes(polygons: Polygons) -> Polygons:
+    """Without the corners from which a side runs back along the one before, as there is no area between the two."""
+    least = NO_AREA * np.square(np.ptp(polygons.vertices[polygons.corners], axis=0)).sum()
+    while True:
+        before = np.arange(-1, len(polygons.corners) - 1)
+        before[polygons.starts] = polygons.starts + polygons.sizes - 1
+        along = polygons.vertices[polygons.next_corner] - polygons.vertices[polygons.corners]
+        flat = 0.5 * np.linalg.norm(np.cross(along[before], along), axis=1) <= least
+        spike = flat & ((np.einsum("ij,ij->i", along[before], along) < 0) | ~along.any(1))
+        if not spike.any():
+            return polygons
+        sizes = np.bincount(polygons.face_of_corner[~spike], minlength=len(polygons.sizes))
+        polygons = replace(polygons, corners=polygons.corners[~spike], sizes=sizes).without_repeats()
 
 
 def distance(surface: Surface, points: Array) -> Array:
-    """Distance (n,) of ``points`` (n, 3) from the polygons of which ``surface`` was made.
-
-    Of each point the polygon is the one of the triangle nearest to it. If that triangle leaves its polygon the point is measured
-    from the polygon nevertheless.
-    """
+    """Distance (n,) of ``points`` (n, 3) from the polygons of which ``surface`` was made, whatever its triangles cover."""
     import open3d as o3d
 
     assert surface.polygons is not None and surface.owner is not None
     scene, (middle, scale) = surface.scene
     nearest = scene.compute_closest_points(o3d.core.Tensor(((points - middle) / scale).astype(np.float32)))
     face = surface.owner[nearest["primitive_ids"].numpy().astype(np.int64)]
-    inside, height, beside = _measure(surface.polygons, face, points)
+    # of long thin faces Open3D names a wrong one; the distance from any bounds that from the nearest
+    bound = _distance_from(surface.polygons, face, points)
+    far = np.flatnonzero(bound > _EXACT * surface.size)
+    for some in (far[k : k + _POINTS_AT_ONCE] for k in range(0, len(far), _POINTS_AT_ONCE)):
+        bound[some] = _least(surface.polygons, points[some], bound[some])
+    return bound
+
+
+def _least(polygons: Polygons, points: Array, bound: Array) -> Array:
+    """Distance (n,) of ``points`` (n, 3) from the polygons, of which one is as near as ``bound`` (n,): from all within that."""
+    from scipy.spatial import cKDTree
+
+    corners = polygons.vertices[polygons.corners]
+    low, high = (f.reduceat(corners, polygons.starts) for f in (np.minimum, np.maximum))
+    middle, radius = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
+    _, octave = np.frexp(radius)
+    for size in np.unique(octave)[::-1]:
+        alike = np.flatnonzero(octave == size)
+        near = cKDTree(middle[alike]).query_ball_point(points, bound + radius[alike].max())
+        point = np.repeat(np.arange(len(points)), [len(some) for some in near])
+        face = alike[np.concatenate([*near, []]).astype(np.int64)]
+        outside = np.maximum(np.maximum(low[face] - points[point], points[point] - high[face]), 0)
+        within = np.linalg.norm(outside, axis=1) < bound[point]
+        point, face = point[within], face[within]
+        np.minimum.at(bound, point, _distance_from(polygons, face, points[point]))
+    return bound
+
+
+def _distance_from(polygons: Polygons, face: Faces, points: Array) -> Array:
+    """Distance (n,) of points (n, 3), each from one face (n,)."""
+    inside, height, beside = _measure(polygons, face, points)
     return np.where(inside, np.minimum(height, beside), beside)
 
 

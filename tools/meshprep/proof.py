@@ -89,11 +89,13 @@ def is_solid(path: Path) -> str | None:
 
 
 def _points(surface: Surface) -> Array:
-    """Corners, the middles of faces, and points spread evenly (n, 3); of the polygons where there are some."""
+    """Corners, the middles of faces, and points spread evenly (n, 3), but where there is no area; of the polygons where there
+    are some."""
     if _has_polygons(surface):
         return polygons.points_on(surface.polygons, SAMPLES)
     spread = Mesh(surface.vertices, surface.faces, "", "").surface_points(SAMPLES)
-    return np.concatenate([surface.corners.reshape(-1, 3), surface.corners[surface.areas > 0].mean(1), spread])
+    corners = surface.corners[surface.areas > polygons.NO_AREA * surface.size**2]
+    return np.concatenate([corners.reshape(-1, 3), corners.mean(1), spread])
 
 
 def _has_polygons(surface: Surface) -> bool:
