@@ -91,6 +91,63 @@ def test_a_cavity_is_no_inverted_body(tmp_path):
     refused("inside out", save(trimesh.util.concatenate([box(), hole]), tmp_path / "b.ply"), "mm")
 
 
+def u_block() -> trimesh.Trimesh:
+    """A U of 30 x 20 x 10, open towards +y between x = -5 and 5."""
+    ring = [(-15, -10), (15, -10), (15, 10), (5, 10), (5, 0), (-5, 0), (-5, 10), (-15, 10)]
+    n = len(ring)
+    vertices = [(x, y, z) for z in (-5, 5) for x, y in ring]
+    walls = [f for k in range(n) for f in ((k, (k + 1) % n, n + (k + 1) % n), (k, n + (k + 1) % n, n + k))]
+    cap = np.array([(0, 1, 5), (1, 4, 5), (1, 2, 4), (2, 3, 4), (0, 5, 6), (0, 6, 7)])
+    return trimesh.Trimesh(vertices, [*walls, *cap[:, ::-1], *(cap + n)], process=False)
+
+
+def inverted(mesh) -> trimesh.Trimesh:
+    mesh.invert()
+    return mesh
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_cavity_lies_in_a_body_and_not_only_within_its_bounds(tmp_path, turned, rng):
+    T = transform(random_rotations(1, rng)[0], [3, 1, 2]) if turned else np.eye(4)
+
+    def saved(*bodies):
+        return save(trimesh.util.concatenate(bodies).apply_transform(T), tmp_path / "a.ply")
+
+    u = u_block()
+    assert u.is_volume and u.volume == pytest.approx(10 * (600 - 100))
+    for size, where in (
+        ((4, 4, 4), (10, 0, 0)),
+        ((4, 4, 4), (0, -5, 0)),
+        ((20, 4, 4), (0, -5, 0)),
+        ((9, 4, 10), (0, -5, 0)),
+    ):
+        assert len(load_mesh(saved(u, inverted(box(size, where))), "mm").faces) == 28 + 12
+    assert len(load_mesh(saved(u, box((4, 4, 4), (0, 6, 0))), "mm").faces) == 28 + 12
+    for where in ((0, 6, 0), (0, 2.5, 1), (2.9, 7.9, -2.9)):  # a pin in the mouth
+        refused("inside out", saved(u, inverted(box((4, 4, 4), where))), "mm")
+    refused(
+        "a body about .* mm, whose faces look inwards, passes through another; subtract it in CAD",
+        saved(u, inverted(box((20, 4, 4), (0, 6, 0)))),
+        "mm",
+    )
+
+
+def test_a_sheet_beside_a_body_encloses_no_volume(tmp_path, rng):
+    for points in (rng.uniform(-9, 9, (3, 3)) for _ in range(10)):
+        for faces in ([[0, 1, 2], [0, 2, 1]], [[0, 2, 1], [0, 1, 2]]):
+            sheet = trimesh.Trimesh(points + [40, 0, 0], faces, process=False)
+            both = save(trimesh.util.concatenate([box(), sheet]), tmp_path / "a.ply")
+            refused("a body about .* mm encloses no volume, as a sheet without thickness; remove it", both, "mm")
+    n = 12  # a wavy one of many faces
+    k = np.arange(n * n).reshape(n, n)[:-1, :-1].ravel()
+    x, y = np.divmod(np.arange(n * n), n)
+    side = np.concatenate([np.stack([k, k + n, k + n + 1], 1), np.stack([k, k + n + 1, k + 1], 1)])
+    wave = trimesh.Trimesh(np.stack([x, y, 40 + np.sin(x) + np.cos(y)], 1), [*side, *side[:, ::-1]], process=False)
+    refused("encloses no volume, as a sheet", save(trimesh.util.concatenate([box(), wave]), tmp_path / "b.ply"), "mm")
+    needle = box((0.002, 0.002, 50), (40, 0, 0))
+    assert len(load_mesh(save(trimesh.util.concatenate([box(), needle]), tmp_path / "c.ply"), "mm").faces) == 24
+
+
 def test_diameter_is_the_largest_distance(rng):
     points = rng.normal(size=(300, 3))
     hull = trimesh.convex.convex_hull(points)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -17,6 +16,7 @@ from geomtact.geometry.folds import folded_faces
 from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.polygon_file import read_triangles
+from geomtact.geometry.solid import check_solid, place_mm
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.geometry.units import METRE_FORMATS, UNITS, stated_unit, unit_comment
 from geomtact.se3 import Array
@@ -74,7 +74,7 @@ def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _Se
         name, path, unit, symmetry = _resolve(source, unit)
         raw_vertices, raw_faces, warnings = _read_triangles(path, unit)
         vertices, faces = _tidy(raw_vertices * UNITS[unit], raw_faces, path, unit)
-        _check_closed(vertices, faces, path)
+        check_solid(vertices, faces, path)
         warnings += _check_folds(vertices, faces, path)
         mesh = Mesh(vertices, faces, name, unit, path, symmetry, warnings)
     if isinstance(sensor, str | os.PathLike):
@@ -201,50 +201,6 @@ def _tidy(vertices: Array, faces: NDArray, path: Path, unit: str) -> tuple[Array
     return vertices[kept], faces.astype(np.int32)
 
 
-def _check_closed(vertices: Array, faces: NDArray[np.int32], path: Path) -> None:
-    """Every edge is walked as often one way as the other, and the surface's outside is outside.
-
-    This allows bodies that touch along an edge, which casts of rays do not mind.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    _, index, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    excess = np.bincount(index.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
-    bare = int((uses % 2 == 1).sum())
-    if bare:
-        raise MeshError(
-            f"{path}: not watertight, {bare} of {len(uses)} edges are open; "
-            "close the surface with tools/prep_mesh.py or a mesh editor"
-        )
-    turned = int((excess != 0).sum())
-    if turned:
-        raise MeshError(
-            f"{path}: neighbouring faces disagree about the outside at {turned} of {len(uses)} edges; "
-            "make them agree in a mesh editor and export it again"
-        )
-    join = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
-    count, body_of_vertex = connected_components(join, directed=False)
-    body = body_of_vertex[faces[:, 0]]
-    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(0), 1, 0)
-    volume = np.bincount(body, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, minlength=count)
-    low, high = (
-        _bounds(vertices, body_of_vertex, count, np.minimum),
-        _bounds(vertices, body_of_vertex, count, np.maximum),
-    )
-    # An inverted body is a cavity if it lies in an upright one; otherwise it is inside out.
-    solid = volume > 0
-    for k in np.flatnonzero(volume < 0):
-        if not ((low[solid] <= low[k]) & (high[solid] >= high[k])).all(1).any():
-            raise MeshError(
-                f"{path}: the surface is inside out (its faces look inwards); flip its faces in a mesh editor and export it again"
-            )
-    size = np.linalg.norm(high - low, axis=1).max()
-    if volume.sum() < 1e-6 * size**3:
-        raise MeshError(f"{path}: the surface encloses no volume; give a solid part")
-
-
 def _check_folds(vertices: Array, faces: NDArray[np.int32], path: Path) -> tuple[str, ...]:
     """Refuse a surface that is folded back onto itself where a sensor would feel it; of less, a warning."""
     folded = folded_faces(vertices, faces)
@@ -252,22 +208,16 @@ def _check_folds(vertices: Array, faces: NDArray[np.int32], path: Path) -> tuple
         return ()
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    area, where = areas[folded].sum(), vertices[faces[folded[areas[folded].argmax()]]].mean(0)
+    area, where = areas[folded].sum(), vertices[faces[folded[areas[folded].argmax()]]]
     said = (
         f"faces of {1e6 * area:.3g} mm2 are folded back onto their neighbours in one plane, one about "
-        f"({', '.join(f'{1e3 * x:.4g}' for x in where)}) mm, as a fan of triangles does that stands for a polygon"
+        f"({place_mm(where)}) mm, as a fan of triangles does that stands for a polygon"
     )
     if area > min(_FOLDED_SHARE * areas.sum(), _FOLDED):
         raise MeshError(
             f"{path}: {said}; export it with its polygons (OBJ, PLY, OFF), or mend it there in a mesh editor"
         )
     return (f"{path.name}: {said}",)
-
-
-def _bounds(vertices: Array, body: NDArray, count: int, pick: Callable) -> Array:
-    out = np.full((count, 3), np.inf if pick is np.minimum else -np.inf)
-    pick.at(out, body, vertices)  # type: ignore[attr-defined]
-    return out
 
 
 def _check_scale(mesh: Mesh, sensor: _SensorLike) -> None:
