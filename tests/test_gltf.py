@@ -246,6 +246,24 @@ def test_morph_targets_move_vertices_by_their_weights(tmp_path):
     assert_is(made.glb(tmp_path / "node.glb"), 2 * CORNERS, 8 * VOLUME)
 
 
+def test_a_morph_target_without_data_moves_nothing(tmp_path):
+    made = Made()
+    still, half = made.accessor(CORNERS, bufferView=None), made.accessor(CORNERS)
+    made.primitive["targets"] = [{"POSITION": still}, {"POSITION": half}]
+    made.primitive["extensions"] = {"KHR_materials_variants": {"mappings": []}}
+    made.node["weights"] = [1, 0.5]
+    assert_is(made.glb(tmp_path / "a.glb"), 1.5 * CORNERS, 1.5**3 * VOLUME)
+    made.content["accessors"][still]["extensions"] = {"ACME_packs": {}}
+    refused("its mesh lies in the glTF extension .*ACME_packs", made.glb(tmp_path / "b.glb"))
+
+
+def test_instances_that_only_other_attributes_tell_apart_are_one(tmp_path):
+    made = Made()
+    attributes = {"_ID": made.accessor(np.arange(3, dtype=np.float32))}
+    made.node["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    assert_is(made.glb(tmp_path / "a.glb"))
+
+
 def test_strips_and_fans_are_triangles(tmp_path):
     """Two fans of a box's corners, about opposite ones, and the strip around a tetrahedron."""
     near = [0, 1, 5, 4, 6, 2, 3, 1]
@@ -291,7 +309,9 @@ def test_the_default_scene_is_read(tmp_path):
     made.content["nodes"] = []
     refused("no scene that places them", made.glb(tmp_path / "meshes.glb"))
     made.content |= {"scenes": [{}], "scene": 0}
-    refused("found only points or lines|found nothing", made.glb(tmp_path / "empty.glb"))
+    refused("found nothing in the scene that it shows; export", made.glb(tmp_path / "empty.glb"))
+    made.content |= {"scenes": [{"nodes": [0]}], "nodes": [{"camera": 0}, {"mesh": 0}]}
+    refused("found nothing in the scene that it shows; export", made.glb(tmp_path / "camera.glb"))
 
 
 def test_what_moves_bends_or_hides_the_mesh_is_named(tmp_path):

@@ -47,13 +47,14 @@ class GltfData:
             raise MeshError(f"it names number {index} of {len(entries)} {name}; export it again")
         return entries[index]
 
-    def numbers(self, index: int, kind: str, owner: Mapping[str, Any]) -> Array:
+    def numbers(self, index: int, kind: str, owner: Mapping[str, Any], *, or_zeros: bool = False) -> Array:
         """The ``index``-th accessor (count, width), normalised integers as the numbers that they mean.
 
         Parameters
         ----------
         kind : "SCALAR", "VEC3" or "VEC4", which it has to be
         owner : what names the accessor, whose extensions are blamed if it has no data
+        or_zeros : whether it is zero where neither it nor an extension has data, as glTF 2.0 says
         """
         accessor = self.at("accessors", index)
         count, width = accessor["count"], _WIDTHS[kind]
@@ -62,7 +63,7 @@ class GltfData:
         dtype = _dtype(accessor["componentType"])
         if "bufferView" in accessor:
             raw = self._view(accessor, count, width, dtype, (owner, accessor))
-        elif "sparse" in accessor:
+        elif "sparse" in accessor or (or_zeros and not accessor.get("extensions")):
             raw = np.zeros((count, width), dtype)
         else:
             raise _no_data(owner, accessor)

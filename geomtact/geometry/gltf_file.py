@@ -57,7 +57,7 @@ def read_gltf(path: Path) -> tuple[Array, NDArray[np.int64]]:
     first = np.cumsum([0, *(len(vertices) for vertices, _ in pieces)])
     faces = [faces + start for (_, faces), start in zip(pieces, first, strict=False)]
     if not sum(map(len, faces)):
-        what = "only points or lines" if data.content.get("meshes") else "nothing"
+        what = "only points or lines" if pieces else "nothing in the scene that it shows"
         raise MeshError(f"{path}: expected a surface of triangles, found {what}; export the mesh with its faces")
     vertices, triangles = np.concatenate([vertices for vertices, _ in pieces]), np.concatenate(faces)
     if not np.isfinite(vertices[triangles]).all():
@@ -105,6 +105,7 @@ def _pieces(data: GltfData) -> Iterator[tuple[Array, NDArray[np.int64]]]:
         weights = node.get("weights", mesh.get("weights", []))
         for primitive in mesh["primitives"]:
             if primitive.get("mode", _TRIANGLES) in _POINTS_AND_LINES:
+                yield np.zeros((0, 3)), np.zeros((0, 3), np.int64)
                 continue
             vertices, faces = _primitive(data, primitive, weights)
             for T in placements:
@@ -149,10 +150,12 @@ def _placed(node: Mapping[str, Any]) -> Array:
 
 
 def _instances(data: GltfData, instancing: Mapping[str, Any]) -> Array:
-    """``T_node_instance`` (n, 4, 4) of EXT_mesh_gpu_instancing."""
+    """``T_node_instance`` (n, 4, 4) of EXT_mesh_gpu_instancing; one if only attributes of other names tell instances apart."""
     named = {"TRANSLATION": ("VEC3", [0, 0, 0]), "ROTATION": ("VEC4", [0, 0, 0, 1]), "SCALE": ("VEC3", [1, 1, 1])}
     attributes = instancing["attributes"]
     found = {name: data.numbers(attributes[name], named[name][0], instancing) for name in named if name in attributes}
+    if not found:  # all lie on each other
+        return np.eye(4)[None]
     n = len(next(iter(found.values())))
     return _composed(*(found.get(name, np.tile(default, (n, 1))) for name, (_, default) in named.items()))
 
@@ -173,7 +176,7 @@ def _primitive(data: GltfData, primitive: Mapping[str, Any], weights: list[float
     vertices = data.numbers(attributes["POSITION"], "VEC3", primitive)
     for weight, target in zip(weights, primitive.get("targets", []), strict=False):
         if weight and "POSITION" in target:
-            vertices = vertices + weight * data.numbers(target["POSITION"], "VEC3", primitive)
+            vertices = vertices + weight * data.numbers(target["POSITION"], "VEC3", primitive, or_zeros=True)
     if "indices" in primitive:
         corners = data.numbers(primitive["indices"], "SCALAR", primitive)[:, 0].astype(np.int64)
     else:
