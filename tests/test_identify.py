@@ -157,6 +157,7 @@ def test_parts_by_a_folder_and_by_names(tmp_path):
         parts_of("pin,pin")
     for name in ("b.stl", "a.ply", "note.txt"):
         (tmp_path / name).touch()
+    (tmp_path / "._a.ply").write_bytes(b"\0\5\x16\7")  # beside each file on disks that macOS writes to
     assert parts_of(str(tmp_path)) == [str(tmp_path / "a.ply"), str(tmp_path / "b.stl")]
     odd = tmp_path / "a,b.stl"
     odd.touch()

@@ -540,6 +540,9 @@ def test_a_folder_gets_a_table_and_what_is_refused_leaves_nothing(command, tmp_p
     BOX.export(folder / "box.stl")
     open_box = BOX.submesh([np.arange(10)], append=True)
     open_box.export(folder / "open.stl")
+    (folder / "._box.stl").write_bytes(b"\0\5\x16\7")
+    (folder / ".trash").mkdir()
+    BOX.export(folder / ".trash" / "old.stl")
     done = command(folder, "--unit", "mm", "--out", out, "--json")
     assert done.exit_code == 0, done.output
     results = {r["name"]: r for r in json.loads(done.stdout)["meshes"]}

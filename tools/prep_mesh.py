@@ -205,12 +205,13 @@ def _resident(pid: int | None) -> int:
 
 
 def _files(inputs: Sequence[Path], out: Path) -> list[Path]:
-    """The files to be prepared; of folders all meshes in them, but for the results of an earlier run."""
+    """The files to be prepared; of folders all meshes in them, but for hidden ones and the results of an earlier run."""
     from meshprep.reading import FORMATS
 
     files: list[Path] = []
     for each in inputs:
-        inside = sorted(p for p in each.rglob("*") if p.suffix.lower() in FORMATS) if each.is_dir() else [each]
+        below = (p for p in each.rglob("*") if not any(name.startswith(".") for name in p.relative_to(each).parts))
+        inside = sorted(p for p in below if p.suffix.lower() in FORMATS) if each.is_dir() else [each]
         files += [p for p in inside if p == each or out.resolve() not in p.resolve().parents]
     return files
 

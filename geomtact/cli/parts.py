@@ -30,7 +30,7 @@ def parts_of(object_name: str | None) -> list[str | None]:
             raise InputError(f"--object {object_name}: expected each part once, with a comma between two")
         return list(names)
     bundled = {entry.file.resolve(): name for name, entry in catalogue().items()}
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in FORMATS)
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in FORMATS and not p.name.startswith("."))
     if not files:
         raise InputError(f"--object {folder}: no mesh in this folder; expected {', '.join(FORMATS)}")
     return [bundled.get(path.resolve(), str(path)) for path in files]

@@ -114,7 +114,7 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
             raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(FORMATS)}")
         raise MeshError(f"no part named {text!r}{nearest_name(text, parts)}; or give a mesh file ({' '.join(FORMATS)})")
     if not path.is_file():
-        beside = [p.name for p in path.parent.glob("*") if p.suffix.lower() in FORMATS]
+        beside = [p.name for p in path.parent.glob("[!.]*") if p.suffix.lower() in FORMATS]
         hint = did_you_mean(path.name, beside) or f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
         raise MeshError(f"{text}: no such file{hint}")
     if suffix in METRE_FORMATS and unit not in (None, "m"):
