@@ -67,8 +67,7 @@ def distance(surface: Surface, points: Array) -> Array:
     # of long thin faces Open3D names a wrong one; the distance from any bounds that from the nearest
     bound = _distance_from(surface.polygons, face, points)
     far = np.flatnonzero(bound > _EXACT * surface.size)
-    for some in (far[k : k + _POINTS_AT_ONCE] for k in range(0, len(far), _POINTS_AT_ONCE)):
-        bound[some] = _least(surface.polygons, points[some], bound[some])
+    bound[far] = _least(surface.polygons, points[far], bound[far])
     return bound
 
 
@@ -82,13 +81,16 @@ def _least(polygons: Polygons, points: Array, bound: Array) -> Array:
     _, octave = np.frexp(radius)
     for size in np.unique(octave)[::-1]:
         alike = np.flatnonzero(octave == size)
-        near = cKDTree(middle[alike]).query_ball_point(points, bound + radius[alike].max())
-        point = np.repeat(np.arange(len(points)), [len(some) for some in near])
-        face = alike[np.concatenate([*near, []]).astype(np.int64)]
-        outside = np.maximum(np.maximum(low[face] - points[point], points[point] - high[face]), 0)
-        within = np.linalg.norm(outside, axis=1) < bound[point]
-        point, face = point[within], face[within]
-        np.minimum.at(bound, point, _distance_from(polygons, face, points[point]))
+        tree, reach = cKDTree(middle[alike]), radius[alike].max()
+        for first in range(0, len(points), _POINTS_AT_ONCE):
+            some = slice(first, first + _POINTS_AT_ONCE)
+            near = tree.query_ball_point(points[some], bound[some] + reach)
+            point = first + np.repeat(np.arange(len(near)), [len(each) for each in near])
+            face = alike[np.concatenate([*near, []]).astype(np.int64)]
+            outside = np.maximum(np.maximum(low[face] - points[point], points[point] - high[face]), 0)
+            within = np.linalg.norm(outside, axis=1) < bound[point]
+            point, face = point[within], face[within]
+            np.minimum.at(bound, point, _distance_from(polygons, face, points[point]))
     return bound
 
 
