@@ -63,7 +63,7 @@ def check_solid(vertices: Array, faces: NDArray[np.int32], path: Path) -> None:
     for k in np.flatnonzero(np.abs(volume) <= _NO_VOLUME * sizes**3):
         raise MeshError(
             f"{path}: a body about ({place_mm(vertices[faces[body == k]])}) mm encloses no volume, as a sheet without thickness; "
-            "remove it with tools/prep_mesh.py, or give it a thickness in a mesh editor"
+            "remove it, or give it a thickness, in a mesh editor"
         )
     # An inverted body is a cavity if it lies in an upright one; otherwise it is inside out.
     for k in np.flatnonzero(volume < 0):
