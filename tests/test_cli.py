@@ -397,3 +397,29 @@ def test_interrupt_exits_130_without_a_traceback():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 130
     assert "Traceback" not in done.stderr
+
+
+def test_each_image_may_have_a_background_of_its_own(tmp_path, monkeypatch, rng):
+    monkeypatch.chdir(tmp_path)
+    given = {}
+
+    def noted(*_, **options):
+        given.update(options)
+        raise InputError("far enough")
+
+    monkeypatch.setattr("geomtact.inference.identify.identify", noted)
+    for name in ("a", "b", "rest_a", "rest_b"):
+        Image.fromarray(rng.integers(100, 110, (320, 427, 3)).astype(np.uint8)).save(f"{name}.png")
+    (tmp_path / "poses.json").write_text(
+        json.dumps({"T_world_sensor": [np.eye(4).tolist(), np.diag([1, -1, -1, 1]).tolist()]})
+    )
+    run = ["localize", "a.png", "b.png", "--object", "ball", "--sensor", "gelslim", "--sensor-poses", "poses.json"]
+    both = ["--background", "rest_a.png", "--background", "rest_b.png"]
+    assert "far enough" in CliRunner().invoke(app, [*run, *both]).output
+    assert given["background"] == ["rest_a.png", "rest_b.png"]
+    CliRunner().invoke(app, [*run, *both[:2]])
+    assert given["background"] == "rest_a.png"
+    refused = CliRunner().invoke(app, [*run, *both, *both[:2]])
+    assert refused.exit_code == 2 and "expected one, or one for each of 2 images, got 3" in " ".join(
+        refused.output.split()
+    )

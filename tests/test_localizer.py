@@ -300,7 +300,7 @@ def test_a_prior_that_cannot_be_is_refused_and_one_that_the_image_contradicts_is
 
 @pytest.mark.parametrize("width", [0.3, 0.8, 2.0, 6.0])
 def test_a_gaussian_prior_is_the_density_of_what_it_draws(rng, width):
-    """What is drawn from it is turned as far, in the mean, as its density over evenly drawn poses says; and the wider, the more."""
+    """What is drawn is turned as far, in the mean, as its density over evenly drawn poses says; and the wider, the more."""
     prior = GaussianPrior(np.eye(4), np.diag([width**2] * 3 + [1.0] * 3))
     even = transform(random_rotations(300_000, rng), rng.uniform(-3.5, 3.5, (300_000, 3)))
     weight = np.exp(prior(even))

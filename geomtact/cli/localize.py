@@ -12,7 +12,6 @@ import typer
 
 from geomtact.cli.options import (
     Approaches,
-    Background,
     CacheDir,
     Effort,
     EffortName,
@@ -68,7 +67,12 @@ def localize(
     unit: Unit = None,
     sensor: SensorName = None,
     kind: KindName = Kind.auto.value,
-    background: Background = None,
+    background: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Image of the untouched sensor, for readings; of several images one for all, or one for each."
+        ),
+    ] = None,
     sensor_poses: Annotated[
         Path | None,
         typer.Option(
@@ -133,7 +137,11 @@ def localize(
         _check_images(images, sensor_poses)
     placed = read_sensor_poses(sensor_poses, len(images)) if sensor_poses is not None else None
     metadata = [] if live else [read_metadata(image) for image in images]
-    values, sources = resolve(given_of(object_name, unit, sensor, background, effort), metadata[0] if metadata else {})
+    if background and len(background) not in (1, len(images)):
+        raise UsageError(f"--background: expected one, or one for each of {len(images)} images, got {len(background)}")
+    first = background[0] if background else None
+    values, sources = resolve(given_of(object_name, unit, sensor, first, effort), metadata[0] if metadata else {})
+    backgrounds = [str(each) for each in background] if background and len(background) > 1 else None
     values["effort"] = chosen = values["effort"] or Effort.balanced.value
     check_name("kind", kind, Kind)
     check_name("effort", chosen, Effort, sources.get("effort"))
@@ -149,7 +157,9 @@ def localize(
         values["object"] = parts[0]
 
     mounting = Mounting(rotate, mirror)
-    asked = _Asked(images, kind, values, sources, prior, sides, scorer, seed, max_poses, cache_dir, mounting)
+    asked = _Asked(
+        images, kind, values, sources, prior, sides, scorer, seed, max_poses, cache_dir, mounting, backgrounds
+    )
     if live:
         _follow(asked, camera)
         return
@@ -185,6 +195,7 @@ class _Asked:
     ----------
     values : object, unit, sensor, background and effort
     sources : where those which the command line did not give come from
+    backgrounds : one for each image, where more than one was given
     """
 
     images: list[Path]
@@ -198,6 +209,7 @@ class _Asked:
     max_poses: int | None
     cache_dir: Path | None
     mounting: Mounting
+    backgrounds: list[str] | None
 
     def opened(self, own: dict[str, Any], quiet: bool = False, frame: str = "sensor") -> Localizer:
         """The localizer of what is asked for, with ``own`` values in the place of those; ``quiet``: where values come from is not
@@ -241,10 +253,11 @@ def _identified(asked: _Asked, parts: Sequence[str | None], placed: SensorPoses 
 
     images, values = asked.images, asked.values
     gels = placed.sensor if placed is not None and placed.sensor is not None else [values["sensor"]] * len(images)
-    for image, gel in zip(images, gels, strict=True):
+    backgrounds = asked.backgrounds or [values["background"]] * len(images)
+    for image, gel, background in zip(images, gels, backgrounds, strict=True):
         if gel is not None:
             # a bad image is told before minutes go into an index
-            read_observation(image, asked.mounting.of(gel), asked.kind, values["background"])
+            read_observation(image, asked.mounting.of(gel), asked.kind, background)
     frame = "sensor" if placed is None else "world"
     took, units = 0.0, dict(zip(parts, units_of(parts, values["unit"]), strict=True))
 
@@ -261,7 +274,7 @@ def _identified(asked: _Asked, parts: Sequence[str | None], placed: SensorPoses 
         map(opened, parts),
         [str(image) for image in images],
         kind=asked.kind,
-        background=values["background"],
+        background=asked.backgrounds or values["background"],
         T_world_sensor=None if placed is None else placed.T_world_sensor,
         prior=asked.prior,
         effort=values["effort"],
