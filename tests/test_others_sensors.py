@@ -125,7 +125,7 @@ def test_a_whole_frame_of_the_mini_is_refused_with_its_part_that_counts(size, ke
     message = (
         f"image: expected 320 x 240 px for sensor gelsight-mini (width x height), got {size[0]} x {size[1]} px; of the camera's "
         f"whole frame give image[{kept}] scaled to 320 x 240 px, for the sensor's images are without 14 % of it at each side; "
-        "what is cut already, or a mask of the image, only scale"
+        "if it is cut already, scale it to 320 x 240 px"
     )
     with pytest.raises(ImageError) as error:
         read_observation(frame, "gelsight-mini")

@@ -273,7 +273,7 @@ def test_eight_bit_heights_have_no_unit():
 
 def test_a_background_of_another_size_is_refused(background, tmp_path):
     with pytest.raises(
-        ImageError, match="background: expected 320 x 240 px .* width and height are exchanged: .*--rotate 90 or 270"
+        ImageError, match="background: expected 320 x 240 px .* width and height are exchanged: .*--rotate 90 turns"
     ):
         read_observation(background, MINI, background=background.swapaxes(0, 1))
     path = write(tmp_path / "untouched.png", background[:200])

@@ -58,6 +58,7 @@ def main(
     as_json: Annotated[bool, typer.Option("--json", help="Print all results as JSON, and nothing else there.")] = False,
 ) -> None:
     """Repair meshes, prove what that changed, and say in which unit and with which symmetry they are parts."""
+    from meshprep.reading import states_own_unit
     from meshprep.repair import STEPS
 
     unknown = sorted(set(skip or ()) - set(STEPS))
@@ -91,6 +92,7 @@ def main(
         "description": description,
         "licence": licence,
         "taken": names,
+        "of_several": not all(states_own_unit(file) for file in files if file.is_file()),
     }
     results = []
     for file, name in zip(files, names, strict=True):
@@ -123,8 +125,7 @@ def prepare(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[s
 
     result: dict[str, Any] = {"file": str(file), "name": name, "outcome": "refused", "reason": None}
     try:
-        of_several = len(options["taken"]) > 1
-        surface, unit = read(file, options["unit"], Sensor.load(options["sensor"]), of_several)
+        surface, unit = read(file, options["unit"], Sensor.load(options["sensor"]), options["of_several"])
         mm = 1e3 * UNITS[unit]  # millimetres in the file's unit
         result |= {"unit": unit, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), "size_mm": mm * surface.size}
         allowed = Options(

@@ -221,7 +221,7 @@ def _print(found: Calibrated, ball_mm: float) -> None:
     typer.echo(
         f"{len(mm)} presses of {len(mm) + len(found.left_out)}; each measured by a table fitted to the others:\n"
         f"  the ball's diameter   {middle:.2f} mm (half of the presses {low:.2f} to {high:.2f}), {ball_mm:g} was said:\n"
-        "                        how well the presses agree, which is no check of what was said\n"
+        "                        how well the presses agree; a wrong --ball-mm does not show\n"
         f"  slopes                off by {colour.slope_rms:.3f} rms (1 is 45 degrees)\n"
         f"  heights               off by {1e3 * colour.height_rms:.3f} mm rms where nothing touches\n"
         f"  contact               shows where the gel is pressed in by {1e3 * colour.contact_depth:.2f} mm"

@@ -88,7 +88,9 @@ def _counters(numbers: set[tuple[str, str]]) -> tuple[bool, bool]:
         for whole, fraction in pairs
     )
     padded = any(len(fraction) > 1 and fraction.startswith("0") for _, fraction in pairs)
-    return counted, counted != padded
+    # nanoseconds counted without zeros before them would end in zeros here and there, or have nine digits
+    seconds = all(len(whole) == 10 and whole.startswith("1") for whole, _ in pairs)
+    return counted, counted != padded or (seconds and not counted)
 
 
 def _halves(number: str) -> tuple[str, str]:

@@ -11,7 +11,7 @@ import numpy as np
 from geomtact.errors import MeshError
 from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh_file import FORMATS as READ
-from geomtact.geometry.mesh_file import PREPARED
+from geomtact.geometry.mesh_file import PREPARED, states_unit
 from geomtact.geometry.polygon_file import READERS, read_triangles
 from geomtact.geometry.units import METRE_FORMATS, UNITS, stated_unit
 from geomtact.sensing.sensor import Sensor
@@ -34,6 +34,11 @@ _THREE_MF = {
 TESSELLATION = 0.01  # of STEP files: how far from their surface its triangles may lie [mm]
 
 
+def states_own_unit(path: Path) -> bool:
+    """Whether a file needs no unit."""
+    return path.suffix.lower() in PREPARED or states_unit(path)
+
+
 def read(path: Path, unit: str | None, sensor: Sensor, of_several: bool = False) -> tuple[Surface, str]:
     """The surface in a file, and its unit.
 
@@ -41,7 +46,7 @@ def read(path: Path, unit: str | None, sensor: Sensor, of_several: bool = False)
     ----------
     unit : "mm", "cm", "m", "inch" in upper or lower case, for files that state none; "auto" only proposes
     sensor : by whose window "auto" judges
-    of_several : whether ``unit`` is given for several files, and so for those that state none
+    of_several : whether ``unit`` is given for several files, of which some state none, and so for these
 
     Raises
     ------
