@@ -139,13 +139,15 @@ def _mounted(
     from geomtact.sensing.image_file import read_image
     from geomtact.sensing.sensor import Sensor
 
-    if not mounting.said or (sensor is None and pitch is None):
+    if not mounting.said:
         return sensor
     if sensor is not None:
         return mounting.of(sensor, masks=False)
+    if pitch is None:
+        return None
     height, width = read_image(background).shape[:2]
     size = (height, width) if _quarter_turned(None, mounting) else (width, height)
-    return mounting.of(Sensor("calibrated", size, pitch or (0.0, 0.0), 0.0, 2e-3), masks=False)
+    return mounting.of(Sensor("calibrated", size, pitch, 0.0, 2e-3), masks=False)
 
 
 def _of_taxim(

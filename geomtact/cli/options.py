@@ -131,7 +131,9 @@ class Mounting:
     mirror: bool | None = None
 
     def __post_init__(self) -> None:
-        if self.rotate not in (None, 0, 90, 180, 270):
+        from geomtact.sensing.sensor import ROTATIONS
+
+        if self.rotate is not None and self.rotate not in ROTATIONS:
             raise UsageError(f"--rotate: expected 0, 90, 180 or 270 degrees, counter-clockwise, got {self.rotate}")
 
     @property
