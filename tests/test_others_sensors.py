@@ -157,6 +157,10 @@ def test_a_live_frame_is_cut_as_the_sensors_images_are(monkeypatch, size):
     np.testing.assert_allclose(image[0, 0, :2], 255 / 7, atol=3)
     np.testing.assert_allclose(image[-1, -1, :2], 255 * 6 / 7, atol=3)
     assert next(camera_frames("0")).image.shape == frame.shape
+    # cut before it is turned, so of the camera's aspect, not of the sensor's
+    mounted = replace(Sensor.load("gelsight-mini"), image_size_px=(240, 320), camera_rotation_deg=90)
+    turned = next(camera_frames("0", mounted)).image
+    assert np.array_equal(turned, image) and mounted.upright(turned).shape == (320, 240, 3)
 
 
 def test_a_live_frame_of_another_aspect_is_refused(monkeypatch):

@@ -142,35 +142,24 @@ def camera_frames(source: str, sensor: Sensor | None = None) -> Generator[Frame,
         raise InputError(f"camera {source}: gives no image; does another program use it?")
     if sensor is not None:
         _check_camera(first[0], sensor, source)
-    return newest(lambda: _driven(first.pop() if first else _next_rgb(capture), sensor), capture.release)
+
+    def read() -> Any:
+        image = first.pop() if first else _next_rgb(capture)
+        return image if image is None or sensor is None else sensor.driven(image)
+
+    return newest(read, capture.release)
 
 
 def _check_camera(image: Any, sensor: Sensor, source: str) -> None:
     """Refuse a camera's image (H, W, 3) of another size than the sensor's; say whether it is turned."""
     from geomtact.sensing.change import check_size
 
-    check_size(sensor.upright(_driven(image, sensor)), sensor, f"camera {source}")
+    check_size(sensor.upright(sensor.driven(image)), sensor, f"camera {source}")
     if sensor.straight_from_camera(image):
         tell(
             f"camera {source}: {image.shape[1]} x {image.shape[0]} px are turned by {sensor.driver_rotation_deg} degrees "
             f"counter-clockwise, as the driver of {sensor.name} does"
         )
-
-
-def _driven(image: Any, sensor: Sensor | None) -> Any:
-    """A camera's image (H, W, 3), or None, as the maker's driver gives it: turned, or without its border."""
-    if image is None or sensor is None:
-        return image
-    import cv2
-    import numpy as np
-
-    from geomtact.sensing.change import has_aspect_of
-
-    if sensor.straight_from_camera(image):
-        image = np.rot90(image, sensor.driver_rotation_deg // 90)
-    if sensor.border_fraction and has_aspect_of(image.shape, sensor):
-        image = cv2.resize(image[sensor.cut(image.shape)], sensor.camera_size_px, interpolation=cv2.INTER_AREA)
-    return image
 
 
 def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) -> Generator[Frame, None, None]:

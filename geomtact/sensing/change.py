@@ -11,22 +11,19 @@ from numpy.typing import NDArray
 
 from geomtact.errors import ImageError
 from geomtact.se3 import Array
-from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.image_file import read_image
 from geomtact.sensing.pixels import Mask, blurred, closed, every, filled, median_of, opened, pixels_apart, size_of
-from geomtact.sensing.sensor import Sensor
+from geomtact.sensing.sensor import Sensor, alike_in_aspect
 
 GRID = 120  # smoothing lengths along an image's shorter side
 Image = NDArray[np.floating]  # (H, W, 3) of 0..1
 _GREY = 1 / 255
-_ALIKE = 0.02  # by which a camera's frame may be wider or narrower than the image that is cut out of it
 _APART = 3  # pixels from one to the next that a smooth background is fitted to
 _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 
 
 def colour_change(image: Image, background: Image) -> tuple[Array, Mask]:
     """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it is felt."""
-    image, _ = without_flicker(image, background)
     change, felt, _, _ = change_from(image, background, min(image.shape[:2]) / GRID)
     return change, felt
 
@@ -153,7 +150,11 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
         )
     elif do is not None:
         hint = do
-    elif sensor.border_fraction and width > sensor.image_size_px[0] and has_aspect_of(array.shape, sensor):
+    elif (
+        sensor.border_fraction
+        and width > sensor.image_size_px[0]
+        and alike_in_aspect(array.shape, sensor.image_size_px)
+    ):
         rows, columns = sensor.cut(array.shape)
         hint = (
             f"of the camera's whole frame give image[{rows.start}:{rows.stop}, {columns.start}:{columns.stop}] scaled to "
@@ -168,12 +169,6 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
             "or a sensor file of its resolution"
         )
     raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
-
-
-def has_aspect_of(shape: tuple[int, ...], sensor: Sensor) -> bool:
-    """Whether an image (h, w, ...) is about as wide for its height as the sensor's."""
-    width, height = sensor.image_size_px
-    return abs(shape[1] * height / (shape[0] * width) - 1) < _ALIKE
 
 
 def background_of(background: Any, image: Array) -> Array:

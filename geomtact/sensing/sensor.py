@@ -26,6 +26,7 @@ HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
 CONTACT_METHODS = ("auto", "classical", "pressure", "learned")  # of finding the contact in a reading, the default first
 
 
+_ALIKE = 0.02  # by which a camera's frame may be wider or narrower than the image that is cut out of it
 ROTATIONS = (0, 90, 180, 270)  # degrees by which a camera may be turned
 
 
@@ -196,11 +197,23 @@ class Sensor:
 
     def upright(self, image: NDArray[Any]) -> NDArray[Any]:
         """An image (H, W, ...) of the camera, mirrored and turned as the sensor is mounted: one in the sensor frame."""
-        if self.straight_from_camera(image):
-            image = np.rot90(image, self.driver_rotation_deg // 90)
+        image = self._turned_by_driver(image)
         if self.camera_mirrored:
             image = image[:, ::-1]
         return np.ascontiguousarray(np.rot90(image, self.camera_rotation_deg // 90))
+
+    def driven(self, frame: NDArray[Any]) -> NDArray[Any]:
+        """A frame (H, W, 3) straight from the camera as the maker's driver gives it: turned, its border cut off, and scaled."""
+        image = self._turned_by_driver(frame)
+        if not (self.border_fraction and alike_in_aspect(image.shape, self.camera_size_px)):
+            return image
+        import cv2
+
+        inside = image[self.cut(image.shape)]
+        return np.asarray(cv2.resize(inside, self.camera_size_px, interpolation=cv2.INTER_AREA))
+
+    def _turned_by_driver(self, image: NDArray[Any]) -> NDArray[Any]:
+        return np.rot90(image, self.driver_rotation_deg // 90) if self.straight_from_camera(image) else image
 
     @property
     def half_window(self) -> Array:
@@ -272,6 +285,11 @@ class Sensor:
     def from_pixels(self, uv: ArrayLike) -> Array:
         """Inverse of :meth:`to_pixels`."""
         return (np.asarray(uv, float) + 0.5) * np.asarray(self.pixel_pitch) - self.half_window
+
+
+def alike_in_aspect(shape: tuple[int, ...], size: tuple[int, int]) -> bool:
+    """Whether an image (h, w, ...) is about as wide for its height as one of ``size`` (width, height)."""
+    return abs(shape[1] * size[1] / (shape[0] * size[0]) - 1) < _ALIKE
 
 
 def bundled_sensors() -> list[str]:
