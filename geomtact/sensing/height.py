@@ -11,6 +11,7 @@ from geomtact.errors import SensorError
 from geomtact.se3 import Array
 from geomtact.sensing.change import as_unit_rgb, check_size, colour_change, same_size
 from geomtact.sensing.colour import ColourTable
+from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.sensor import Sensor
 from geomtact.sensing.slope import integrate
 
@@ -46,13 +47,12 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
         )
     image = sensor.upright(as_unit_rgb(image, "image"))
     check_size(image, sensor, "image")
-    return height_of(
-        image, same_size(sensor.upright(as_unit_rgb(background, "background")), image, "background", "image"), sensor
-    )
+    background = same_size(sensor.upright(as_unit_rgb(background, "background")), image, "background", "image")
+    return height_of(without_flicker(image, background).image, background, sensor)
 
 
 def height_of(image: Array, background: Array, sensor: Sensor) -> NDArray[np.float32]:
-    """As :func:`contact_height`, of images (H, W, 3) of 0..1 in the frame of a calibrated sensor."""
+    """As :func:`contact_height`, of images (H, W, 3) of 0..1 in the frame of a calibrated sensor, without flickering light."""
     assert sensor.colour is not None
     change, felt = colour_change(image, background)
     change = change / sensor.colour.brighter(background)

@@ -94,13 +94,18 @@ def contact_mask(
         sensor = Sensor.load(sensor)
         image = sensor.upright(as_unit_rgb(image, "image"))
         background = None if background is None else sensor.upright(as_unit_rgb(background, "background"))
+    if background is not None:
+        image = as_unit_rgb(image, "image")
+        background = background_of(background, image)
+        image = without_flicker(image, background).image
     return find_contact(image, background, sensor, method).mask
 
 
 def find_contact(
     image: Any, background: Any = None, sensor: Sensor | str | None = None, method: str | None = None
 ) -> FoundContact:
-    """As :func:`contact_mask`, of images in the sensor frame, with what else is known of how it was found."""
+    """As :func:`contact_mask`, of images in the sensor frame and without flickering light, with what else is known of how it was
+    found."""
     if method is not None and method not in CONTACT_METHODS:
         raise UsageError(f"contact_mask: no method named {method!r}{nearest_name(str(method), CONTACT_METHODS)}")
     image = as_unit_rgb(image, "image")
@@ -118,9 +123,8 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
     """As :func:`find_contact`, of images (H, W, 3) of 0..1 whose columns and rows are as far apart as ``pitch`` (2,) says, in the
     smaller of both."""
     size = image.shape[1::-1]
-    image, estimated = _on_grid(image), reference is None
-    reference = smooth_background(image) if reference is None else _on_grid(reference)
-    image, _ = without_flicker(image, reference)
+    image, estimated = on_grid(image), reference is None
+    reference = smooth_background(image) if reference is None else on_grid(reference)
     # a second look smooths more where noise asks for it
     sigma = min(image.shape[:2]) / GRID
     change, felt, strong, noise = change_from(image, reference, sigma, estimated)
@@ -150,7 +154,7 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
     return FoundContact(mask, None, method)
 
 
-def _on_grid(image: Array) -> Array:
+def on_grid(image: Array) -> Array:
     """``image`` (H, W, 3) on ``GRID`` pixels along its shorter side: finer ones tell nothing that smoothing leaves."""
     share = min(1.0, GRID / min(image.shape[:2]))
     size = [round(share * n) for n in image.shape[1::-1]]

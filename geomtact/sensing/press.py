@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from geomtact.se3 import Array
 from geomtact.sensing.change import as_unit_rgb, colour_change, same_size
+from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.local_shape import contact_of
 from geomtact.sensing.sensor import Sensor
 
@@ -55,6 +56,7 @@ def find_presses(
             left_out[name] = SAME
             continue
         seen.append(image)
+        image = without_flicker(image, reference).image
         change, felt = colour_change(image, reference)
         mask = contact_of(image, reference, "auto", np.array([1.0, stretch]) / min(1.0, stretch)).mask
         if not mask.any():

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import ImageError, UsageError, nearest_name
-from geomtact.sensing.change import as_unit_rgb, check_size
+from geomtact.sensing.change import as_unit_rgb, check_size, smooth_background
 from geomtact.sensing.checks import faults, unlike_calibrated
 from geomtact.sensing.contact import FAINT, Contact, border_of
 from geomtact.sensing.depth_map import depths_of
@@ -19,7 +19,7 @@ from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
 from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.height import height_of
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
-from geomtact.sensing.local_shape import contact_mask, find_contact
+from geomtact.sensing.local_shape import contact_mask, find_contact, on_grid
 from geomtact.sensing.sensor import Sensor
 
 __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observation", "write_image"]
@@ -159,6 +159,11 @@ def _in_sensor_frame(
         return array
     from_file = isinstance(source, str | Path)
     if from_file and "geomtact:sensor" in read_metadata(source):
+        if sensor.turned:
+            warnings.append(
+                f"{name}: is not turned or mirrored as the camera is mounted, for its metadata say that geomtact made it in the "
+                "sensor frame; if it was changed since, save it without metadata"
+            )
         return array
     if kind != "reading" and not sensor.camera_masks:
         if from_file and sensor.turned:
@@ -270,13 +275,13 @@ def _reading(
             f"{name}: one of image and background has colours, the other is grey; give both as the camera made them"
         )
     seen, reference = as_unit_rgb(seen, name), None if reference is None else as_unit_rgb(reference, "background")
-    if reference is not None:
-        seen, flicker = without_flicker(seen, reference)
-        if flicker:
-            warnings.append(
-                f"{name}: the light flickers: grey stripes, off the background's brightness by {100 * flicker:.1f} % rms, were "
-                "evened out; keep other lamps off the gel, or expose for whole periods of the mains"
-            )
+    if reference is None:
+        coarse = on_grid(seen)
+        light = without_flicker(coarse, smooth_background(coarse), estimated=True)
+    else:
+        light = without_flicker(seen, reference)
+        seen = light.image
+    warnings.extend(f"{name}: {each}" for each in light.warnings)
     warnings.extend(f"{name}: {fault}" for fault in faults(seen, reference))
     touch = find_contact(seen, reference, sensor)
     if touch.method != sensor.contact_method != "auto":
