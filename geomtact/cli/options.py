@@ -69,7 +69,7 @@ Rotate = Annotated[
     typer.Option(
         "--rotate",
         metavar="0|90|180|270",
-        help="Degrees by which images are turned, counter-clockwise, as the camera is mounted; else as the sensor's file says.",
+        help="Turn every image counter-clockwise by this many degrees before use; else as the sensor's file says.",
         show_default=False,
     ),
 ]
@@ -77,7 +77,7 @@ Mirror = Annotated[
     bool | None,
     typer.Option(
         "--mirror/--no-mirror",
-        help="Whether images are mirrored left to right before that; else as the sensor's file says.",
+        help="Mirror every image left to right before that; else as the sensor's file says.",
         show_default=False,
     ),
 ]

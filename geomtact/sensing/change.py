@@ -146,7 +146,8 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
     elif (height, width) == sensor.image_size_px:
         hint = (
             "width and height are exchanged: say how the camera is mounted (--rotate 90 turns images counter-clockwise, 270 "
-            "clockwise; or camera_rotation_deg in the sensor's file), or name the sensor that took it; an array has rows first, (height, width)"
+            "clockwise; or camera_rotation_deg in the sensor's file), or name the sensor that took it; an array has rows first, "
+            "(height, width)"
         )
     elif do is not None:
         hint = do
@@ -158,8 +159,8 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
         rows, columns = sensor.cut(array.shape)
         hint = (
             f"of the camera's whole frame give image[{rows.start}:{rows.stop}, {columns.start}:{columns.stop}] scaled to "
-            f"{wanted}, for the sensor's images are without {100 * sensor.border_fraction:.0f} % of it at each side; if it is cut "
-            f"already, scale it to {wanted}"
+            f"{wanted}, for the sensor's images are without {100 * sensor.border_fraction:.0f} % of it at each side; if it "
+            f"is cut already, scale it to {wanted}"
         )
     elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
         hint = "the shape agrees: scale a mask to that, or describe this resolution in a sensor file of its own"
