@@ -150,7 +150,7 @@ def _placed(node: Mapping[str, Any]) -> Array:
 
 
 def _instances(data: GltfData, instancing: Mapping[str, Any]) -> Array:
-    """``T_node_instance`` (n, 4, 4) of EXT_mesh_gpu_instancing; one if only attributes of other names tell instances apart."""
+    """``T_node_instance`` (n, 4, 4) of EXT_mesh_gpu_instancing; one if instances differ only in attributes of other names."""
     named = {"TRANSLATION": ("VEC3", [0, 0, 0]), "ROTATION": ("VEC4", [0, 0, 0, 1]), "SCALE": ("VEC3", [1, 1, 1])}
     attributes = instancing["attributes"]
     found = {name: data.numbers(attributes[name], named[name][0], instancing) for name in named if name in attributes}

@@ -138,7 +138,7 @@ def states_unit(source: str | Path) -> bool:
     """Whether a part needs no unit: one of the catalogue, or a file that states its own."""
     try:
         return _catalogue_name(str(source)) is not None or stated_unit(Path(source)) is not None
-    except (MeshError, OSError):  # which loading it tells
+    except (MeshError, OSError):  # which loading the file reports
         return False
 
 

@@ -83,5 +83,5 @@ def _first_of_off(lines: list[bytes]) -> int:
 def _behind_keyword(words: list[bytes]) -> list[bytes]:
     try:
         return split_keyword(words)[1]
-    except MeshError:  # which reading it tells
+    except MeshError:  # which reading the file reports
         return words

@@ -377,7 +377,7 @@ def _reopened(
 
 
 def _fit_of(scorer: FittedScorer) -> tuple[Calibration, Calibration | None, bool]:
-    """What tells a score from another of its name."""
+    """By what a score differs from another of its name."""
     return scorer.calibration, scorer.exact_calibration, scorer.cascade is None
 
 
