@@ -17,6 +17,8 @@ from geomtact.cli import app
 from geomtact.errors import InputError, UsageError
 from geomtact.scoring import fitted
 from geomtact.sensing.sensor import Sensor
+from tools.studies.__main__ import COMMANDS
+from tools.studies.__main__ import app as studies
 
 PARTS = ("ball", "hex_nut")
 TOUCHES = fitted.TOUCHES  # of another test, for as long as it lasts, there are fewer
@@ -105,7 +107,7 @@ def test_a_study_of_parts_apart_finds_what_it_finds_of_one_after_the_other(few_t
 
     def judge(out: Path, parts: tuple, *words: str) -> dict:
         options = ["--touches", "1", "--sweep", "noise", "--max-poses", "3000", "--cache-dir", str(cache_dir)]
-        done = CliRunner().invoke(app, ["evaluate", "stability", *parts, *options, "--out", str(out), *words])
+        done = CliRunner().invoke(studies, ["stability", *parts, *options, "--out", str(out), *words])
         assert done.exit_code == 0, done.output
         return json.loads(out.read_text())
 
@@ -121,7 +123,7 @@ def test_scores_of_parts_apart_are_those_of_one_after_the_other(few_touches, tmp
 
     def judge(out: Path, *words: str) -> tuple[dict, dict]:
         options = ["--touches", "3", "--max-poses", "3000", "--cache-dir", str(cache_dir), "--out", str(out)]
-        done = CliRunner().invoke(app, ["evaluate", "scores", *PARTS, "--scores", "l1", "iou", *options, *words])
+        done = CliRunner().invoke(studies, ["scores", *PARTS, "--scores", "l1", "iou", *options, *words])
         assert done.exit_code == 0, done.output
         content = json.loads(out.read_text())
         told = {
@@ -137,31 +139,26 @@ def test_scores_of_parts_apart_are_those_of_one_after_the_other(few_touches, tmp
 
 
 def test_every_study_by_part_names_the_part_that_it_cannot_judge(tmp_path):
-    (evaluate,) = app.registered_groups
-    judged_apart = [
-        study.name
-        for study in evaluate.typer_instance.registered_commands
-        if "ray" in inspect.signature(study.callback).parameters
-    ]
+    judged_apart = [name for name, study in COMMANDS.items() if "ray" in inspect.signature(study).parameters]
     assert len(judged_apart) >= 10
     for study in judged_apart:
         out = tmp_path / f"{study}.json"
-        done = CliRunner().invoke(app, ["evaluate", study, "pim", "--jobs", "1", "--out", str(out)])
+        done = CliRunner().invoke(studies, [study, "pim", "--jobs", "1", "--out", str(out)])
         assert done.exit_code == 3 and "pim: not judged" in done.output, (study, done.output)
 
 
 def test_a_study_apart_keeps_what_it_could_judge_and_names_the_rest(few_touches, tmp_path, cache_dir):
     out = tmp_path / "study.json"
-    words = ["evaluate", "stability", PARTS[0], "pim", "--touches", "1", "--sweep", "noise", "--max-poses", "3000"]
-    done = CliRunner().invoke(app, [*words, "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)])
+    words = ["stability", PARTS[0], "pim", "--touches", "1", "--sweep", "noise", "--max-poses", "3000"]
+    done = CliRunner().invoke(studies, [*words, "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)])
     assert done.exit_code == 3 and "1 of 2 parts are not judged" in done.output and "pim: not judged" in done.output
     assert list(json.loads(out.read_text())["parts"]) == [PARTS[0]]
     (kept := tmp_path / "study.parts" / "mine.txt").write_text("mine")
-    again = [*words[:3], *words[4:], "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)]
-    assert CliRunner().invoke(app, again).exit_code == 0 and kept.read_text() == "mine"
-    twice = CliRunner().invoke(app, [*again[:3], f"elsewhere/{PARTS[0]}.stl", *again[3:]])
+    again = [*words[:2], *words[3:], "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)]
+    assert CliRunner().invoke(studies, again).exit_code == 0 and kept.read_text() == "mine"
+    twice = CliRunner().invoke(studies, [*again[:2], f"elsewhere/{PARTS[0]}.stl", *again[2:]])
     assert twice.exit_code == 2 and f"two parts are named '{PARTS[0]}'" in twice.output
-    without = CliRunner().invoke(app, [*words, "--jobs", "2"])
+    without = CliRunner().invoke(studies, [*words, "--jobs", "2"])
     assert without.exit_code == 2 and "--out" in without.output
 
 

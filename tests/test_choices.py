@@ -8,10 +8,12 @@ import pytest
 from safetensors.numpy import save_file
 from typer.testing import CliRunner
 
-from geomtact.cli import app
-from geomtact.evaluation import choices
-from geomtact.evaluation.choices import DEFAULT, MODELLED, WAYS, Timed, adds, beaten_by, front, modelled, summarise
-from geomtact.report.choices_plot import draw_costs, draw_modelled
+from tools.studies.__main__ import app as studies
+from tools.studies.choices import study as choices
+from tools.studies.choices.plot import draw_costs, draw_modelled
+from tools.studies.choices.study import DEFAULT, MODELLED, WAYS, Timed, adds, beaten_by, front, modelled, summarise
+
+pytestmark = pytest.mark.studies
 
 SMALL = 4000  # poses
 
@@ -98,9 +100,9 @@ def few_ways(monkeypatch, few_touches):
 
 def test_the_study_judges_every_way_on_the_same_touches_and_goes_on_where_it_was(few_ways, tmp_path, monkeypatch):
     out = tmp_path / "choices.json"
-    command = ["evaluate", "choices", "hex_nut", "--touches", "2", "--out", str(out)]
+    command = ["choices", "hex_nut", "--touches", "2", "--out", str(out)]
     pictures = ["--plot", str(tmp_path / "a.png"), "--plot-modelled", str(tmp_path / "b.png")]
-    shown = CliRunner().invoke(app, [*command, *pictures])
+    shown = CliRunner().invoke(studies, [*command, *pictures])
     assert shown.exit_code == 0, shown.output
     content = json.loads(out.read_text("utf-8"))
     part = content["parts"]["hex_nut"]
@@ -114,7 +116,7 @@ def test_the_study_judges_every_way_on_the_same_touches_and_goes_on_where_it_was
     assert (tmp_path / "a.png").read_bytes() == draw_costs(content)
     assert (tmp_path / "b.png").read_bytes() == draw_modelled(content)
     monkeypatch.setattr(choices, "prepare", None)  # a study that is done prepares nothing
-    assert CliRunner().invoke(app, command).exit_code == 0
+    assert CliRunner().invoke(studies, command).exit_code == 0
     assert json.loads(out.read_text("utf-8"))["parts"] == content["parts"]
 
 
@@ -139,5 +141,5 @@ def test_a_few_ways_are_judged_where_they_differ():
     assert list(ways) == [DEFAULT, "this side alone", "this side, 1 mode"]
     assert choices.scenes_of(ways) == ["known side"]
     assert choices.scenes_of(choices.ways_of([])) == list(choices.SCENES) == choices.scenes_of({DEFAULT: WAYS[DEFAULT]})
-    refused = CliRunner().invoke(app, ["evaluate", "choices", "hex_nut", "--way", "one mode"])
+    refused = CliRunner().invoke(studies, ["choices", "hex_nut", "--way", "one mode"])
     assert refused.exit_code == 2 and "no way to localize named 'one mode'" in refused.output

@@ -16,6 +16,8 @@ from geomtact import load_mesh, se3
 from geomtact.cli import app, main, project
 from geomtact.cli.options import approach_from
 from geomtact.errors import CacheError, InputError, UsageError
+from tools.studies.__main__ import COMMANDS
+from tools.studies.__main__ import app as studies
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +32,8 @@ def geomtact(tmp_path, monkeypatch, cache, few_touches):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GEOMTACT_CACHE", str(cache))
 
-    def run(*args, status=0):
-        result = CliRunner().invoke(app, [str(a) for a in args])
+    def run(*args, status=0, of=app):
+        result = CliRunner().invoke(of, [str(a) for a in args])
         assert result.exit_code == status, f"exit status {result.exit_code}: {result.output} {result.exception!r}"
         if status == 3:
             assert result.stderr.startswith("error: ")
@@ -67,7 +69,7 @@ def test_help_and_lists(geomtact):
         "view",
     }
     assert {c.name or c.callback.__name__ for c in app.registered_commands} == commands
-    assert all(name in geomtact("--help").stdout for name in {*commands, "evaluate"})
+    assert all(name in geomtact("--help").stdout for name in commands)
     assert geomtact("--version").stdout.startswith("geomtact ")
     assert "gelsight-mini" in geomtact("sensors").stdout
     listed = geomtact("objects").stdout
@@ -90,7 +92,6 @@ def test_usage_errors_exit_2(geomtact, args):
         (["localize", "--nope"], "no such option: --nope; 'geomtact localize --help'"),
         (["simulate", "pin", "--n", "0"], "'--n'"),
         (["simulate", "pin", "--out", ""], "expected a word after --out, got an empty one"),
-        (["evaluate", "scores", "--effort", "best"], "'balanced'"),
     ],
 )
 def test_usage_errors_are_told_in_one_line(args, said, monkeypatch, capsys):
@@ -133,11 +134,10 @@ def test_bad_input_exits_3_with_one_line(geomtact, tmp_path):
 
 
 def test_every_study_tells_a_wrong_part_in_one_line(geomtact):
-    (evaluate,) = app.registered_groups
-    for study in evaluate.typer_instance.registered_commands:
-        assert study.name in geomtact("evaluate", status=2).output
-        more = ["out.png"] if study.name == "plot" else []  # it takes a study's file
-        assert "pim" in geomtact("evaluate", study.name, "pim", *more, status=3).stderr
+    for study in COMMANDS:
+        assert study in geomtact(status=2, of=studies).output
+        more = ["out.png"] if study == "plot" else []  # it takes a study's file
+        assert "pim" in geomtact(study, "pim", *more, status=3, of=studies).stderr
 
 
 def test_wrong_names_and_paths_are_told_before_any_work(geomtact, touched, tmp_path):

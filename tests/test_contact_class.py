@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from geomtact.contact_space.contact_class import CLASSES, contact_class
 from geomtact.contact_space.space import ContactSpace
-from geomtact.evaluation.contact_class import CLASSES, contact_class
 from geomtact.geometry.mesh import Mesh
 from geomtact.se3 import transform
 from geomtact.sensing.sensor import Sensor

@@ -10,10 +10,10 @@ from geomtact import load_mesh
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_height
 from geomtact.errors import ImageError
-from geomtact.evaluation.groove import read_scan
 from geomtact.sensing.depth_map import depths_of
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
+from tools.studies.readings.groove import read_scan
 
 MINI = Sensor.load("gelsight-mini")
 PITCH = 0.0634e-3

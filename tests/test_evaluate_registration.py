@@ -9,22 +9,24 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from geomtact import load_mesh, se3
-from geomtact.cli import app
 from geomtact.contact_space.build import choose_resolution
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask
-from geomtact.evaluation import registration
-from geomtact.evaluation.information import agreement, fisher_information, split
-from geomtact.evaluation.peers import peers
-from geomtact.evaluation.registration import End, Grid, Seen, Trial, own_methods, summarise, trials
-from geomtact.evaluation.shapes import SHAPES, shape
-from geomtact.evaluation.touches import random_touches
+from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.rotations import Directions
 from geomtact.registration.observability import Spread, motion_of, moved
 from geomtact.registration.protocol import Problem, Surface
 from geomtact.registration.rim import make_problem
 from geomtact.sensing.noise import CLEAN, MODERATE, Noise
 from geomtact.sensing.sensor import Sensor
+from tools.studies.__main__ import app as studies
+from tools.studies.registration import study as registration
+from tools.studies.registration.information import agreement, fisher_information, split
+from tools.studies.registration.peers import peers
+from tools.studies.registration.shapes import SHAPES, shape
+from tools.studies.registration.study import End, Grid, Seen, Trial, own_methods, summarise, trials
+
+pytestmark = pytest.mark.studies
 
 SENSOR = Sensor("small", (120, 90), (0.15e-3, 0.15e-3), 0.0, 2e-3)
 
@@ -277,18 +279,18 @@ def test_other_libraries_move_the_object_the_right_way(name):
 
 def test_the_command_goes_on_and_draws(tmp_path):
     out, plot = tmp_path / "r.json", tmp_path / "r.png"
-    words = ["evaluate", "registration", "hex_nut", "--sensor", "gelsight-mini", "--seed", "3"]
+    words = ["registration", "hex_nut", "--sensor", "gelsight-mini", "--seed", "3"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(registration.trials, "__defaults__", ((0.0, 5.0), (0.0, 1.0), 0))
         args = [*words, "--touches", "2", "--out", str(out), "--plot", str(plot)]
-        done = CliRunner().invoke(app, args)
+        done = CliRunner().invoke(studies, args)
         assert done.exit_code == 0, done.output
         content = json.loads(out.read_text("utf-8"))
         kept = content["parts"]["hex_nut"]["outcomes"]
         out.write_text(
             json.dumps({**content, "parts": {"hex_nut": {**content["parts"]["hex_nut"], "outcomes": kept[:1]}}})
         )
-        done = CliRunner().invoke(app, args)
+        done = CliRunner().invoke(studies, args)
         assert done.exit_code == 0, done.output
     content = json.loads(out.read_text("utf-8"))
     again = content["parts"]["hex_nut"]["outcomes"]
@@ -298,5 +300,5 @@ def test_the_command_goes_on_and_draws(tmp_path):
     assert content["schema"] == "geomtact/registration/2" and len(content["parts"]["hex_nut"]["outcomes"]) == 2
     assert {"none", "icp", "filterreg", "both", "thesis"} <= set(content["figures"]["methods"])
     assert np.asarray(Image.open(io.BytesIO(plot.read_bytes()))).std() > 5
-    refused = CliRunner().invoke(app, [*words, "--max-poses", "5000"])
+    refused = CliRunner().invoke(studies, [*words, "--max-poses", "5000"])
     assert refused.exit_code == 2 and "--max-poses" in refused.output

@@ -9,12 +9,15 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from geomtact import Localizer, load_mesh
-from geomtact.cli import app, study_file
-from geomtact.evaluation import scores, study
-from geomtact.report.score_plot import draw_scores
 from geomtact.scoring import catalogue, fitted
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.sensor import Sensor
+from tools.studies.__main__ import app as studies
+from tools.studies.common import study, study_file
+from tools.studies.scores import study as scores
+from tools.studies.scores.plot import draw_scores
+
+pytestmark = pytest.mark.studies
 
 NAMES = ["l1", "iou", "moments"]
 TOUCHES = 6
@@ -27,7 +30,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def evaluate(folder):
-    """Runs ``geomtact evaluate scores`` on small grids, with calibrations from few touches; checks the exit status.
+    """Runs ``python -m tools.studies scores`` on small grids, with calibrations from few touches; checks the exit status.
 
     Touches of the same part and kind are made once for all tests.
     """
@@ -45,8 +48,8 @@ def evaluate(folder):
             patch.setattr(study, "make_touches", touches_of)
             patch.setattr(study, "random_add", lambda *_: 5e-3)
             settings = ["--sensor", "gelsight-mini", "--touches", touches, "--max-poses", 3000, "--seed", 7]
-            args = ["evaluate", "scores", *words, *settings, "--cache-dir", folder / "cache"]
-            done = CliRunner().invoke(app, [str(a) for a in args])
+            args = ["scores", *words, *settings, "--cache-dir", folder / "cache"]
+            done = CliRunner().invoke(studies, [str(a) for a in args])
             assert done.exit_code == status, done.output
             return done
 
@@ -240,14 +243,14 @@ def test_words_are_told_apart_and_wrong_ones_named(evaluate):
     assert "no score named 'momens'; did you mean 'moments'?" in told
     told = evaluate("ball", "--scores", "l1", "iuo", status=2).stderr
     assert "no score or part named 'iuo'; did you mean 'iou'?" in told
-    done = CliRunner().invoke(app, ["evaluate", "localize", "ball", "--scores", "iou"])
+    done = CliRunner().invoke(studies, ["localize", "ball", "--scores", "iou"])
     assert done.exit_code == 2 and "No such option: --scores" in done.stderr
-    done = CliRunner().invoke(app, ["evaluate", "localize"])
+    done = CliRunner().invoke(studies, ["localize"])
     assert done.exit_code == 2 and "Missing argument 'OBJECT...'" in done.stderr
 
 
 def test_by_default_all_scores_are_judged_on_the_thesis_parts():
-    from geomtact.cli.evaluate_scores import sort_words
+    from tools.studies.scores.command import sort_words
 
     names = [*(name for name in catalogue.SCORERS if name != catalogue.DEFAULT_SCORER), "fast", "balanced", "exact"]
     assert sort_words([], []) == (["pin", "damping_pin", "head", "elbow_pipe"], names)

@@ -1,6 +1,5 @@
 """Evaluation: pose errors obey their definitions, coverage its binomial law, and a study repeats, resumes and adds up."""
 
-import importlib.util
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -11,14 +10,20 @@ import trimesh
 from typer.testing import CliRunner
 
 from geomtact import Localizer, Mesh, load_mesh
-from geomtact.cli import app, study_file
 from geomtact.errors import InputError
-from geomtact.evaluation import known_approach, proper, study
-from geomtact.evaluation.pose_error import add, add_s, coverage, mssd, random_add
+from geomtact.evaluation import coverage
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.report.studies import draw
+from geomtact.geometry.pose_error import add, add_s, mssd
 from geomtact.se3 import exp, log, random_rotations, transform
 from geomtact.sensing.noise import CLEAN, MODERATE
+from tools.studies.__main__ import app as studies
+from tools.studies.common import study, study_file
+from tools.studies.common.pictures import draw
+from tools.studies.common.study import random_add
+from tools.studies.localize import study as proper
+from tools.studies.thesis import known_approach
+
+pytestmark = pytest.mark.studies
 
 MM = 1e-3
 ROOT = Path(__file__).parents[1]
@@ -217,10 +222,10 @@ def test_a_study_says_what_the_posterior_says(localizer):
 def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tmp_path, monkeypatch):
     out = tmp_path / "study.json"
     monkeypatch.setattr(study, "expected_random_add", lambda localizer: 5.0)
-    common = ["evaluate", "localize", "ball", "--sensor", "gelsight-mini", "--effort", "fast"]
+    common = ["localize", "ball", "--sensor", "gelsight-mini", "--effort", "fast"]
     common += ["--cache-dir", str(cache), "--touches", "6"]
     picture = tmp_path / "study.png"
-    done = CliRunner().invoke(app, [*common, "--out", str(out), "--plot", str(picture)])
+    done = CliRunner().invoke(studies, [*common, "--out", str(out), "--plot", str(picture)])
     assert done.exit_code == 0, done.output
     whole = json.loads(out.read_text())
     assert picture.read_bytes() == draw(whole)
@@ -238,17 +243,17 @@ def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tm
     stopped = json.loads(out.read_text())
     stopped["parts"]["ball"]["outcomes"] = part["outcomes"][:4]
     out.write_text(json.dumps(stopped))
-    assert CliRunner().invoke(app, [*common, "--out", str(out)]).exit_code == 0
+    assert CliRunner().invoke(studies, [*common, "--out", str(out)]).exit_code == 0
     assert asked == [2]
     assert json.loads(out.read_text())["parts"]["ball"] == part
     stopped["schema"] = "geomtact/study/2"
     (tmp_path / "older.json").write_text(json.dumps(stopped))
-    older = CliRunner().invoke(app, [*common, "--out", str(tmp_path / "older.json")])
+    older = CliRunner().invoke(studies, [*common, "--out", str(tmp_path / "older.json")])
     assert (
         older.exit_code == 3 and "expected a study of the schema geomtact/study/3, got geomtact/study/2" in older.output
     )
     held = out.read_bytes()
-    other = CliRunner().invoke(app, [*common, "--out", str(out), "--seed", "2"])
+    other = CliRunner().invoke(studies, [*common, "--out", str(out), "--seed", "2"])
     assert other.exit_code == 3 and "other settings (seed)" in other.output
     assert asked == [2] and out.read_bytes() == held, "what was judged with other settings is kept"
 
@@ -278,12 +283,12 @@ def _as_before(part, first):
 def test_a_file_that_is_no_study_is_left_alone(cache, tmp_path):
     out = tmp_path / "other.json"
     out.write_text("{}")
-    done = CliRunner().invoke(app, ["evaluate", "localize", "ball", "--out", str(out), "--cache-dir", str(cache)])
+    done = CliRunner().invoke(studies, ["localize", "ball", "--out", str(out), "--cache-dir", str(cache)])
     assert done.exit_code == 3 and out.read_text() == "{}"
 
 
 def test_touches_are_described(tmp_path):
-    done = CliRunner().invoke(app, ["evaluate", "samples", "ball", "--sensor", "gelsight-mini", "--touches", "6"])
+    done = CliRunner().invoke(studies, ["samples", "ball", "--sensor", "gelsight-mini", "--touches", "6"])
     assert done.exit_code == 0, done.output
     assert "geometric" in done.output and "elastic" in done.output
 
@@ -297,19 +302,17 @@ def test_outcomes_are_plain_numbers(localizer):
 def test_the_judging_solver_agrees_with_hertz_and_with_our_own():
     pytest.importorskip("tamaas")
     from geomtact.sensing.elastic import elastic_mask
+    from tools.studies.localize.other_solver import tamaas_mask
 
-    spec = importlib.util.spec_from_file_location("judge_elastic", ROOT / "tools" / "judge_elastic.py")
-    judge = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(judge)
     pitch, radius, depth = (0.1 * MM, 0.1 * MM), 20 * MM, 0.8 * MM
     x = (np.arange(121) - 60) * pitch[0]
     r2 = x**2 + x[:, None] ** 2
     ball = depth - r2 / (2 * radius)
-    mask = judge.tamaas_mask(ball, pitch)
+    mask = tamaas_mask(ball, pitch)
     assert np.sqrt(mask.sum() * pitch[0] * pitch[1] / np.pi) == pytest.approx(np.sqrt(radius * depth), rel=0.015)
     assert (mask ^ elastic_mask(ball, pitch)).sum() < 0.03 * mask.sum()
     punch = np.where(r2 < (4 * MM) ** 2, depth, -np.inf)
-    assert (judge.tamaas_mask(punch, pitch) ^ (punch > 0)).sum() < 0.03 * (punch > 0).sum()
+    assert (tamaas_mask(punch, pitch) ^ (punch > 0)).sum() < 0.03 * (punch > 0).sum()
 
 
 def test_the_thesis_table_counts_what_refinement_brings_nearer():
@@ -325,8 +328,8 @@ def test_the_thesis_table_counts_what_refinement_brings_nearer():
 def test_touches_of_a_known_side_are_judged_before_and_after_refinement(flat_nut, monkeypatch, tmp_path):
     monkeypatch.setattr(Localizer, "prepare", classmethod(lambda cls, *args, **options: flat_nut))
     out = tmp_path / "table.json"
-    args = ["evaluate", "thesis", "hex_nut", "--sides", "2", "--touches", "1", "--out", str(out)]
-    done = CliRunner().invoke(app, args)
+    args = ["thesis", "hex_nut", "--sides", "2", "--touches", "1", "--out", str(out)]
+    done = CliRunner().invoke(studies, args)
     assert done.exit_code == 0, done.output
     part = json.loads(out.read_text("utf-8"))["parts"]["hex_nut"]
     distance = PoseDistance(flat_nut.mesh)
@@ -343,5 +346,5 @@ def test_touches_of_a_known_side_are_judged_before_and_after_refinement(flat_nut
         assert 0 < outcome["random_mm"] < 100
     # a study that is whole is not made again
     monkeypatch.setattr(Localizer, "prepare", None)
-    assert CliRunner().invoke(app, args).exit_code == 0
+    assert CliRunner().invoke(studies, args).exit_code == 0
     assert json.loads(out.read_text("utf-8"))["parts"]["hex_nut"] == part

@@ -15,7 +15,8 @@ from PIL import Image
 from geomtact import Localizer
 from geomtact.sensing.render import example_reading
 
-EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "docs" / "examples"
 
 
 @pytest.fixture
@@ -26,34 +27,36 @@ def example(tmp_path, cache_dir, few_touches, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("GEOMTACT_CACHE", str(cache_dir))
         monkeypatch.setattr(sys, "argv", [name, *words])
-        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        runpy.run_path(str(ROOT / name), run_name="__main__")
         return capsys.readouterr().out
 
     return run
 
 
 def test_touch_until_sure(example):
-    last = [line for line in example("touch_until_sure.py").splitlines() if "mm off the truth" in line][-1]
+    last = [line for line in example("docs/examples/touch_until_sure.py").splitlines() if "mm off the truth" in line][
+        -1
+    ]
     held, off = float(last.split("holds ")[1].split(" %")[0]), float(last.split("it is ")[1].split(" mm")[0])
     assert held >= 90 and off < 5
 
 
 def test_the_pencils_ends_tell_most(example, tmp_path):
     """A touch of its middle tells nothing of which way round it lies; one of its ends does."""
-    said = example("pencil.py").splitlines()
+    said = example("docs/examples/pencil.py").splitlines()
     ranked = [line[:24].strip() for line in said if "discards" in line]
     assert len(ranked) == 7 and "end" in ranked[0] and ranked[0] != "finger in the middle"
     assert (tmp_path / "out" / "pencil" / "next_touch.png").stat().st_size > 10_000
 
 
 def test_a_gripper_that_reads_its_width(example):
-    said = example("gripper.py", "--part", "connector_plug", "--max-poses", "60000")
+    said = example("docs/examples/gripper.py", "--part", "connector_plug", "--max-poses", "60000")
     assert float(re.search(r"the truth: (\S+) nats", said)[1]) > 0
     assert re.search(r"the jaw is \d+\.\d mm open", said)
 
 
 def test_a_face_put_down_flat_is_told_whether_the_side_is_known_or_not(example):
-    said = example("face_on.py", "--max-poses", "20000", "--touches", "6", "--tilt", "1").splitlines()
+    said = example("docs/examples/face_on.py", "--max-poses", "20000", "--touches", "6", "--tilt", "1").splitlines()
     assert len(said) == 2 and "any side" in said[0] and "that side" in said[1]
     for line in said:
         assert float(re.search(r"(\S+) nats told", line)[1]) > 2 and " 0 % outside the 99 % region" in line
@@ -61,14 +64,16 @@ def test_a_face_put_down_flat_is_told_whether_the_side_is_known_or_not(example):
 
 def test_kitting_places_nothing_that_it_is_not_sure_of(example, tmp_path):
     """One touch of a plug leaves more than a millimetre open."""
-    said = example("kitting.py", "--part", "connector_plug", "--max-poses", "20000", "--touches", "1")
+    said = example(
+        "tools/studies/kitting/film.py", "--part", "connector_plug", "--max-poses", "20000", "--touches", "1"
+    )
     assert re.search(r"touch 1: \d+\.\d nats known, it fits with \d %", said) and "not sure, not placed" in said
     with Image.open(tmp_path / "out" / "kitting" / "connector_plug.gif") as film:
         assert film.n_frames > 5
 
 
 def test_a_figure_of_the_thesis_shows_the_distances_that_it_names(example, tmp_path):
-    example("thesis_figures.py", "10")
+    example("tools/studies/thesis/figures.py", "10")
     figure = json.loads((tmp_path / "out" / "thesis" / "thesis_figures.json").read_text())["10"]
     for each in figure["shown"]:
         assert each["add_mm"] == pytest.approx(each["normalised"] * figure["random_mm"], rel=1e-3)

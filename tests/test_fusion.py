@@ -11,13 +11,13 @@ from typer.testing import CliRunner
 from geomtact import Localizer, Mesh, se3
 from geomtact.cli import app
 from geomtact.contact_space.carry import Carry, RigStd
+from geomtact.contact_space.touches import random_touches
 from geomtact.errors import InputError, NoPoseAgreesError, UsageError
-from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.touches import random_touches
 from geomtact.inference.fusion import _badly_agreed, _shares, disagreement, fuse
 from geomtact.inference.rig import rig_covariance
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
+from tools.studies.touches.study import make_scenes
 
 
 def world(touches, rng):

@@ -11,8 +11,6 @@ from typer.testing import CliRunner
 from geomtact import GaussianPrior, Localizer, Mesh, Sensor, contact_mask
 from geomtact.cli import app
 from geomtact.contact_space.touch import felt_height, felt_mask
-from geomtact.evaluation.groove import read_scan
-from geomtact.evaluation.readings import BALLS, calibrations, cameras, circles_of, localize_balls
 from geomtact.scoring.likelihood import height_log_likelihood
 from geomtact.se3 import transform
 from geomtact.sensing.contact import Contact
@@ -21,6 +19,8 @@ from geomtact.sensing.image_file import read_image
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.render import Lamps, example_reading, render
 from geomtact.sensing.sensor import CONTACT_METHODS, HEIGHT_NOISE
+from tools.studies.readings.groove import read_scan
+from tools.studies.readings.study import BALLS, calibrations, cameras, circles_of, localize_balls
 
 CIRCLES = Path(__file__).with_name("circles_gelslam_gsmini.csv")
 MM = 1e-3

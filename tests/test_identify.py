@@ -13,12 +13,12 @@ from geomtact import InputError, Localizer, Mesh, UsageError
 from geomtact.cli import app
 from geomtact.cli.parts import parts_of
 from geomtact.errors import NoPoseAgreesError
-from geomtact.evaluation.identification import Told, identify_scenes, summarise
-from geomtact.evaluation.sensors_study import make_scenes
 from geomtact.inference.identify import identify
-from geomtact.report.studies import draw
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
+from tools.studies.common.pictures import draw
+from tools.studies.identify.study import Told, identify_scenes, summarise
+from tools.studies.touches.study import make_scenes
 
 
 @pytest.fixture(scope="module")

@@ -5,23 +5,15 @@ import pytest
 
 from geomtact import load_mesh, se3
 from geomtact.contact_space.space import ContactSpace
-from geomtact.evaluation.fixture import Fixture, upwards
-from geomtact.evaluation.kitting import (
-    SURE,
-    Believed,
-    believe,
-    choose_jaw,
-    close_jaw,
-    decide,
-    draw_part,
-    first_grasp,
-    kit,
-    touch_with_jaw,
-)
-from geomtact.evaluation.kitting_study import CLEARANCES, GOAL, THOROUGH, TOUCHES, Outcome, summarise
-from geomtact.report.kitting_plot import draw_kitting
+from geomtact.planning.jaw import close_jaw, first_grasp
 from geomtact.sensing.noise import CLEAN
 from geomtact.sensing.sensor import Sensor
+from tools.studies.kitting.cell import SURE, Believed, believe, choose_jaw, decide, draw_part, kit, touch_with_jaw
+from tools.studies.kitting.fixture import Fixture, upwards
+from tools.studies.kitting.plot import draw_kitting
+from tools.studies.kitting.study import CLEARANCES, GOAL, THOROUGH, TOUCHES, Outcome, summarise
+
+pytestmark = pytest.mark.studies
 
 SENSOR = Sensor("small", (120, 90), (0.3e-3, 0.3e-3), 0.0, 2e-3)
 TOLERANCE = 3e-5  # m: Open3D's distances, at triangles that are slivers

@@ -10,7 +10,7 @@ from scipy.stats import binom
 
 from geomtact import InputError, Localizer, PoseError, Sensor, UsageError
 from geomtact.contact_space.store import open_index
-from geomtact.evaluation.touches import random_touches
+from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.approach import approach_of
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh

@@ -10,17 +10,6 @@ import trimesh
 from typer.testing import CliRunner
 
 from geomtact import InputError, UsageError, contact_mask
-from geomtact.cli import app
-from geomtact.evaluation.readings import (
-    Imprint,
-    find,
-    imprints,
-    largest_difference,
-    methods,
-    off_centre,
-    overlap,
-    summarise_contacts,
-)
 from geomtact.geometry.mesh import Mesh
 from geomtact.sensing import mask_network
 from geomtact.sensing.image_file import read_image
@@ -32,6 +21,17 @@ from geomtact.training import presses
 from geomtact.training.presses import PRESSES, READINGS, make_presses, press_part
 from geomtact.training.state import read_weights
 from geomtact.training.train_mask import Settings, train_mask, validate, write_mask_network
+from tools.studies.__main__ import app as studies
+from tools.studies.readings.study import (
+    Imprint,
+    find,
+    imprints,
+    largest_difference,
+    methods,
+    off_centre,
+    overlap,
+    summarise_contacts,
+)
 
 
 def disk(x, y, r, shape=(120, 160)):
@@ -298,5 +298,5 @@ def test_real_imprints_are_read_and_ours_is_nearer_than_the_baseline(data_folder
 
 
 def test_a_folder_without_readings_is_refused(tmp_path):
-    run = CliRunner().invoke(app, ["evaluate", "readings", str(tmp_path)])
+    run = CliRunner().invoke(studies, ["readings", str(tmp_path)])
     assert run.exit_code == 3 and "expected fots_balls and objectfolder_gelsight_calib in it" in run.output

@@ -13,8 +13,6 @@ from geomtact.cli.next_touch import next_touch as next_touch_command
 from geomtact.cli.shell import one_line_errors
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError, InputError, PoseError, UsageError
-from geomtact.evaluation import next_touch_study
-from geomtact.evaluation.fixture import upwards
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.planning.actions import Probe, Touch
@@ -32,6 +30,8 @@ from geomtact.planning.next_touch import (
 from geomtact.se3 import exp, inverse, log, transform
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.sensor import Sensor
+from tools.studies.kitting.fixture import upwards
+from tools.studies.next_touch import study as next_touch_study
 
 MM = 1e-3
 DOWN = np.diag([1.0, -1.0, -1.0])  # a sensor that looks down

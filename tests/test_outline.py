@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from geomtact.contact_space.touch import felt_mask, sinking
-from geomtact.evaluation.touches import random_touches
+from geomtact.contact_space.touches import random_touches
 from geomtact.inference.gels import SHAPE, Gel
 from geomtact.registration.observability import Spread
 from geomtact.registration.rim import make_problem

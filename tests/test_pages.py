@@ -2,17 +2,14 @@
 
 import math
 import re
-import sys
 from collections import Counter
-from pathlib import Path
 
 import pytest
 
-from geomtact.cli.evaluate_stability import _answers
+from tools.page_tables import DOCS, PARTS, TABLES, between, filled, study, with_tables
+from tools.studies.stability.command import _answers
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-
-from page_tables import DOCS, PARTS, TABLES, between, filled, study, with_tables
+pytestmark = pytest.mark.studies
 
 
 @pytest.mark.parametrize("page", dict.fromkeys(name for name, *_ in TABLES))

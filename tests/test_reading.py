@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from geomtact.errors import ImageError, UsageError
-from geomtact.evaluation.readings import find, imprints
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 from geomtact.sensing.local_shape import contact_mask
 from geomtact.sensing.pixels import median_of
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
+from tools.studies.readings.study import find, imprints
 
 MINI = Sensor.load("gelsight-mini")
 SHAPE = (240, 320)

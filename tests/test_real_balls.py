@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from geomtact import Localizer, Mesh, Posterior, Sensor
-from geomtact.evaluation.touches import random_touches
+from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.report.shown import shown_of
 from geomtact.report.write import write_all

@@ -9,7 +9,6 @@ from trimesh.creation import box, cylinder
 
 from geomtact import Localizer, Sensor
 from geomtact.contact_space.space import ContactSpace
-from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
@@ -18,6 +17,7 @@ from geomtact.inference.modes import Refined, carried
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.reference import Reference
 from geomtact.se3 import exp, inverse, log, transform
+from tools.studies.track.trajectories import random_trajectory
 
 MM = 1e-3
 T_WORLD = exp([0.3, -1.2, 0.5, 0.4, -0.1, 0.7])

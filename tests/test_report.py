@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from geomtact import se3
-from geomtact.cli import app
-from geomtact.evaluation.touches import random_touches
+from geomtact.contact_space.touches import random_touches
 from geomtact.files import write_whole
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
@@ -29,6 +28,7 @@ from geomtact.report.summary import MOTIONS, caution, contact_centre, facts, per
 from geomtact.report.write import write_all
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
+from tools.studies.__main__ import app as studies
 
 
 @dataclass
@@ -470,7 +470,7 @@ def test_every_committed_picture_is_drawn_from_its_study_alone(study, which, pic
         str(tmp_path / "again.png"),
         *(["--picture", which] if which else []),
     ]
-    shown = CliRunner().invoke(app, ["evaluate", "plot", *arguments])
+    shown = CliRunner().invoke(studies, ["plot", *arguments])
     assert shown.exit_code == 0, shown.output
     committed = Image.open(docs / "images" / f"{picture}.png")
     again = Image.open(tmp_path / "again.png")
@@ -485,5 +485,5 @@ def test_what_is_no_study_is_not_drawn(tmp_path):
         ("b.json", "no JSON of a study"),
         ("c.json", "cannot be read"),
     ):
-        shown = CliRunner().invoke(app, ["evaluate", "plot", str(tmp_path / name), str(tmp_path / "out.png")])
+        shown = CliRunner().invoke(studies, ["plot", str(tmp_path / name), str(tmp_path / "out.png")])
         assert shown.exit_code == 3 and why in shown.output and not (tmp_path / "out.png").exists()

@@ -16,14 +16,14 @@ from typer.testing import CliRunner
 from geomtact import se3
 from geomtact.cli.shell import one_line_errors
 from geomtact.errors import ImageError, InputError, UsageError
-from geomtact.evaluation import track_study
-from geomtact.evaluation.trajectories import random_trajectory
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.motion import GaussianTwist, UniformBall
 from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
+from tools.studies.track import study as track_study
+from tools.studies.track.trajectories import random_trajectory
 
 STILL = GaussianTwist(0.0, 0.0)
 KINDS = ("pin", "ball", "cone", "flat_nut")  # an axis, a sphere, cones of approach, and a face with a housing

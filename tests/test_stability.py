@@ -11,21 +11,26 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from geomtact import Sensor, load_mesh
-from geomtact.cli import app, evaluate_stability, study_options
+from geomtact.contact_space.contact_class import CLASSES, contact_class
 from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.touches import penetrations
 from geomtact.errors import NoPoseAgreesError
-from geomtact.evaluation import stability, worlds
-from geomtact.evaluation.answer import REFUSED, Answer, judged
-from geomtact.evaluation.contact_class import CLASSES, contact_class
-from geomtact.evaluation.sensors_study import make_scenes
-from geomtact.evaluation.stability import SWEEPS, opposed
-from geomtact.evaluation.touches import penetrations
-from geomtact.evaluation.trajectories import random_trajectory
-from geomtact.evaluation.worlds import World, cut_off, knobbed, larger, scanned
 from geomtact.report.result import plain
-from geomtact.report.stability_plot import draw_stability
 from geomtact.se3 import inverse
 from geomtact.sensing.noise import CLEAN, MODERATE
+from tools.studies.__main__ import app as studies
+from tools.studies.common import study_options
+from tools.studies.common.answer import REFUSED, Answer, judged
+from tools.studies.stability import command as evaluate_stability
+from tools.studies.stability import study as stability
+from tools.studies.stability import worlds
+from tools.studies.stability.plot import draw_stability
+from tools.studies.stability.study import SWEEPS, opposed
+from tools.studies.stability.worlds import World, cut_off, knobbed, larger, scanned
+from tools.studies.touches.study import make_scenes
+from tools.studies.track.trajectories import random_trajectory
+
+pytestmark = pytest.mark.studies
 
 MM = 1e-3
 
@@ -285,7 +290,7 @@ def command(plug):
     def run(*words, status=0):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(study_options, "localizers", lambda *_: iter([plug]))
-            done = CliRunner().invoke(app, [str(w) for w in ("evaluate", "stability", "connector_plug", *words)])
+            done = CliRunner().invoke(studies, [str(w) for w in ("stability", "connector_plug", *words)])
             assert done.exit_code == status, done.output
             return done
 

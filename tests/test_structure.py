@@ -14,6 +14,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "geomtact"
 MODULES = sorted(PACKAGE.rglob("*.py"))
+RUN_BY_HAND = {"film.py", "figures.py"}  # programs that print and draw, as the examples do
+STUDIES = sorted(path for path in (ROOT / "tools" / "studies").rglob("*.py") if path.name not in RUN_BY_HAND)
 SCRIPTS = [path for folder in ("tools", "docs/examples", "meshes") for path in sorted((ROOT / folder).rglob("*.py"))]
 
 # A module imports only from its own stage and from stages above it in this list; one line, one height.
@@ -74,21 +76,21 @@ def test_imports_go_one_way(path):
 def test_what_scripts_import_is_there(path):
     """Inside functions, too: most scripts run for too long to be run here."""
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "geomtact":
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in ("geomtact", "tools"):
             module = importlib.import_module(node.module)
             for alias in node.names:
                 there = hasattr(module, alias.name) or importlib.util.find_spec(f"{node.module}.{alias.name}")
                 assert there, f"{path}:{node.lineno}: no {alias.name} in {node.module}"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize("path", [*MODULES, *STUDIES], ids=lambda p: str(p.relative_to(ROOT)))
 def test_library_does_not_print(path):
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         printed = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
         assert not printed, f"{path}:{node.lineno} prints; return it, or say it in geomtact/cli"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize("path", [*MODULES, *STUDIES], ids=lambda p: str(p.relative_to(ROOT)))
 def test_files_are_written_whole_or_not_at_all(path):
     """Under a temporary name (``geomtact.files``), or within a folder that is renamed as a whole."""
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -156,11 +158,11 @@ def test_setup_cfg_ships_every_package_and_pins_every_requirement():
     assert pins["torch"] == "2.13.0"
 
 
-def test_every_study_and_every_module_of_evaluation_stands_in_its_table():
-    import geomtact.evaluation
-    from geomtact.cli.evaluate import evaluate
+def test_every_study_stands_in_its_table_and_has_its_folder():
+    import tools.studies
+    from tools.studies.__main__ import COMMANDS
 
-    table = geomtact.evaluation.__doc__
-    studies = {command.name for command in evaluate.registered_commands} - {"samples", "plot"}
-    modules = {path.stem for path in (ROOT / "geomtact" / "evaluation").glob("*.py")} - {"__init__"}
-    assert set(re.findall(r"``([a-z_-]+)``", table)) == studies | modules
+    table = set(re.findall(r"^``([a-z-]+)``", tools.studies.__doc__, re.MULTILINE))
+    folders = {path.parent.name for path in STUDIES if path.name == "command.py"}
+    assert table == set(COMMANDS) - {"plot"}
+    assert folders == {name.replace("-", "_") for name in table}

@@ -12,19 +12,21 @@ import trimesh
 from typer.testing import CliRunner
 
 from geomtact import Localizer, Sensor, load_mesh
-from geomtact.cli import app
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import open_index
 from geomtact.contact_space.touch import felt_mask
-from geomtact.evaluation import alike as search
-from geomtact.evaluation import ambiguity, known_approach
-from geomtact.evaluation.alike import SPACING_MM, climbed, overlap, overlap_of_readings
-from geomtact.evaluation.known_approach import ROWS, Outcome, granularity
-from geomtact.evaluation.touches import Touch, each_touch, random_touches
+from geomtact.contact_space.touches import Touch, each_touch, random_touches
 from geomtact.geometry.distance import PoseDistance
-from geomtact.report.thesis_plot import draw_thesis
 from geomtact.se3 import transform
 from geomtact.sensing.noise import CLEAN, HEAVY, MODERATE
+from tools.studies.__main__ import app as studies
+from tools.studies.thesis import alike as search
+from tools.studies.thesis import ambiguity, known_approach
+from tools.studies.thesis.alike import SPACING_MM, climbed, overlap, overlap_of_readings
+from tools.studies.thesis.known_approach import ROWS, Outcome, granularity
+from tools.studies.thesis.plot import draw_thesis
+
+pytestmark = pytest.mark.studies
 
 DOCS = Path(__file__).parents[1] / "docs"
 MM = 1e-3
@@ -174,10 +176,10 @@ def test_a_study_of_what_is_open_goes_on_and_keeps_what_was_judged(flat_nut, mon
         return [Outcome(side, False, [1.0 + k for k in range(len(ROWS))], 50.0)] * n
 
     monkeypatch.setattr(known_approach, "judge_side", judged_at_once)
-    args = ["evaluate", "thesis", "hex_nut", "--felt", "rigid", "--sides", "2", "--touches", "1", "--out", str(out)]
+    args = ["thesis", "hex_nut", "--felt", "rigid", "--sides", "2", "--touches", "1", "--out", str(out)]
 
     def run(*more):
-        done = CliRunner().invoke(app, [*args, *more])
+        done = CliRunner().invoke(studies, [*args, *more])
         assert done.exit_code == 0, done.output
         return json.loads(out.read_text("utf-8"))["parts"]["hex_nut"]
 

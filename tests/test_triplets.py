@@ -7,14 +7,16 @@ import pytest
 from typer.testing import CliRunner
 
 from geomtact import contact_mask, load_mesh
-from geomtact.cli import app
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import NoPoseAgreesError
-from geomtact.evaluation import triplets
-from geomtact.evaluation.triplets import Outcome, judge, read_triplets, summarise, touching
 from geomtact.se3 import inverse, transform
 from geomtact.sensing.image_file import read_image
 from geomtact.sensing.sensor import Sensor
+from tools.studies.__main__ import app as studies
+from tools.studies.triplets import study as triplets
+from tools.studies.triplets.study import Outcome, judge, read_triplets, summarise, touching
+
+pytestmark = pytest.mark.studies
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +140,6 @@ def test_figures_are_of_each_kind_and_number():
 )
 def test_without_the_data_it_says_which_folder_it_needs(words, status, told, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, ["evaluate", "triplets", *words])
+    done = CliRunner().invoke(studies, ["triplets", *words])
     assert done.exit_code == status, done.output
     assert told in done.output

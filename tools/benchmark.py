@@ -137,7 +137,7 @@ def _prepare(part: str, sensor: str, cache: str) -> dict[str, Any]:
 
 def _localize(part: str, sensor: str, cache: str, repeats: str) -> dict[str, Any]:
     """Each touch at every effort, and by the thesis's query, in turn: all of them meet the same neighbours."""
-    from geomtact.evaluation.touches import random_touches
+    from geomtact.contact_space.touches import random_touches
     from geomtact.inference.effort import EFFORTS
     from geomtact.inference.localizer import Localizer
 
@@ -194,7 +194,7 @@ def starts(part: str, sensor: str, cache: Path, repeats: int) -> dict[str, Any]:
     """Wall time of whole processes, first to last line."""
     from PIL import Image
 
-    from geomtact.evaluation.touches import random_touches
+    from geomtact.contact_space.touches import random_touches
     from geomtact.inference.localizer import Localizer
 
     with tempfile.TemporaryDirectory() as folder:

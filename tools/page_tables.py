@@ -1,6 +1,6 @@
 """Fills the tables of the documentation from the files of the studies, in place:
 
-    python tools/page_tables.py
+    python -m tools.page_tables
 
 A cell that no file holds, as a name in words, stays what it is, and what is bold stays bold.
 """
@@ -10,9 +10,9 @@ import re
 from functools import cache, partial
 from pathlib import Path
 
-from geomtact.cli.study_file import inside
-from geomtact.evaluation.shapes import SHAPES
-from geomtact.report.track_plot import LABELS
+from tools.studies.common.study_file import inside
+from tools.studies.registration.shapes import SHAPES
+from tools.studies.track.plot import LABELS
 
 DOCS = Path(__file__).parents[1] / "docs"
 KEPT = None  # a cell that stays what it is

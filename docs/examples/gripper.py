@@ -9,7 +9,7 @@ import json
 import numpy as np
 
 from geomtact import Localizer, se3
-from geomtact.evaluation.kitting import close_jaw, first_grasp
+from geomtact.planning.jaw import close_jaw, first_grasp
 from geomtact.report.exchange import to_ros
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -7,7 +7,6 @@ import sys
 import typer
 
 from geomtact.cli.calibrate import calibrate
-from geomtact.cli.evaluate import evaluate
 from geomtact.cli.library import cache, objects, sensors
 from geomtact.cli.localize import localize
 from geomtact.cli.next_touch import next_touch
@@ -28,7 +27,6 @@ app = typer.Typer(
 for command in (localize, track, view, prepare, train, simulate, calibrate, sensors, objects, cache):
     app.command()(one_line_errors(command))
 app.command("next-touch")(one_line_errors(next_touch))
-app.add_typer(evaluate, name="evaluate")
 
 
 @app.callback(invoke_without_command=True)

@@ -14,7 +14,7 @@ from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from geomtact.contact_space.space import ContactSpace
-    from geomtact.evaluation.touches import Touch
+    from geomtact.contact_space.touches import Touch
     from geomtact.se3 import Array
     from geomtact.sensing.noise import Noise
 
@@ -77,7 +77,7 @@ def simulate(
     if pose is not None:
         touches = [_touch_at(space, read_pose(pose), seed, elastic, strength)]
     else:
-        from geomtact.evaluation.touches import random_touches
+        from geomtact.contact_space.touches import random_touches
 
         touches = random_touches(space, n or 1, seed, elastic=elastic, noise=strength)
     # files are named in full, so that the image is understood from any folder
@@ -142,7 +142,7 @@ def _touch_at(space: ContactSpace, T: Array, seed: int, elastic: bool, noise: No
     import numpy as np
 
     from geomtact.contact_space.touch import felt_mask, spoilt
-    from geomtact.evaluation.touches import Touch
+    from geomtact.contact_space.touches import Touch
 
     mask = spoilt(felt_mask(space, T, elastic), space, noise, np.random.default_rng(seed))
     return Touch(T, float(space.caster.penetration(space.sensor, T)[0]), mask, elastic)

@@ -25,7 +25,7 @@ from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.moments import moments_of
 
-# chosen on trajectories that ``evaluate track`` does not judge (docs/tracking.md)
+# chosen on trajectories that ``tools.studies track`` does not judge (docs/tracking.md)
 NOW = 0.85  # power of a frame's likelihood in its own posterior
 MEMORY = 0.6  # power that the likelihoods of all frames before have together
 NEWEST = 0.15  # share of it that the newest of them has, at most

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from meshprep import Refused
 from scipy.spatial.transform import Rotation
 
 from geomtact.files import write_whole
 from geomtact.geometry.symmetry import Symmetry, group_of
-from meshprep import Refused
 
 
 def add(

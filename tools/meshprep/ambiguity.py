@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from meshprep import Refused
+from meshprep.picture import draw_values
+from meshprep.surface import Array, Surface
 from scipy.spatial import cKDTree
 
 from geomtact import Localizer
@@ -10,9 +13,6 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.geometry.approach import facing
 from geomtact.geometry.mesh import Mesh
 from geomtact.se3 import transform
-from meshprep import Refused
-from meshprep.picture import draw_values
-from meshprep.surface import Array, Surface
 
 _POSES = 150_000  # of the index
 _TOUCHES = 400  # all over the part

@@ -5,11 +5,10 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+from meshprep.surface import Faces, Surface
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-
-from meshprep.surface import Faces, Surface
 
 
 def without_repeats(faces: Faces, cancel: bool) -> Faces:

@@ -6,7 +6,6 @@ import io
 from collections.abc import Callable
 
 import numpy as np
-
 from meshprep.proof import Proof
 from meshprep.repair import Work
 from meshprep.surface import Array, Surface

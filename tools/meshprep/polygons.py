@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from meshprep.surface import Array, Faces, Surface
 from numpy.typing import NDArray
 
 from geomtact.geometry.polygons import Polygons
-from meshprep.surface import Array, Faces, Surface
 
 _AT_ONCE = 2_000_000  # corners that are looked at together
 _POINTS_AT_ONCE = 1000

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pymeshlab
 import trimesh
-
-from geomtact.geometry.mesh import Mesh
 from meshprep import polygons
 from meshprep.repair import Work
 from meshprep.surface import Array, Surface
+
+from geomtact.geometry.mesh import Mesh
 
 SAMPLES = 60_000  # points on each surface, besides its corners and the middles of its faces
 

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from meshprep import Refused
+from meshprep.surface import Array, Faces, Surface
 
 from geomtact.errors import MeshError
 from geomtact.geometry.gltf_file import read_gltf
@@ -15,8 +17,6 @@ from geomtact.geometry.mesh_file import PREPARED, states_unit
 from geomtact.geometry.polygon_file import READERS, read_triangles
 from geomtact.geometry.units import METRE_FORMATS, UNITS, stated_unit
 from geomtact.sensing.sensor import Sensor
-from meshprep import Refused
-from meshprep.surface import Array, Faces, Surface
 
 STEP = (".step", ".stp")
 FORMATS = READ + PREPARED

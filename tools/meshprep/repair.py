@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pymeshlab
-
 from meshprep import Refused
 from meshprep.edges import canonical, cut_up, divided_at_corners, without_repeats
 from meshprep.surface import Array, Surface, label_faces

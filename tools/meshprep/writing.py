@@ -9,6 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from meshprep import Refused
+from meshprep.adding import add
+from meshprep.picture import draw
+from meshprep.proof import Proof, is_solid, prove
+from meshprep.repair import Work
+from meshprep.surface import Surface
 
 from geomtact.errors import MeshError
 from geomtact.files import write_bytes
@@ -17,12 +23,6 @@ from geomtact.geometry.mesh_file import load_mesh
 from geomtact.geometry.units import UNITS, unit_comment
 from geomtact.report.result import plain
 from geomtact.versions import versions
-from meshprep import Refused
-from meshprep.adding import add
-from meshprep.picture import draw
-from meshprep.proof import Proof, is_solid, prove
-from meshprep.repair import Work
-from meshprep.surface import Surface
 
 
 def write(before: Surface, work: Work, name: str, unit: str, out: Path, options: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from benchmark import spread
-
 from peerbench.turns import Way, take_turns
 
 TEN = 10
@@ -19,7 +18,7 @@ ALIKE = 1e-4  # squared distances of vectors that are equal but for rounding
 
 
 def retrieval(given: argparse.Namespace) -> list[dict[str, Any]]:
-    from geomtact.evaluation.touches import random_touches
+    from geomtact.contact_space.touches import random_touches
     from geomtact.inference.localizer import Localizer
 
     localizer = Localizer.prepare(given.part, sensor=given.sensor)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from benchmark import spread
-
 from peerbench.turns import Way, take_turns
 
 BLOCK = 10  # poses rendered in turn

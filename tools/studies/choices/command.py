@@ -1,0 +1,175 @@
+"""``python -m tools.studies choices``: what each way of localizing tells and costs, on the same touches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from geomtact.cli.options import Seed, Unit
+from geomtact.cli.shell import print_table, progress_bar, tell
+from tools.studies.common import study_file, study_options
+
+if TYPE_CHECKING:
+    from geomtact.geometry.mesh import Mesh
+    from geomtact.inference.localizer import Localizer
+    from geomtact.sensing.sensor import Sensor
+
+SCHEMA = "geomtact/choices/1"
+
+
+def judge_choices(
+    parts: study_options.ThesisParts = None,
+    unit: Unit = None,
+    sensor: study_options.SensorName = "gelslim",
+    touches: Annotated[
+        int, typer.Option("--touches", min=2, help="How many scenes of each kind, for each part.")
+    ] = 100,
+    seed: Seed = 3,
+    weights: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--weights",
+            help="Weights that 'geomtact train' wrote: an encoder of another size, or the thesis's network; each is a way more.",
+            show_default=False,
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--way", help="Judge this way beside the default, not all; may be given again.", show_default=False
+        ),
+    ] = None,
+    out: study_options.Out = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="PNG of information and error against the time of a touch.")
+    ] = None,
+    plot_modelled: Annotated[
+        Path | None, typer.Option("--plot-modelled", help="PNG of what each thing modelled adds.")
+    ] = None,
+) -> None:
+    """Judge choices: efforts, grids, scores, registration, calibration and known sides, each against the default.
+
+    All ways meet each touch in turn. Everything is prepared anew in a folder that is removed afterwards, so that the time of
+    preparing is known too. Prints tables, and writes all answers to --out.
+    """
+    from geomtact.contact_space.store import FORMAT
+    from geomtact.report.result import plain
+    from geomtact.sensing.sensor import Sensor
+    from tools.studies.choices import study as choices
+    from tools.studies.common import study
+
+    content, gel = study_file.load(out, SCHEMA), Sensor.load(sensor)
+    ways = choices.ways_of(weights or [], only or [])
+    for mesh in study_options.meshes(parts, unit, gel):
+        settings = plain(
+            study.whose(mesh, gel)
+            | {
+                "index_format": FORMAT,
+                "touches": touches,
+                "seed": seed,
+                "ways": {name: asdict(way) | {"scorer": Path(way.scorer).name} for name, way in ways.items()},
+            }
+        )
+        found = content["parts"].get(mesh.name)
+        known = dict(found) if study_file.begun(found, settings) else {"ways": {}, "scenes": {}}
+        part = known | {"settings": settings}
+        done = {kind: list(part["scenes"].get(kind, {}).get("answers", [])) for kind in choices.scenes_of(ways)}
+        if any(len(some) < touches for some in done.values()):
+            _judge(mesh, gel, ways, part, done, touches, seed, lambda part=part: _keep(out, content, part))
+        _summarise(part)
+        _keep(out, content, part)
+        _print(mesh.name, part)
+        tell(f"{mesh.name}: done")
+    study_file.plot(content, plot)
+    study_file.plot(content, plot_modelled, "modelled")
+
+
+def _keep(out: Path | None, content: dict[str, Any], part: Mapping[str, Any]) -> None:
+    study_file.keep(out, content, part["settings"]["object"], **part)
+
+
+def _judge(
+    mesh: Mesh,
+    sensor: Sensor,
+    ways: Mapping[str, Any],
+    part: dict[str, Any],
+    done: dict[str, list],
+    n: int,
+    seed: int,
+    save: Any,
+) -> None:
+    """Prepare every way and localize what is left of the scenes, in every way."""
+    import tempfile
+
+    from tools.studies.choices import study as choices
+    from tools.studies.scores.study import bytes_read
+
+    localizers: dict[str, Localizer] = {}
+    spent: dict[tuple[Any, ...], float | None] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, way in ways.items():
+            with progress_bar(f"preparing {mesh.name}, {name}") as progress:
+                localizers[name], seconds = choices.prepare(mesh, sensor, way, Path(folder), progress)
+            spent.setdefault(way.prepared, seconds)
+            part["ways"][name] = {
+                "choice": way.choice,
+                "poses": len(localizers[name].index),
+                "bytes_per_pose": bytes_read(localizers[name], "balanced"),
+                "prepare_s": spent[way.prepared],
+            }
+        for kind in done:
+            scenes = choices.make(kind, localizers[choices.DEFAULT], n, seed)
+            todo = choices.localized(localizers, ways, scenes[len(done[kind]) :], kind, seed)
+            rows = ({name: asdict(answer) for name, answer in told.items()} for told in todo)
+
+            def keep(answers: list, kind: str = kind) -> None:
+                part["scenes"][kind] = {"answers": answers}
+                save()
+
+            keep(study_file.collect(done[kind], rows, n, f"{mesh.name}, {kind}", keep))
+
+
+def _summarise(part: dict[str, Any]) -> None:
+    """Write the figures of each kind of scene beside its answers."""
+    from tools.studies.choices import study as choices
+
+    for scene in part["scenes"].values():
+        answers = {
+            name: [choices.Timed(**study_file.numbers(told[name])) for told in scene["answers"]]
+            for name in scene["answers"][0]
+        }
+        figures = choices.summarise(answers)
+        scene["figures"] = figures
+        scene["front"] = {
+            "gain_mean": choices.front(figures, "gain_mean", 1),
+            "mssd_mm_median": choices.front(figures, "mssd_mm_median", -1),
+        }
+        scene["beaten_by"] = choices.beaten_by(answers, figures)
+        scene["modelled"] = choices.modelled(answers)
+
+
+def _print(name: str, part: Mapping[str, Any]) -> None:
+    headings = ["gain [nats]", "MSSD [mm]", "ms", "poses", "ready [s]"]
+    for kind, scene in part["scenes"].items():
+        rows = []
+        for way, f in scene["figures"].items():
+            gain = "-" if f["gain_mean"] is None else f"{f['gain_mean']:.2f} ± {f['gain_standard_error'] or 0:.2f}"
+            ms = f"{f['ms_quantiles'][1]:.1f} ({f['ms_quantiles'][0]:.1f}-{f['ms_quantiles'][2]:.1f})"
+            ready = part["ways"][way]["prepare_s"]
+            numbers = [f"{part['ways'][way]['poses']:,}", study_file.figure(ready, 0)]
+            on_front = "*" if way in scene["front"]["gain_mean"] else ""
+            rows.append([way + on_front, part["ways"][way]["choice"], gain, f"{f['mssd_mm_median']:.1f}", ms, *numbers])
+        typer.echo(f"{name}, {kind}; * no other way is as fast and tells as much")
+        print_table(["way", "choice", *headings], rows, headings)
+        if scene["beaten_by"]:
+            typer.echo(f"the default is slower and tells less than: {', '.join(scene['beaten_by'])}")
+        rows = [
+            [what, "{:+.2f} ({:+.2f} to {:+.2f})".format(*f["adds"]), f"{f['time_ratio']:.2f}"]
+            for what, f in scene["modelled"].items()
+        ]
+        if rows:
+            print_table(["modelled", "adds [nats]", "time"], rows, ["adds [nats]", "time"])

@@ -1,0 +1,64 @@
+"""What was told of one touch, or of one scene, held against the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.pose_error import mssd
+from geomtact.inference.posterior import Posterior
+from geomtact.se3 import Array
+from tools.studies.common.study import CERTAIN, WRONG_MM
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was told of one touch, or one scene. Lengths in millimetres, information in nats.
+
+    Attributes
+    ----------
+    gain : log density at the true pose; -inf where it was given no probability
+    claimed : minus the entropy
+    level : credible level of the true pose
+    mssd_mm, probability : of the first mode; inf and 0 where there is none
+    warned : whether a warning came with it; an error in place of an answer counts as one
+    """
+
+    gain: float
+    claimed: float
+    level: float
+    mssd_mm: float
+    probability: float
+    warned: bool
+
+    @property
+    def wrong(self) -> bool:
+        return self.mssd_mm > WRONG_MM
+
+    @property
+    def silent(self) -> bool:
+        """Wrong, and nothing says so."""
+        return self.wrong and self.probability >= CERTAIN and not self.warned
+
+
+REFUSED = Answer(-np.inf, 0.0, 1.0, np.inf, 0.0, True)  # an error took the answer's place
+
+
+def judged(mesh: Mesh, T: Array, posterior: Posterior, nearest: Array | None = None) -> Answer:
+    """A posterior held against the truth ``T`` (4, 4); errors are modulo the symmetry of ``mesh``.
+
+    Where ``T`` lies outside the contact pose space, its density and level are those of ``nearest`` (4, 4), a pose inside.
+    """
+    inside = T if nearest is None else nearest
+    modes = posterior.modes(1)
+    poses = np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
+    return Answer(
+        gain=float(posterior.log_density(inside)),
+        claimed=-float(posterior.entropy_nats),
+        level=float(posterior.credible_level(inside)),
+        mssd_mm=float(1e3 * mssd(T, poses, mesh).min(initial=np.inf)),
+        probability=modes[0].probability if modes else 0.0,
+        warned=bool(posterior.warnings),
+    )

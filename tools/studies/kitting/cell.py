@@ -1,0 +1,197 @@
+"""Kitting (thesis 8.3): a simulated cell in which a part is grasped, localized, touched again, and placed in a fixture.
+
+Geometric and quasi-static. The world is the gripper that holds the part, so a second gripper's closings, at known poses
+relative to it, all count in one product. The fixture is a recess of the part's own shape, wider by a clearance on all sides.
+The robot places the part only if the posterior says that it will fit; else it touches again, and at last refuses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.space import ContactSpace
+from geomtact.contact_space.touch import felt_mask, spoilt
+from geomtact.contact_space.touches import counts, penetrations
+from geomtact.errors import InputError
+from geomtact.inference.localizer import Localizer
+from geomtact.inference.posterior import Posterior
+from geomtact.inference.refine import TRUST, Refinery
+from geomtact.inference.search import View
+from geomtact.planning.belief import draw_cells
+from geomtact.planning.grid import grid_of_touches
+from geomtact.planning.jaw import OPPOSITE, close_jaw, first_grasp
+from geomtact.planning.next_touch import judge
+from geomtact.se3 import Array, inverse, transform
+from geomtact.sensing.contact import Contact
+from geomtact.sensing.noise import MODERATE, Noise
+from tools.studies.kitting.fixture import Fixture
+
+SURE = 0.95  # estimated probability of fitting from which the part is placed
+_DRAWS = 1000  # poses that are believed
+_ASKED = 60  # of these, by their weights, of which it is asked whether they fit
+_MISSED = 2.0  # a jaw that met nothing swept its way: that no contact is shown there counts twice
+_TRIED, _PLACES, _PRESSES = 16, 40, 3  # touches to choose from, places to tell apart, depths at which each is pressed
+
+
+@dataclass(frozen=True, eq=False)
+class Felt:
+    """What fingers felt: where each stopped (n, 4, 4), in the world, and its mask (H, W), empty without contact."""
+
+    T_world_sensor: Array
+    masks: list[NDArray[np.bool_]]
+
+    def __add__(self, more: Felt) -> Felt:
+        return Felt(np.concatenate([self.T_world_sensor, more.T_world_sensor]), self.masks + more.masks)
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """Poses ``T`` (n, 4, 4) of the part in the world, the heaviest first, and their ``weight`` (n,), which sums to 1."""
+
+    T: Array
+    weight: Array
+
+    @property
+    def effective(self) -> float:
+        """How many poses of equal weight would tell as much (Kish 1965)."""
+        return float(1 / (self.weight**2).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """The pose ``T_world_part`` (4, 4) by which to place the part, and the ``probability`` that it fits then."""
+
+    T_world_part: Array
+    probability: float
+
+    @property
+    def sure(self) -> bool:
+        return self.probability >= SURE
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """After so many touches of a jaw: all that was felt, the posterior, what is believed, and a decision for each clearance."""
+
+    felt: Felt
+    posterior: Posterior
+    belief: Believed
+    decisions: list[Decision]
+
+
+def touch_with_jaw(
+    space: ContactSpace, T_world_part: Array, T_world_jaw: Array, elastic: bool, noise: Noise, rng: np.random.Generator
+) -> Felt:
+    """The jaw closes at ``T_world_jaw`` (4, 4), each finger until the part presses 0.3 to 1.5 mm into it: nobody is told.
+
+    Where neither finger meets the part, that both met nothing is felt, at the jaw's origin. A finger stopped by too small a
+    contact tells nothing.
+    """
+    stopped, touches = close_jaw(space, T_world_part, T_world_jaw, rng.uniform(*penetrations(space), 2))
+    T, masks = [], []
+    for T_world_sensor in stopped[touches]:
+        mask = _felt(space, T_world_sensor, T_world_part, elastic)
+        if mask is not None:
+            T.append(T_world_sensor)
+            masks.append(spoilt(mask, space, noise, rng))
+    if not touches.any():
+        nothing = np.zeros(space.sensor.image_size_px[::-1], bool)
+        return Felt(T_world_jaw @ np.stack([np.eye(4), OPPOSITE]), [nothing, nothing])
+    return Felt(np.array(T).reshape(-1, 4, 4), masks)
+
+
+def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.random.Generator) -> Believed:
+    """Poses drawn from ``posterior``, each weighed by how likely all that was ``felt`` is there.
+
+    They scatter about what registration found, and lie anywhere within cells that it did not look into. The grid's cells are
+    wider than any clearance, so their masses say too little; the pixels, cast at the pose itself, say more.
+    """
+    poses = draw_cells(posterior, _DRAWS, rng)[0]
+    refinery, log_weight = Refinery(space), np.zeros(len(poses))
+    for T_world_sensor, mask in zip(felt.T_world_sensor, felt.masks, strict=True):
+        seen = View(refinery, Contact(mask) if mask.any() else None, inverse(T_world_sensor))
+        log_weight += (TRUST if mask.any() else _MISSED) * seen.log_likelihood(poses)
+    heaviest = np.argsort(-log_weight)
+    weight = np.exp(log_weight - log_weight.max())[heaviest]
+    return Believed(poses[heaviest], weight / weight.sum())
+
+
+def decide(belief: Believed, fixture: Fixture, clearances: Sequence[float]) -> list[Decision]:
+    """For each of ``clearances`` [m] the probability that the part fits, placed by the pose that explains best what was felt.
+
+    P(fits | T) = W n / (n + 1), W the weight of the poses T' believed at which inv(T) T' needs no more than the clearance, n
+    how many poses are effective: where hardly any explains what was felt, that one fits itself proves nothing.
+    """
+    even = (np.arange(_ASKED) + 0.5) / _ASKED
+    drawn = np.minimum(np.searchsorted(np.cumsum(belief.weight), even), len(belief.T) - 1)
+    needed = fixture.clearance_needed(inverse(belief.T[0]) @ belief.T[drawn])
+    trust = belief.effective / (belief.effective + 1)
+    return [Decision(belief.T[0], float((needed <= clearance).mean() * trust)) for clearance in clearances]
+
+
+def choose_jaw(posterior: Posterior, belief: Believed, made: Array, rng: np.random.Generator) -> Array:
+    """The jaw's pose (4, 4) whose first finger is expected to tell most about the pose (thesis 8.2).
+
+    As in ``planning.next_touch``, but the places to be told apart are drawn as for the decision, finer than the grid's cells.
+    """
+    touches = grid_of_touches(posterior, made=made, seed=int(rng.integers(2**31)))
+    some = [touches[i] for i in rng.permutation(len(touches))[:_TRIED]]
+    places = belief.T[rng.choice(len(belief.T), _PLACES, p=belief.weight)]
+    T = np.tile(places, (_PRESSES, 1, 1, 1))
+    _, best = max((judge(posterior.space, touch, T).expected_nats, i) for i, touch in enumerate(some))
+    # fingers that meet nothing meet each other in the middle
+    return some[best].T_world_sensor @ transform(np.eye(3), [0.0, 0.0, 0.5 * some[best].travel])
+
+
+def kit(
+    localizer: Localizer,
+    fixture: Fixture,
+    T_world_part: Array,
+    clearances: Sequence[float],
+    rng: np.random.Generator,
+    touches: int = 4,
+    elastic: bool = True,
+    noise: Noise = MODERATE,
+) -> Iterator[Step]:
+    """Touch a part that lies at ``T_world_part`` (4, 4), unknown to the robot, up to ``touches`` times with a jaw.
+
+    The first closing is at the world's origin, along z. A caller who is sure enough stops asking for the next step.
+
+    Raises
+    ------
+    InputError
+        Nothing was felt.
+    NoPoseAgreesError
+        No pose agrees with all that was felt.
+    """
+    felt = touch_with_jaw(localizer.space, T_world_part, np.eye(4), elastic, noise, rng)
+    if not felt.masks or not felt.masks[0].any():
+        raise InputError("kit: expected a grasp with contact, no finger felt the part; take another seed")
+    for touch in range(1, touches + 1):
+        posterior = localizer.localize(felt.masks, "mask", T_world_sensor=felt.T_world_sensor)
+        belief = believe(localizer.space, posterior, felt, rng)
+        yield Step(felt, posterior, belief, decide(belief, fixture, clearances))
+        if touch < touches:
+            jaw = choose_jaw(posterior, belief, felt.T_world_sensor, rng)
+            felt += touch_with_jaw(localizer.space, T_world_part, jaw, elastic, noise, rng)
+
+
+def draw_part(space: ContactSpace, rng: np.random.Generator) -> Array:
+    """A pose (4, 4) of the part at which a jaw at the world's origin grasps it, and both fingers feel it."""
+    least = penetrations(space)[0]
+    while True:
+        T_world_part = inverse(first_grasp(space.mesh, rng))
+        stopped, touches = close_jaw(space, T_world_part, np.eye(4), (least, least))
+        # a harder grasp shows more, and a rigid gel more than an elastic one
+        if touches.all() and all(_felt(space, T, T_world_part, True) is not None for T in stopped):
+            return T_world_part
+
+
+def _felt(space: ContactSpace, T_world_sensor: Array, T_world_part: Array, elastic: bool) -> NDArray[np.bool_] | None:
+    """The mask (H, W) without noise; None where it is smaller than a contact that counts."""
+    mask = felt_mask(space, inverse(T_world_sensor) @ T_world_part, elastic)
+    return mask if counts(space, mask) else None

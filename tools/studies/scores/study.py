@@ -1,0 +1,164 @@
+"""Scores side by side: the same touches judged through one score after another, and what each score costs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geomtact.contact_space.index import Index
+from geomtact.contact_space.store import open_index
+from geomtact.contact_space.touches import Touch
+from geomtact.geometry.approach import Approach
+from geomtact.geometry.mesh import Mesh
+from geomtact.inference.localizer import Localizer
+from geomtact.progress import Progress
+from geomtact.scoring.catalogue import PIXELWISE
+from geomtact.scoring.moments import Moments
+from geomtact.scoring.product import Product
+from geomtact.scoring.protocol import Scorer
+from geomtact.scoring.vectors import VectorScorer
+from geomtact.sensing.sensor import Sensor
+from tools.studies.common import study
+
+
+@dataclass(frozen=True)
+class Scored(study.Outcome):
+    """An outcome, with the time [ms] that comparing with every pose and weighing them took: ``score_ms``."""
+
+    score_ms: float
+
+
+class Stopwatch:
+    """A progress callback that adds up the seconds of each step and passes the report on.
+
+    A step reports when some of it is done, so the time since the report before belongs to the step that is named.
+    """
+
+    def __init__(self, progress: Progress | None = None):
+        self.seconds: dict[str, float] = {}
+        self._progress = progress
+        self._began = self._last = time.perf_counter()
+
+    def __call__(self, done: float, step: str = "") -> None:
+        now = time.perf_counter()
+        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
+        self._last = now
+        if self._progress:
+            self._progress(done, step)
+
+    def total(self) -> float:
+        return time.perf_counter() - self._began
+
+    def of(self, start: str) -> float:
+        """Seconds of all steps whose name starts so."""
+        return sum((seconds for step, seconds in self.seconds.items() if step.startswith(start)), 0.0)
+
+
+def prepare(
+    mesh: Mesh,
+    sensor: Sensor,
+    scorer: str,
+    max_poses: int,
+    cache_dir: Path | None,
+    progress: Progress | None = None,
+    approach: Approach | None = None,
+) -> tuple[Localizer, dict[str, float | None]]:
+    """A localizer with ``scorer``, and the seconds that building the index, describing its contacts and calibrating the
+    score took; None for what was read from the cache."""
+    watch = Stopwatch(progress)
+    open_index(mesh, sensor, approach, max_poses, cache_dir, watch)
+    index_s = watch.total() if watch.seconds else None
+    watch = Stopwatch(progress)
+    localizer = Localizer.prepare(
+        mesh, None, sensor, approach, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir, progress=watch
+    )
+    described = watch.of("describing")
+    stores = isinstance(localizer.scorer.scorer, VectorScorer) or localizer.scorer.cascade is not None
+    return localizer, {
+        "index": index_s,
+        "describe": None if stores and not described else described,
+        "calibrate": watch.of("simulating") + watch.of("calibrating") if watch.of("calibrating") else None,
+    }
+
+
+def bytes_read(localizer: Localizer, effort: str) -> float:
+    """Bytes a pose that the localizer's score reads for a touch at ``effort``."""
+    fitted, index = localizer.scorer, localizer.index
+    if effort == "fast" and fitted.cascade is not None:
+        blocks = fitted.cascade.blocks
+        return (blocks.narrowing.nbytes + blocks.narrowed.nbytes + blocks.constant.nbytes) / len(index)
+    exact = fitted.exact_scorer if effort == "exact" else None
+    return bytes_per_pose(exact or fitted.scorer, index)
+
+
+def bytes_per_pose(scorer: Scorer, index: Index) -> float:
+    """Bytes that ``scorer`` reads of every pose to compare a touch with it; all that is stored, for one unknown here."""
+    if isinstance(scorer, Product):
+        return sum(bytes_per_pose(part, index) for part in scorer.scorers)
+    if isinstance(scorer, VectorScorer):
+        return scorer.stored.nbytes / len(index)
+    if isinstance(scorer, Moments):
+        return index.moments.nbytes / len(index)
+    if scorer.name in PIXELWISE:
+        return (index.bits.nbytes + index.area.nbytes) / len(index)
+    return index.bytes_per_pose
+
+
+def judged(localizer: Localizer, touches: Sequence[Touch], effort: str, seed: int) -> Iterator[Scored]:
+    """Localizes each touch and says how that went, and the time of the score."""
+    for outcome, posterior in study.judged(localizer, touches, effort, seed):
+        # an image without contact is not scored
+        score_ms = sum(posterior.timing_ms.get(stage, 0.0) for stage in ("score", "posterior"))
+        yield Scored(**asdict(outcome), score_ms=score_ms)
+
+
+def summarise(outcomes: Sequence[Scored], iou: Sequence[Scored], random_add_mm: float) -> dict[str, dict[str, Any]]:
+    """``study.summarise``, with the score's time and, touch by touch, its gain over ``iou``: that score's outcomes on
+    the same touches, or none."""
+    out = study.summarise(outcomes, random_add_mm)
+    others = study.groups(iou)
+    for name, some in study.groups(outcomes).items():
+        difference = [a.gain - b.gain for a, b in zip(some, others[name], strict=True)] if others else []
+        n = len(difference)
+        out[name] |= {
+            "score_ms_median": float(np.median([o.score_ms for o in some])),
+            "over_iou_mean": float(np.mean(difference)) if n else None,
+            "over_iou_standard_error": float(np.std(difference, ddof=1) / np.sqrt(n)) if n > 1 else None,
+        }
+    return out
+
+
+def over_parts(entries: Sequence[Mapping[str, Any]], outcomes: Sequence[Sequence[Scored]]) -> dict[str, Any]:
+    """A score's figures over several parts: every part counts alike, and the coverage is that of all touches together.
+
+    Parameters
+    ----------
+    entries : what the JSON holds of the score, a part each
+    outcomes : on each part
+    """
+    figures = {}
+    for name, together in study.groups([o for some in outcomes for o in some]).items():
+        some = [entry["figures"][name] for entry in entries if name in entry["figures"]]
+        figures[name] = {key: _over(key, [f[key] for f in some]) for key in some[0] if not key.startswith("coverage")}
+        figures[name] |= {"n": len(together), **study.coverage_figures([o.level for o in together])}
+    return {
+        "bytes_per_pose": _over("bytes_per_pose", [entry["bytes_per_pose"] for entry in entries]),
+        "prepare_s": {
+            step: _over(step, [entry["prepare_s"][step] for entry in entries]) for step in entries[0]["prepare_s"]
+        },
+        "figures": figures,
+    }
+
+
+def _over(key: str, values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return None
+    if key.endswith("standard_error"):
+        return float(np.linalg.norm(known) / len(known))
+    return float(np.mean(known))

@@ -1,0 +1,142 @@
+"""Several sensors judged: what each more of them adds, on objects that all of them touch at once (thesis 7.2, Figure 13)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from geomtact.contact_space.touches import Touch, random_touches
+from geomtact.errors import NoPoseAgreesError
+from geomtact.geometry.distance import PoseDistance
+from geomtact.geometry.pose_error import add_s, mssd
+from geomtact.inference.localizer import Localizer
+from geomtact.se3 import Array, inverse, random_rotations, transform
+from geomtact.sensing.noise import Noise
+from tools.studies.common.study import MODES, coverage_figures, mean_with_interval
+
+SENSORS = 5
+_POINTS = 20_000  # for ADD-S, which says no less than the distance between points (0.3 mm on the pin)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One object in the world, touched by several sensors: their poses (n, 4, 4), the object's (4, 4), and the touches."""
+
+    T_world_sensor: Array
+    T_world_object: Array
+    touches: list[Touch]
+
+
+@dataclass(frozen=True)
+class FusedOutcome:
+    """What the first ``sensors`` of a scene told together. Lengths in millimetres, information in nats.
+
+    Attributes
+    ----------
+    gain : log density at the true pose, relative to the uniform distribution on the first sensor's poses
+    claimed : minus the entropy
+    level : credible level of the true pose
+    mssd_mm, add_mm, add_s_mm, add10_mm : of the first mode, the last of the best of ten; inf where no pose agreed
+    probability : of the first mode
+    warned : whether a sensor was said to disagree
+    ms : that localizing took
+    """
+
+    scene: int
+    sensors: int
+    gain: float
+    claimed: float
+    level: float
+    mssd_mm: float
+    add_mm: float
+    add_s_mm: float
+    add10_mm: float
+    probability: float
+    warned: bool
+    ms: float
+
+
+def make_scenes(
+    localizer: Localizer, n: int, seed: int, noise: Noise, elastic: bool | None, sensors: int = SENSORS
+) -> list[Scene]:
+    """``n`` scenes of so many ``sensors``, one touch each, uniform over the contact pose space, wherever they meet the object.
+
+    ``elastic`` as in ``touches.random_touches``.
+    """
+    rng = np.random.default_rng([seed, 13])
+    touches = random_touches(localizer.space, n * sensors, seed, elastic, noise)
+    out = []
+    for i in range(n):
+        some = touches[i * sensors : (i + 1) * sensors]
+        T_world_object = transform(random_rotations(1, rng)[0], rng.uniform(-0.3, 0.3, 3))
+        T = np.stack([T_world_object @ inverse(touch.T_sensor_object) for touch in some])
+        out.append(Scene(T, T_world_object, some))
+    return out
+
+
+def fuse_scenes(
+    localizer: Localizer, scenes: Sequence[Scene], effort: str, seed: int, first: int = 0
+) -> Iterator[list[FusedOutcome]]:
+    """Each scene from ``first`` on localized from its first sensor, its first two, and so on."""
+    distance, points = PoseDistance(localizer.mesh), localizer.mesh.surface_points(_POINTS)
+    for number, scene in enumerate(scenes[first:], first):
+        out = []
+        for n in range(1, len(scene.touches) + 1):
+            began = time.perf_counter()
+            images = [touch.mask for touch in scene.touches[:n]]
+            try:
+                posterior = localizer.localize(images, "mask", None, scene.T_world_sensor[:n], effort=effort, seed=seed)
+            except NoPoseAgreesError:
+                out.append(FusedOutcome(number, n, -np.inf, 0.0, 1.0, np.inf, np.inf, np.inf, np.inf, 0.0, True, 0.0))
+                continue
+            ms = 1e3 * (time.perf_counter() - began)
+            modes = posterior.modes(MODES)
+            T, poses = scene.T_world_object, np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
+            mean = 1e3 * distance.mean(T, poses)
+            out.append(
+                FusedOutcome(
+                    scene=number,
+                    sensors=n,
+                    gain=float(posterior.log_density(T)),
+                    claimed=-float(posterior.entropy_nats),
+                    level=float(posterior.credible_level(T)),
+                    mssd_mm=float(1e3 * mssd(T, poses[:1], localizer.mesh)[0]),
+                    add_mm=float(mean[0]),
+                    add_s_mm=float(1e3 * add_s(T, poses[:1], points)[0]),
+                    add10_mm=float(mean.min()),
+                    probability=modes[0].probability,
+                    warned=posterior.settings.get("disagrees", False),
+                    ms=ms,
+                )
+            )
+        yield out
+
+
+def summarise(outcomes: Sequence[FusedOutcome]) -> list[dict[str, Any]]:
+    """Figures for each number of sensors; ``more`` is the mean gain over one sensor less, with its paired 95 % bootstrap
+    interval, and ``ruled_out`` the share of scenes in which the true pose was given no probability: of the others are gain and
+    claim."""
+    gains = {n: _column(outcomes, n, "gain") for n in sorted({o.sensors for o in outcomes})}
+    rng, out = np.random.default_rng(0), []
+    for n, gain in gains.items():
+        figures: dict[str, Any] = {"sensors": n, "n": len(gain), "ruled_out": float((~np.isfinite(gain)).mean())}
+        kept = np.isfinite(gain)
+        claimed = _column(outcomes, n, "claimed")
+        figures |= {"gain_mean": float(gain[kept].mean()), "claimed_mean": float(claimed[kept].mean())}
+        if n - 1 in gains:
+            more = (gain - gains[n - 1])[np.isfinite(gain) & np.isfinite(gains[n - 1])]
+            figures["more"] = mean_with_interval(more, rng)
+        for name in ("mssd_mm", "add_mm", "add_s_mm", "add10_mm", "probability", "ms"):
+            figures[f"{name}_median"] = float(np.median(_column(outcomes, n, name)))
+        figures["warned"] = float(_column(outcomes, n, "warned").mean())
+        out.append(figures | coverage_figures(_column(outcomes, n, "level")))
+    return out
+
+
+def _column(outcomes: Sequence[FusedOutcome], sensors: int, name: str) -> Array:
+    """One field of all scenes with that many sensors."""
+    return np.array([getattr(o, name) for o in outcomes if o.sensors == sensors], float)
