@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 _TRIES = 3  # of a task whose process dies
 _AHEAD = 4  # tasks handed to a cluster for each of its cores
-_ANSWERS = 5.0  # s within which a cluster does
-_DIED = "its process died, three times, the last two alone; there may be too little memory for it"
+_CONNECT_TIMEOUT = 5.0  # s
+_DIED = "its process died three times, twice running alone; it may need more memory"
 
 
 def prepare_part(
     mesh: str, unit: str | None, sensor: str | Sensor, scorer: str, max_poses: int, cache_dir: str | Path | None
 ) -> None:
-    """Prepare a part as ``Localizer.prepare`` does, and leave it in the cache."""
+    """Prepare an object as ``Localizer.prepare`` does, and leave it in the cache."""
     from geomtact.inference.localizer import Localizer
 
     Localizer.prepare(mesh, unit, sensor, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir)
@@ -152,11 +152,11 @@ def _by_ray(
     try:
         if ":" in address.removeprefix("ray://"):  # Ray itself would try for minutes
             host, port = address.removeprefix("ray://").rsplit(":", 1)
-            socket.create_connection((host, int(port)), timeout=_ANSWERS).close()
+            socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT).close()
         ray.init(address=address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, ValueError, RuntimeError) as error:
         raise UsageError(
-            f"--ray: no cluster at {address!r} ({str(error).splitlines()[0]}); start one with 'ray start --head', or give auto"
+            f"--ray: no cluster at {address!r} ({str(error).splitlines()[0]}); run 'ray start --head' there, or give auto"
         ) from None
     remote = ray.remote(num_cpus=1, max_retries=_TRIES - 1)(_done)
     waiting, running = list(range(len(tasks)))[::-1], dict[Any, int]()
@@ -169,4 +169,4 @@ def _by_ray(
         try:
             yield number, ray.get(future)
         except ray.exceptions.RayError as error:
-            yield number, GeomtactError(f"not done on the cluster, three times: {str(error).splitlines()[0]}")
+            yield number, GeomtactError(f"failed three times on the cluster: {str(error).splitlines()[0]}")

@@ -151,7 +151,7 @@ def test_a_study_apart_keeps_what_it_could_judge_and_names_the_rest(few_touches,
     out = tmp_path / "study.json"
     words = ["stability", PARTS[0], "pim", "--touches", "1", "--sweep", "noise", "--max-poses", "3000"]
     done = CliRunner().invoke(studies, [*words, "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)])
-    assert done.exit_code == 3 and "1 of 2 parts are not judged" in done.output and "pim: not judged" in done.output
+    assert done.exit_code == 3 and "1 of 2 objects are not judged" in done.output and "pim: not judged" in done.output
     assert list(json.loads(out.read_text())["parts"]) == [PARTS[0]]
     (kept := tmp_path / "study.parts" / "mine.txt").write_text("mine")
     again = [*words[:2], *words[3:], "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)]
@@ -216,7 +216,7 @@ def test_the_command_prepares_several_parts_and_names_those_that_it_cannot(few_t
     assert "[1 of 3] ball on gelsight-mini: prepared" in done.output
     assert "broken.stl on gelsight-mini: not prepared" in done.output
     assert "[3 of 3] hex_nut on gelsight-mini: prepared" in done.output
-    assert "1 of 3 parts are not prepared" in done.output
+    assert "1 of 3 objects are not prepared" in done.output
 
 
 def test_several_parts_are_trained_for_each_into_a_folder(tmp_path):

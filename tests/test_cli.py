@@ -88,10 +88,10 @@ def test_usage_errors_exit_2(geomtact, args):
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (["localise"], "did you mean 'localize'?; 'geomtact --help'"),
-        (["localize", "--nope"], "no such option: --nope; 'geomtact localize --help'"),
+        (["localise"], "did you mean 'localize'?; run 'geomtact --help'"),
+        (["localize", "--nope"], "no such option: --nope; run 'geomtact localize --help'"),
         (["simulate", "pin", "--n", "0"], "'--n'"),
-        (["simulate", "pin", "--out", ""], "expected a word after --out, got an empty one"),
+        (["simulate", "pin", "--out", ""], "expected a value after --out, got an empty text"),
     ],
 )
 def test_usage_errors_are_told_in_one_line(args, said, monkeypatch, capsys):
@@ -152,7 +152,7 @@ def test_wrong_names_and_paths_are_told_before_any_work(geomtact, touched, tmp_p
     assert "--report needs --out" in geomtact("localize", image, "--report", "png", status=2).stderr
     assert "is a file; give a folder" in geomtact("localize", image, "--out", "part.stl", status=2).stderr
     assert "is a file; give a folder" in geomtact("simulate", "ball", "--out", "part.stl", status=2).stderr
-    assert "is a folder; give the images in it" in geomtact("localize", str(tmp_path), status=3).stderr
+    assert "got a folder; give the images in it" in geomtact("localize", str(tmp_path), status=3).stderr
     assert "no.npz: no such file" in geomtact("localize", image, "--prior", "no.npz", status=3).stderr
     assert "no.toml: no such file" in geomtact("localize", image, "--sensor", "no.toml", status=3).stderr
     (tmp_path / "geomtact.toml").write_text('effort = "quick"')
@@ -215,7 +215,7 @@ def test_simulate_is_repeatable_and_replays_a_pose(geomtact, touched, tmp_path):
         assert np.array_equal(a, b)
     (tmp_path / "pose.json").write_text(json.dumps(np.diag([1.0, 1, 1, 1]).tolist()).replace("0.0]", "9.0]", 1))
     far = ("simulate", "ball", "--sensor", "gelslim", "--pose", tmp_path / "pose.json", "--out", tmp_path / "far")
-    assert "the part does not touch there" in geomtact(*far).stderr
+    assert "the object does not touch at this pose" in geomtact(*far).stderr
     assert "give one of them" in geomtact(*far, "--n", 2, status=2).stderr
     assert json.loads((tmp_path / "far" / "ball_1.json").read_text())["penetration_mm"] is None
     (tmp_path / "pose.json").write_text('{"T_sensor_object": [[1, 2], [3, 4]]}')
@@ -241,7 +241,7 @@ def test_the_side_that_is_touched_may_be_said(geomtact, flat_nut, a_touch, tmp_p
             approach_from([wrong])
     assert "three numbers" in geomtact("localize", *nut, "--approach", "0,1", status=2).stderr
     assert (
-        "give one part"
+        "exactly one object"
         in geomtact("localize", *nut[:2], "hex_nut,pin", *nut[3:], "--approach", "0,0,1", status=2).stderr
     )
 
@@ -288,7 +288,7 @@ def test_images_and_folders_of_any_name_serve(geomtact, touched, tmp_path):
     assert geomtact("localize", image, "--prior", name, "--json").stdout.startswith("{")
     film = shutil.copy(image, tmp_path / f"{name}.avi")
     told = geomtact("track", film, "--object", "ball", "--sensor", "gelsight-mini", status=3).stderr
-    assert "a video whose name is not UTF-8 cannot be opened; rename it" in told
+    assert "the name of a video must be UTF-8; rename it" in told
 
 
 def test_no_contact_exits_4_and_writes_its_result(geomtact, tmp_path):

@@ -75,8 +75,8 @@ def test_names_that_leave_the_order_open_bring_a_warning(names, why):
     taken, said = ordered(names)
     assert taken == names
     assert said == (
-        f"the names do not settle the order of the images: {why}; taken is {', '.join(f'{name}.png' for name in names)}; "
-        "to give another, write their paths to standard input, and - for the folder"
+        f"the names do not settle the order of the images: {why}; the order used is "
+        f"{', '.join(f'{name}.png' for name in names)}; for another, give - as the source and write the paths to standard input"
     )
 
 
@@ -136,7 +136,7 @@ NAMES = [f"{k}.png" for k in range(8, 16)]
 @pytest.mark.parametrize("step", [1 / 5, 1, 60])
 def test_files_written_in_another_order_bring_a_warning(tmp_path, rng, step):
     times = np.roll(np.arange(8), 3) * step * rng.uniform(0.99, 1.01)
-    assert "images: 10.png was written after 11.png; taken is 8.png, 9.png" in warned(tmp_path, NAMES, times)
+    assert "images: 10.png was written after 11.png; the order used is 8.png, 9.png" in warned(tmp_path, NAMES, times)
 
 
 @pytest.mark.parametrize(

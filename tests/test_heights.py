@@ -172,7 +172,7 @@ def test_a_prior_that_tells_the_depth_is_held_against_the_whole_press(ball, rng)
 
 def test_simulated_readings_are_localized_as_they_come(tmp_path):
     run = CliRunner().invoke(
-        app, ["simulate", "hex_nut", "--sensor", "gelsight-mini", "--reading", "--n", "1", "--out", str(tmp_path)]
+        app, ["simulate", "hex_nut", "--sensor", "gelsight-mini", "--tactile-image", "--n", "1", "--out", str(tmp_path)]
     )
     assert run.exit_code == 0, run.output
     image, background = (read_image(tmp_path / name) for name in ("hex_nut_1.png", "background.png"))

@@ -153,7 +153,7 @@ def test_parts_by_a_folder_and_by_names(tmp_path):
     assert "pin" in parts_of(str(meshes)) and len(parts_of(str(meshes))) == 10
     with pytest.raises(InputError, match="no mesh in this folder"):
         parts_of(str(tmp_path))
-    with pytest.raises(InputError, match="each part once"):
+    with pytest.raises(InputError, match="each object once"):
         parts_of("pin,pin")
     for name in ("b.stl", "a.ply", "note.txt"):
         (tmp_path / name).touch()
@@ -176,10 +176,10 @@ def test_the_command_line_tells_the_part(drawer, tmp_path, monkeypatch):
     done = CliRunner().invoke(app, [*run, "--out", "out"])
     assert done.exit_code == 0, done.output
     said = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert said["object"]["name"] == "ball" and [part["name"] for part in said["parts"]] == ["ball", "rod"]
+    assert said["object"]["name"] == "ball" and [part["name"] for part in said["candidates"]] == ["ball", "rod"]
     assert "log evidence" in done.stdout
     refused = CliRunner().invoke(app, [*run, "--prior", "out/posterior.npz"])
-    assert refused.exit_code == 2 and "several parts go with images alone" in " ".join(refused.output.split())
+    assert refused.exit_code == 2 and "several objects exclude" in " ".join(refused.output.split())
 
 
 def test_the_study_tells_what_identify_does(drawer):

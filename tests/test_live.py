@@ -53,12 +53,12 @@ def test_the_newest_wins_and_what_came_meanwhile_is_counted():
 
     first = next(frames)
     has_read.acquire()
-    assert (first.image, first.passed_over) == (0, 0)
+    assert (first.image, first.skipped) == (0, 0)
     come(9)
     given = [next(frames)]
     while given[-1].image < 9:  # the last may not have been put down yet
         given.append(next(frames))
-    assert given[-1].image == 9 and sum(frame.passed_over + 1 for frame in given) == 9 and len(given) <= 2
+    assert given[-1].image == 9 and sum(frame.skipped + 1 for frame in given) == 9 and len(given) <= 2
     come(20)
     while given[-1].image < 29:
         given.append(next(frames))
@@ -69,7 +69,7 @@ def test_the_newest_wins_and_what_came_meanwhile_is_counted():
     assert rest[-1].image == 39 and closed == [True]
     images = [frame.image for frame in (first, *given, *rest)]
     assert images == sorted(set(images))
-    assert sum(frame.passed_over + 1 for frame in (first, *given, *rest)) == 40
+    assert sum(frame.skipped + 1 for frame in (first, *given, *rest)) == 40
 
 
 def test_a_source_that_is_left_is_closed():
@@ -86,7 +86,7 @@ def test_a_folder_gives_its_newest_whole_image(tmp_path):
         os.utime(tmp_path / name, (100 - age, 100 - age))
     frames = newest_in(tmp_path)
     first = next(frames)
-    assert first.image == str(tmp_path / "c.png") and first.passed_over == 2
+    assert first.image == str(tmp_path / "c.png") and first.skipped == 2
     write_image(tmp_path / "d.png", np.ones((8, 8), bool))
     assert next(frames).image == str(tmp_path / "d.png"), "the older ones do not come again"
     write_image(tmp_path / "a.png", np.zeros((8, 8), bool))
@@ -157,7 +157,7 @@ def test_the_first_without_contact_is_the_background_of_the_rest(localizer, read
     assert seen == [empty, empty], "a given one is kept"
 
 
-def test_an_image_that_is_broken_is_passed_over_but_the_first_is_not(localizer, capsys):
+def test_an_image_that_is_broken_is_skipped_but_the_first_is_not(localizer, capsys):
     whole = np.zeros((240, 320), bool)
     whole[100:140, 100:160] = True
     broken = np.zeros((3, 3))
@@ -166,7 +166,7 @@ def test_an_image_that_is_broken_is_passed_over_but_the_first_is_not(localizer, 
     assert localize_live(localizer, live([whole, broken, whole]), None, {"effort": "fast"})
     out, err = capsys.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
-    assert [line["frame"] for line in lines] == [1, 3] and "image 2 is passed over" in err
+    assert [line["frame"] for line in lines] == [1, 3] and "image 2 skipped" in err
     assert lines[0]["T"] == lines[1]["T"], "each image is localized by itself"
 
 
@@ -188,17 +188,17 @@ def test_the_command_line(localizer, readings, monkeypatch, tmp_path):
     status, out, _ = run("--camera", "film.avi")
     lines = [json.loads(line) for line in out.splitlines()]
     assert status == (0 if any(line["contact"] for line in lines) else 4)
-    assert sum(line["passed_over"] + 1 for line in lines) == 3
+    assert sum(line["skipped"] + 1 for line in lines) == 3
 
     for args, said in (
         ((), "expected an image, got none"),
-        (("film.avi", "--camera", "0"), "--camera stands in place of images"),
+        (("film.avi", "--camera", "0"), "--camera replaces images"),
         (("--watch",), "--watch: expected one folder, got 0"),
-        ((".", "--watch", "--json"), "--json does not go with --camera and --watch"),
+        ((".", "--watch", "--json"), "--json excludes --camera and --watch"),
     ):
         status, _, text = run(*args)
         assert status == 2 and said in text
     status, _, text = run("film.avi", "--watch")
-    assert status == 3 and "film.avi is no folder" in text
+    assert status == 3 and "--watch film.avi: expected the folder" in text
     status, _, text = run(".")
-    assert status == 3 and "localize the newest with --watch" in text
+    assert status == 3 and "use --watch for the newest" in text

@@ -24,7 +24,16 @@ from geomtact.geometry.mesh_file import load_mesh
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
 from geomtact.report.result import plain, result, to_text
 from geomtact.report.shown import Shown, shown_of
-from geomtact.report.summary import MOTIONS, caution, contact_centre, facts, percent, summaries_of, summarise, told
+from geomtact.report.summary import (
+    MOTIONS,
+    caution,
+    contact_centre,
+    facts,
+    observable_share,
+    percent,
+    summaries_of,
+    summarise,
+)
 from geomtact.report.write import write_all
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
@@ -111,7 +120,8 @@ def test_all_files_are_whole_and_agree(touch, tmp_path):
     assert read == content
     assert read["schema"] == "geomtact/localization/1"
     assert set(read) == {
-        *("schema", "object", "sensor", "frame", "contact", "modes", "entropy_nats", "effective_poses"),
+        *("schema", "object", "sensor", "frame", "contact", "modes", "information_gain_nats"),
+        *("entropy_nats", "effective_poses"),
         *("settings", "versions", "timing_ms", "warnings"),
     }
     assert read["settings"] == {"scorer": "overlap", "temperature": 0.1, "kind": "auto", "seed": 7}
@@ -261,7 +271,7 @@ def test_told_names_the_motions_by_finite_differences(rng):
     scale = np.array([length] * 3 + [1] * 3)
     basis = np.linalg.qr(rng.normal(size=(6, 6)))[0]
     rows, lost = basis[:4], basis[4:]
-    shares = told(FakeMode(T, observable=rows, length=length), about)
+    shares = observable_share(FakeMode(T, observable=rows, length=length), about)
     there, back = se3.transform(np.eye(3), about), se3.transform(np.eye(3), -about)
     carried = [scale * se3.log(back @ T @ se3.exp(step * n / scale) @ se3.inverse(T) @ there) for n in lost]
     untold = np.linalg.qr(np.array(carried).T)[0]
@@ -280,11 +290,11 @@ def test_summary_in_words_and_numbers(rng):
     moved = (T @ se3.exp(xi))[:, :3] @ np.append(centre, 1)
     assert summary.centre_sd_mm == pytest.approx(1e3 * np.sqrt(np.linalg.eigvalsh(np.cov(moved.T))[-1]), rel=0.03)
     flat = FakeMode(np.eye(4), observable=np.eye(6)[[0, 1, 5]])
-    assert summarise(flat, centre).told_in_words() == "fixed: tilt x, tilt y, shift z; not: turn z, shift x, shift y"
+    assert summarise(flat, centre).in_words() == "fixed: tilt x, tilt y, shift z; not: turn z, shift x, shift y"
     half = FakeMode(np.eye(4), observable=np.array([[0, 0, 0, 1, 1, 0]]) / np.sqrt(2))
-    assert summarise(half, centre).told_in_words() == "partly: shift x, shift y; not: tilt x, tilt y, turn z, shift z"
-    assert summarise(FakeMode(T, observable=np.zeros((0, 6))), centre).told_in_words() == "unknown"
-    assert summarise(FakeMode(T, observable=np.eye(6)), centre).told_in_words() == "fixed: all six motions"
+    assert summarise(half, centre).in_words() == "partly: shift x, shift y; not: tilt x, tilt y, turn z, shift z"
+    assert summarise(FakeMode(T, observable=np.zeros((0, 6))), centre).in_words() == "unknown"
+    assert summarise(FakeMode(T, observable=np.eye(6)), centre).in_words() == "fixed: all six motions"
     assert "unknown" in summarise(FakeMode(T, covariance=np.full((6, 6), np.nan)), centre).cells(1)
 
 
@@ -359,12 +369,12 @@ def test_contact_centre_is_the_pressed_spot():
 def test_facts_are_sentences(touch):
     posterior, _, _ = touch
     lines = facts(posterior)
-    assert lines[0].startswith("4.2 nats are known: one part in 67 ")
-    assert re.match("1,23[45] of the grid's 4,000 poses", lines[1])
+    assert lines[0] == "Information gain: 4.2 nats; 1 in 67 of all touching poses remains."
+    assert re.match("1,23[45] of 4,000 grid poses", lines[1])
     assert _said_of(posterior, None) == lines
-    assert _said_of(posterior, "learned") == ["The contact was found in the learned way.", *lines]
+    assert _said_of(posterior, "learned") == ["Method of contact detection: learned.", *lines]
     several = _said_of(posterior, "learned", None, "classical", "learned")
-    assert several == ["The contact was found in the classical and in the learned way.", *lines]
+    assert several == ["Method of contact detection: classical and learned.", *lines]
 
 
 def _said_of(posterior, *methods):
@@ -378,7 +388,7 @@ def test_a_mode_that_holds_little_is_not_believed(touch, tmp_path):
     assert [percent(p) for p in (0.62, 0.0012, 0.0004, 0.0)] == ["62.0 %", "0.1 %", "< 0.1 %", "< 0.1 %"]
     assert caution(summaries_of(posterior, modes)) == caution([]) == []
     weak = [FakeMode(modes[0].T, 0.0003)]
-    warned = ["The part is probably not at mode 1, which holds < 0.1 %."]
+    warned = ["The object is probably not at mode 1, which holds < 0.1 %."]
     assert caution(summaries_of(posterior, weak)) == warned
     write_all(tmp_path, posterior, weak, alone(posterior, simulate), timing_ms={"prepare": 1.23456})
     html = (tmp_path / "report.html").read_text("utf-8")

@@ -46,14 +46,14 @@ def test_the_part_is_drawn_where_the_posterior_says(shown, flat_nut, a_touch):
     turned = Rotation.from_quat(shown._drawn.batched_wxyzs, scalar_first=True).as_matrix()
     assert np.allclose(turned, drawn[:, :3, :3], atol=1e-5)
     assert shown._drawn.visible and shown._mode.visible
-    assert "frame 1" in shown._told.content
+    assert "frame 1" in shown._summary.content
 
 
 def test_without_contact_no_part_is_drawn(shown, flat_nut):
     width, height = flat_nut.sensor.image_size_px
     shown.show(2, flat_nut.localize(np.zeros((height, width), bool), "mask"))
     assert not shown._drawn.visible and not shown._mode.visible
-    assert "no contact" in shown._told.content
+    assert "no contact" in shown._summary.content
 
 
 def test_images_of_every_kind_can_be_shown():

@@ -17,14 +17,44 @@ from geomtact.cli.track import track
 from geomtact.cli.train import train
 from geomtact.cli.view import view
 
+EXAMPLES = """
+[bold]Examples[/bold]
+
+One sensor, an image that 'geomtact simulate' wrote:
+
+  geomtact localize touch.png --out result
+
+Your own mesh in millimetres, with a tactile image:
+
+  geomtact localize touch.png --object part.stl --unit mm --sensor gelsight-mini --background untouched.png
+
+Two sensors that touch the object at the same time:
+
+  geomtact localize a.png b.png --object part.stl --unit mm --sensor gelsight-mini --sensor-poses poses.json
+"""
+SENSOR_POSES = """
+poses.json for two sensors that face each other, 50 mm apart, the first at the world's origin:
+
+  {"T_world_sensor": [[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]], [[1,0,0,0],[0,-1,0,0],[0,0,-1,0.05],[0,0,0,1]]]}
+
+Each 4x4 matrix is row by row and maps sensor coordinates to world coordinates, in metres; they are in the order of the \
+images. Sensor frame: origin at the image centre on the membrane, x right and y down in the image, z from the camera to \
+the object. The world is any frame that the sensors share.
+
+If the sensors differ, add "sensor": ["gelslim", "digit"]. If the matrices are uncertain, add "std_mm": 0.5, "std_deg": 0.2.
+"""
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
-    help="Localize a known part from the shape of one tactile contact: the whole distribution of its pose.",
+    help="Localize an object from tactile images: from its mesh and the image of a contact to the distribution of its pose.",
+    epilog=EXAMPLES
+    + "\n\n'geomtact localize --help' shows the form of poses.json. 'geomtact sensors' lists the sensors.",
 )
-for command in (localize, track, view, prepare, train, simulate, calibrate, sensors, objects, cache):
+app.command(epilog=EXAMPLES + SENSOR_POSES)(one_line_errors(localize))
+for command in (track, view, prepare, train, simulate, calibrate, sensors, objects, cache):
     app.command()(one_line_errors(command))
 app.command("next-touch")(one_line_errors(next_touch))
 

@@ -1,4 +1,4 @@
-"""Several parts, each by a process of its own or by the machines of a Ray cluster."""
+"""Options --jobs and --ray: several objects in parallel, in processes or on the machines of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from geomtact.cli.shell import tell
 
 Jobs = Annotated[
     int | None,
-    typer.Option(min=1, help="How many parts are worked on at a time, each by one core.", show_default=False),
+    typer.Option(min=1, help="Number of objects processed in parallel, one core each.", show_default=False),
 ]
 Ray = Annotated[
     str | None,
-    typer.Option(metavar="ADDRESS", help="Work on the machines of a Ray cluster; auto for the one this belongs to."),
+    typer.Option(metavar="ADDRESS", help="Run on the Ray cluster at this address; auto: this machine's cluster."),
 ]
 Command = Callable[..., None]
 
@@ -30,28 +30,28 @@ def do_all(
     jobs: int | None = None,
     ray: str | None = None,
 ) -> None:
-    """Do ``tasks`` as ``geomtact.batch.run_all`` does, and tell by its name of each that is ``done``, or why it is not.
+    """Do ``tasks`` as ``geomtact.batch.run_all`` does, and print the name of each that is ``done``, or why it is not.
 
     Raises
     ------
     InputError
-        Some are not; the others are.
+        Some failed; the others are done.
     """
     from geomtact.batch import run_all
     from geomtact.errors import InputError, UsageError
 
     if jobs is not None and ray is not None:
-        raise UsageError("--jobs is for this machine, a Ray cluster has its own number of cores; leave out one of them")
+        raise UsageError("--jobs is for this machine and --ray for a cluster; give one of them")
     wrong = []
     together = run_all(work, tasks, min(jobs or os.cpu_count() or 1, len(tasks)), ray)
     for count, (number, error) in enumerate(together, 1):
-        told = done if error is None else f"not {done}: {' '.join(str(error).split())}"
-        tell(f"[{count} of {len(tasks)}] {names[number]}: {told}")
+        outcome = done if error is None else f"not {done}: {' '.join(str(error).split())}"
+        tell(f"[{count} of {len(tasks)}] {names[number]}: {outcome}")
         if error is not None:
             wrong.append(names[number])
     if wrong:
         raise InputError(
-            f"{len(wrong)} of {len(tasks)} parts are not {done}, for the reasons above: {', '.join(wrong)}"
+            f"{len(wrong)} of {len(tasks)} objects are not {done}, for the reasons above: {', '.join(wrong)}"
         )
 
 

@@ -1,4 +1,4 @@
-"""``geomtact calibrate``: presses of one ball become a sensor file whose colours tell heights."""
+"""``geomtact calibrate``: from presses of one ball to a sensor file whose colours measure indentation depth."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ def calibrate(
     presses: Annotated[
         list[Path],
         typer.Argument(
-            metavar="PRESS...", help="Images of one ball, pressed in here and there; or Taxim's table, polycalib.npz."
+            metavar="PRESS...", help="Images of one ball pressed at many places; or Taxim's table, polycalib.npz."
         ),
     ],
-    background: Annotated[Path, typer.Option(help="The same sensor without contact.")],
+    background: Annotated[Path, typer.Option(help="Tactile image of the untouched sensor.")],
     ball_mm: Annotated[float | None, typer.Option("--ball-mm", help="Diameter of the ball.")] = None,
     pitch_mm: Annotated[
         tuple[float, float] | None,
         typer.Option("--pitch-mm", help="Millimetres per pixel on the membrane, along x and along y."),
     ] = None,
     pins: Annotated[
-        Path | None, typer.Option(help="In place of --pitch-mm: image of a square board of pins, pressed in.")
+        Path | None, typer.Option(help="Instead of --pitch-mm: image of a pressed square pin board.")
     ] = None,
     pin_spacing_mm: Annotated[
-        float | None, typer.Option("--pin-spacing-mm", help="From pin to pin of that board.")
+        float | None, typer.Option("--pin-spacing-mm", help="Distance between neighbouring pins of that board.")
     ] = None,
     other_presses: Annotated[
-        Path | None, typer.Option(help="Folder of presses of another ball, which tell how the membrane bulges.")
+        Path | None, typer.Option(help="Folder of presses of another ball, to measure the membrane's curvature.")
     ] = None,
     other_ball_mm: Annotated[float | None, typer.Option("--other-ball-mm", help="Diameter of that ball.")] = None,
     sensor: SensorName = None,
@@ -45,11 +45,11 @@ def calibrate(
     mirror: Mirror = None,
     name: Annotated[str | None, typer.Option(help="Name of the new sensor.")] = None,
     out: Annotated[Path, typer.Option(help="Sensor file to write.")] = Path("sensor.toml"),
-    plot: Annotated[Path | None, typer.Option(help="PNG to write: how well the presses fit.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG to write: the fit of the presses.")] = None,
 ) -> None:
-    """Calibrate a sensor's colours from presses of a ball of known diameter, so that its readings tell heights.
+    """Calibrate a sensor's colours from presses of a ball of known diameter, so that its images measure indentation depth.
 
-    Give a pitch, an image of a pin board, or a sensor whose geometry is kept. A dozen presses all over the window take
+    Give --pitch-mm, --pins or --sensor, whose geometry is kept. Use a dozen presses, spread over the window. They take
     half a minute.
     """
     from geomtact.report.calibration_plot import draw_calibration
@@ -58,9 +58,9 @@ def calibrate(
     mounting = Mounting(rotate, mirror)
     for path, suffix in ((out, ".toml"), (plot, ".png")):
         if path is not None and path.suffix != suffix:
-            raise UsageError(f"{path}: expected a name that ends in {suffix}; give one")
+            raise UsageError(f"{path}: expected a file name that ends in {suffix}; rename it")
         if path is not None and not path.parent.is_dir():
-            raise UsageError(f"{path}: there is no folder {path.parent}; make it, or give another")
+            raise UsageError(f"{path}: no folder {path.parent}; create it, or give another")
     presses = [path for path in presses if path.absolute() != background.absolute()] or presses  # *.png names it, too
     folder = next((path for path in presses if path.is_dir()), None)
     if folder is not None:
@@ -70,28 +70,24 @@ def calibrate(
     for option, least, value in lengths:
         if value is not None and not least < value < 1000 * least:
             raise UsageError(
-                f"{option} {value:g}: expected millimetres, {least:g} to {1000 * least:g}; of metres give 1000 times as many"
+                f"{option} {value:g}: expected {least:g} to {1000 * least:g} millimetres; multiply metres by 1000"
             )
     pitch = None if pitch_mm is None else (1e-3 * pitch_mm[0], 1e-3 * pitch_mm[1])
     if pins is not None or pin_spacing_mm is not None:
         if pins is None or pin_spacing_mm is None or pitch is not None:
-            raise UsageError(
-                "--pins and --pin-spacing-mm belong together, and stand in place of --pitch-mm; give these two"
-            )
+            raise UsageError("--pins and --pin-spacing-mm belong together and replace --pitch-mm; give these two alone")
         pitch = _pitch_of(pins, background, 1e-3 * pin_spacing_mm)
         if _quarter_turned(sensor, mounting):
             pitch = pitch[::-1]
     if (other_presses is None) != (other_ball_mm is None):
         raise UsageError("--other-presses and --other-ball-mm belong together; give both")
     if other_presses is not None and not other_presses.is_dir():
-        raise UsageError(f"--other-presses {other_presses}: expected the folder of another ball's presses; give it")
+        raise UsageError(f"--other-presses {other_presses}: expected a folder with presses of another ball; give it")
     if presses[0].suffix == ".npz":
         if len(presses) > 1 or ball_mm is not None or plot is not None or other_presses is not None:
-            raise UsageError(f"{presses[0]}: a table of Taxim stands alone; leave out other presses, balls and --plot")
-        if mounting.said:
-            raise UsageError(
-                f"{presses[0]}: a table of Taxim is of images as they were taken for it; leave --rotate and --mirror out"
-            )
+            raise UsageError(f"{presses[0]}: a table of Taxim needs no presses, balls or --plot; leave these out")
+        if mounting.is_given:
+            raise UsageError(f"{presses[0]}: a table of Taxim fits unturned images; leave --rotate and --mirror out")
         _write(_of_taxim(presses[0], background, pitch, sensor, name or out.stem), sensor, out)
         return
     if ball_mm is None:
@@ -115,11 +111,11 @@ def calibrate(
 def _write(calibrated: Sensor, geometry: str | None, out: Path) -> None:
     """Write a sensor's file; ``geometry`` is whose it has."""
     write_text(out, calibrated.to_toml())
-    typer.echo(f"wrote {out}: geomtact.contact_height(image, background, {str(out)!r}) tells heights")
+    typer.echo(f"wrote {out}; geomtact.contact_height(image, background, {str(out)!r}) returns depth maps")
     if geometry is None:
         typer.echo(
-            "its geometry is a camera with parallel rays before a flat gel, 2 mm deep; if you know better, "
-            "write a sensor file and calibrate again with --sensor"
+            "assumed: parallel camera rays, a flat gel, 2 mm deep. For another geometry write a sensor file and calibrate "
+            "again with --sensor"
         )
 
 
@@ -135,11 +131,11 @@ def _quarter_turned(sensor: str | None, mounting: Mounting) -> bool:
 def _mounted(
     sensor: str | None, background: Path, pitch: tuple[float, float] | None, mounting: Mounting
 ) -> Sensor | str | None:
-    """The sensor whose geometry to keep, mounted as the command line says; where it names none, one of the background's size."""
+    """The sensor whose geometry to keep, mounted as given; where none is named, one of the background's size."""
     from geomtact.sensing.image_file import read_image
     from geomtact.sensing.sensor import Sensor
 
-    if not mounting.said:
+    if not mounting.is_given:
         return sensor
     if sensor is not None:
         return mounting.of(sensor, masks=False)
@@ -153,7 +149,7 @@ def _mounted(
 def _of_taxim(
     table: Path, background: Path, pitch: tuple[float, float] | None, sensor: str | None, name: str
 ) -> Sensor:
-    """The sensor whose colours a table of Taxim tells."""
+    """The sensor with the colour calibration of a table of Taxim."""
     from dataclasses import replace
 
     from geomtact.sensing.change import as_unit_rgb
@@ -168,48 +164,45 @@ def _of_taxim(
     base = Sensor.load(sensor) if sensor is not None else Sensor(name, (width, height), pitch or (0.0, 0.0), 0.0, 2e-3)
     if base.image_size_px != (width, height):
         raise UsageError(
-            f"--sensor {sensor}: has {base.image_size_px[0]} x {base.image_size_px[1]} px, the background {width} x {height}; "
-            "name the sensor that took it"
+            f"--sensor {sensor}: expected a background of {base.image_size_px[0]} x {base.image_size_px[1]} px, got "
+            f"{width} x {height}; name the sensor that took it"
         )
     if base.turned:
         raise UsageError(
-            f"--sensor {sensor}: its camera is turned, and a table of Taxim is of images as they were taken; name one that is not"
+            f"--sensor {sensor}: its camera is turned, but a table of Taxim fits unturned images; name another sensor"
         )
     colour = replace(colours_of_taxim(table, (height, width)), background=kept(as_unit_rgb(background, "background")))
     typer.echo(
-        f"slopes of up to 30 degrees that the table shows are told to {colour.slope_rms:.3f} rms (1 is 45 degrees)"
+        f"error of slopes up to 30 degrees in the table: {colour.slope_rms:.3f} rms (a slope of 1 is 45 degrees)"
     )
     return replace(base, name=name, pixel_pitch=pitch or base.pixel_pitch, colour=colour)
 
 
 def _print_membrane(found: Calibrated, ball_mm: float, folder: Path, other_mm: float, background: Path) -> None:
-    """Print how the membrane bulges, by presses of another ball."""
+    """Print the membrane's curvature, measured with presses of another ball."""
     from geomtact.cli.frames import listed
     from geomtact.sensing.calibrate import calibrated
     from geomtact.sensing.membrane import membrane_curvature
 
     second = calibrated(sorted(listed(folder)), 1e-3 * other_mm, background, sensor=found.sensor)
     curvature, std = membrane_curvature(found, 1e-3 * ball_mm, second, 1e-3 * other_mm)
-    said = f"bulges by 1/{1e3 / curvature:.0f} mm" if curvature > 2 * std else "shows no bulge"
-    typer.echo(
-        f"  membrane              {said}: a curvature of {1e-3 * curvature:.4f} 1/mm, give or take {1e-3 * std:.4f}"
-    )
+    typer.echo(f"  membrane              curvature {1e-3 * curvature:.4f} ± {1e-3 * std:.4f} 1/mm")
     if curvature > 2 * std:
-        typer.echo(
-            f"  (membrane_radius_mm = {1e3 / curvature:.0f} in a sensor file that --sensor names takes that into account)"
-        )
+        typer.echo(f"  (to use it, set membrane_radius_mm = {1e3 / curvature:.0f} in the file of --sensor)")
+    else:
+        typer.echo("  (the membrane is flat within that uncertainty)")
 
 
 def _pitch_of(pins: Path, background: Path, spacing: float) -> tuple[float, float]:
-    """The pitch [m] that an image of a pin board tells, which is printed."""
+    """The pixel pitch [m] measured with an image of a pin board; it is printed."""
     from geomtact.sensing.image_file import read_image
     from geomtact.sensing.pins import pixel_pitch_of_pins
 
     board = pixel_pitch_of_pins(read_image(pins), read_image(background), spacing)
     x, y = 1e3 * board.pixel_pitch[0], 1e3 * board.pixel_pitch[1]
     typer.echo(
-        f"{len(board.pins)} pins: {x:.4f} x {y:.4f} mm a pixel in the middle, give or take {100 * max(board.std):.1f} %; "
-        f"at the outermost pins {100 * board.stretch:.0f} % less"
+        f"{len(board.pins)} pins: pixel pitch {x:.4f} x {y:.4f} mm ± {100 * max(board.std):.1f} % in the middle; "
+        f"{100 * board.stretch:.0f} % less at the outermost pins"
     )
     return board.pixel_pitch
 
@@ -221,10 +214,10 @@ def _print(found: Calibrated, ball_mm: float) -> None:
     assert colour is not None
     low, middle, high = np.nanquantile(mm, [0.25, 0.5, 0.75])
     typer.echo(
-        f"{len(mm)} presses of {len(mm) + len(found.left_out)}; each measured by a table fitted to the others:\n"
-        f"  the ball's diameter   {middle:.2f} mm (half of the presses {low:.2f} to {high:.2f}), {ball_mm:g} was said:\n"
-        "                        how well the presses agree; a wrong --ball-mm does not show\n"
-        f"  slopes                off by {colour.slope_rms:.3f} rms (1 is 45 degrees)\n"
-        f"  heights               off by {1e3 * colour.height_rms:.3f} mm rms where nothing touches\n"
-        f"  contact               shows where the gel is pressed in by {1e3 * colour.contact_depth:.2f} mm"
+        f"{len(mm)} of {len(mm) + len(found.left_out)} presses used; each measured with a table fitted to the others:\n"
+        f"  ball diameter         {middle:.2f} mm (half of the presses: {low:.2f} to {high:.2f}), given {ball_mm:g} mm;\n"
+        "                        this checks that the presses agree, not that --ball-mm is right\n"
+        f"  slope error           {colour.slope_rms:.3f} rms (a slope of 1 is 45 degrees)\n"
+        f"  depth error           {1e3 * colour.height_rms:.3f} mm rms where nothing touches\n"
+        f"  contact threshold     {1e3 * colour.contact_depth:.2f} mm indentation depth"
     )

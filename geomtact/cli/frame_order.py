@@ -41,8 +41,8 @@ def doubt(paths: list[Path]) -> str | None:
         return None
     shown = ", ".join(path.name for path in paths[:_SHOWN]) + (", ..." if len(paths) > _SHOWN else "")
     return (
-        f"the names do not settle the order of the images: {why}; taken is {shown}; to give another, write their paths to "
-        "standard input, and - for the folder"
+        f"the names do not settle the order of the images: {why}; the order used is {shown}; for another, give - as "
+        "the source and write the paths to standard input"
     )
 
 

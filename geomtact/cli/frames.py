@@ -1,4 +1,4 @@
-"""Where sequences of images come from: folders, videos, cameras, names on standard input; all of them in order, or the newest."""
+"""Sources of image sequences: folders, videos, cameras, paths on standard input; all images in order, or the newest."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class Frame:
     Attributes
     ----------
     image : path, or (H, W, 3) RGB
-    time : [s] of a video, or since 1970 from a camera; None where the source tells none
-    passed_over : images that came since the one before, and are not given
+    time : [s] of a video, or since 1970 from a camera; None where the source has none
+    skipped : images that came since the one before, and are not given
     """
 
     image: Any
     time: float | None = None
-    passed_over: int = 0
+    skipped: int = 0
 
 
 def all_frames(
@@ -74,14 +74,14 @@ def all_frames(
         return camera_frames(source, sensor)
     if not path.is_file():
         raise InputError(
-            f"{path}: no such folder, video or camera; give a folder of images, a video, a camera's number, or - for paths"
+            f"{path}: no such folder, video or camera; give a folder of images, a video, the number of a camera, or -"
         )
     if path.suffix.lower() in _IMAGES:
         raise UsageError(f"{path}: is one image; give its folder, or use 'geomtact localize'")
     frames = _filmed(path, masks)
     first = next(frames, None)
     if first is None:
-        raise InputError(f"{path}: holds no image; give a whole video, or a folder of images")
+        raise InputError(f"{path}: no image in this video; give another, or a folder of images")
     check(first.image)
     return chain([first], frames)
 
@@ -103,7 +103,7 @@ def newest_in(folder: Path) -> Generator[Frame, None, None]:
         before = now
         if whole:
             given.update((path, now[path]) for path in came[: whole[-1] + 1])
-            yield Frame(str(came[whole[-1]]), passed_over=whole[-1])
+            yield Frame(str(came[whole[-1]]), skipped=whole[-1])
         else:
             time.sleep(_POLL)
 
@@ -131,7 +131,7 @@ def camera_frames(source: str, sensor: Sensor | None = None) -> Generator[Frame,
     capture = cv2.VideoCapture(int(source) if source.isdigit() else _name_for_opencv(source))
     if not capture.isOpened():
         raise InputError(
-            f"camera {source}: cannot be opened; give the number of a camera of this computer, its device, or a URL"
+            f"camera {source}: cannot be opened; give the number of a camera on this computer, its device, or a URL"
         )
     if size is not None:
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
@@ -139,7 +139,7 @@ def camera_frames(source: str, sensor: Sensor | None = None) -> Generator[Frame,
 
     first = [_next_rgb(capture)]
     if first[0] is None:
-        raise InputError(f"camera {source}: gives no image; does another program use it?")
+        raise InputError(f"camera {source}: no image; close other programs that use it")
     if sensor is not None:
         _check_camera(first[0], sensor, source)
 
@@ -151,13 +151,13 @@ def camera_frames(source: str, sensor: Sensor | None = None) -> Generator[Frame,
 
 
 def _check_camera(image: Any, sensor: Sensor, source: str) -> None:
-    """Refuse a camera's image (H, W, 3) of another size than the sensor's; say whether it is turned."""
+    """Refuse a camera's image (H, W, 3) of another size than the sensor's; report whether it is turned."""
     from geomtact.sensing.change import check_size
 
     check_size(sensor.upright(sensor.driven(image)), sensor, f"camera {source}")
     if sensor.straight_from_camera(image):
         tell(
-            f"camera {source}: {image.shape[1]} x {image.shape[0]} px are turned by {sensor.driver_rotation_deg} degrees "
+            f"camera {source}: turning {image.shape[1]} x {image.shape[0]} px by {sensor.driver_rotation_deg} degrees "
             f"counter-clockwise, as the driver of {sensor.name} does"
         )
 
@@ -190,8 +190,8 @@ def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) ->
                 changed.wait_for(lambda: held or ended)
                 if not held:
                     return
-                (image, read_at), passed_over, given = held.pop(), came - given - 1, came
-            yield Frame(image, read_at, passed_over)
+                (image, read_at), skipped, given = held.pop(), came - given - 1, came
+            yield Frame(image, read_at, skipped)
     finally:
         ended = True
         reader.join(2)  # else it would be within OpenCV still when Python ends
@@ -245,7 +245,7 @@ def _filmed(path: Path, masks: bool) -> Iterator[Frame]:
 
     video = cv2.VideoCapture(_name_for_opencv(str(path)))
     if not video.isOpened():
-        raise InputError(f"{path}: cannot be read as a video; give one that OpenCV reads, or a folder of images")
+        raise InputError(f"{path}: OpenCV cannot read this video; give another, or a folder of images")
 
     def frames() -> Iterator[Frame]:
         while (image := _next_rgb(video)) is not None:
@@ -264,7 +264,7 @@ def _name_for_opencv(name: str) -> str:
     InputError
     """
     if name != printable(name):
-        raise InputError(f"{name}: a video whose name is not UTF-8 cannot be opened; rename it")
+        raise InputError(f"{name}: the name of a video must be UTF-8; rename it")
     return name
 
 

@@ -1,4 +1,4 @@
-"""``geomtact sensors``, ``objects`` and ``cache``: what there is."""
+"""``geomtact sensors``, ``objects`` and ``cache``: lists of what is bundled and cached."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def sensors() -> None:
 
 
 def objects() -> None:
-    """List the bundled parts."""
+    """List the bundled objects."""
     import numpy as np
 
     from geomtact.geometry.catalogue import catalogue
@@ -42,22 +42,22 @@ def objects() -> None:
         if symmetry == "discrete":
             symmetry = f"{len(entry.symmetry.elements)}-fold"
         rows.append([name, entry.unit, size, symmetry, entry.licence, entry.description])
-    print_table(["part", "unit", "size [mm]", "symmetry", "licence", "what it is"], rows)
+    print_table(["object", "unit", "size [mm]", "symmetry", "licence", "description"], rows)
 
 
 def cache(
-    clear: Annotated[bool, typer.Option("--clear", help="Remove all cached indexes.")] = False,
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all cached contact indexes.")] = False,
     limit_gb: Annotated[
         float | None,
-        typer.Option("--limit-gb", min=0, help="Remove those used longest ago until at most this is left."),
+        typer.Option("--limit-gb", min=0, help="Remove the least recently used ones until at most this is left."),
     ] = None,
     remove: Annotated[
         list[str] | None,
-        typer.Option("--remove", metavar="PART|KEY", help="Remove those of a part, or of a key. May be repeated."),
+        typer.Option("--remove", metavar="OBJECT|KEY", help="Remove those of an object or a key. May be repeated."),
     ] = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """List the cached indexes; remove some, or all."""
+    """List the cached contact indexes; remove some or all of them."""
     import time
 
     from geomtact.contact_space import store
@@ -79,7 +79,7 @@ def cache(
     for e in entries:
         size, used = f"{e.size_bytes / 1e6:.0f}", _when(time.time() - e.last_used)
         rows.append([e.key[:12], e.object, e.sensor, _sides(e.approach), f"{e.poses:,}", size, used])
-    print_table(["key", "part", "sensor", "approach", "poses", "MB", "last used"], rows, right=["poses", "MB"])
+    print_table(["key", "object", "sensor", "approach", "poses", "MB", "last used"], rows, right=["poses", "MB"])
     typer.echo(f"{_count(len(entries))}, {sum(e.size_bytes for e in entries) / 1e6:.0f} MB in {folder}")
 
 

@@ -1,4 +1,4 @@
-"""What is printed of each image of a sequence: a line of JSON."""
+"""The JSON line that is printed for each image of a sequence."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ if TYPE_CHECKING:
 
 
 def line_of(n: int, posterior: Posterior) -> dict[str, Any]:
-    """Of the ``n``-th image: whether it shows contact (None if it could not be read), and the first mode."""
+    """The ``n``-th image's contact (None if it could not be read), information and first mode."""
     from geomtact.se3 import quat_xyzw
 
     first = next(iter(posterior.modes(1)), None)
     return {
         "frame": n,
         "contact": posterior.contact if posterior.observations else None,
+        "information_gain_nats": -posterior.entropy_nats if posterior.contact else None,
         "entropy_nats": posterior.entropy_nats if posterior.contact else None,
         "probability": None if first is None else first.probability,
         "T": None if first is None else first.T,

@@ -1,4 +1,4 @@
-"""One image after the other localized, each by itself, as they come: the newest whenever the one before is done."""
+"""Localize a live source image by image, each on its own: always the newest one."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 def localize_live(
     localizer: Localizer, frames: Generator[Frame, None, None], background: Any, options: dict[str, Any]
 ) -> bool:
-    """Print a line of JSON for each of the ``frames``, until there are no more or Ctrl-C; whether any showed contact.
+    """Print a JSON line for each of the ``frames``, until there are no more or Ctrl-C; whether any showed contact.
 
-    Without a ``background``, the first reading that shows none is that of those after it. An image that cannot be read is told,
-    and passed over, but for the first.
+    Without a ``background``, the first tactile image without contact serves as that of the following ones. An image that
+    cannot be read brings a warning and is skipped, unless it is the first.
     """
     touched = False
     try:
@@ -34,7 +34,7 @@ def localize_live(
             except InputError as error:
                 if n == 1:
                     raise
-                tell(f"warning: image {n} is passed over: {error}")
+                tell(f"warning: image {n} skipped: {error}")
                 continue
             touched |= posterior.contact
             if background is None and not posterior.contact and posterior.observation.kind == "reading":
@@ -43,7 +43,7 @@ def localize_live(
             own = {
                 "image": frame.image if isinstance(frame.image, str) else None,
                 "time": frame.time,
-                "passed_over": frame.passed_over,
+                "skipped": frame.skipped,
             }
             typer.echo(to_line(line | own | {"ms": 1e3 * (time.perf_counter() - began)}))
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""``geomtact localize``: from one image to the distribution of the part's pose."""
+"""``geomtact localize``: from one image, or one per sensor, to the distribution of the object's pose."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def localize(
         list[Path] | None,
         typer.Argument(
             metavar="IMAGE...",
-            help="Contact mask, height map or RGB reading; several of them with --sensor-poses; with --watch, a folder.",
+            help="Contact mask, depth map or tactile image; one per sensor with --sensor-poses; a folder with --watch.",
             show_default=False,
         ),
     ] = None,
@@ -61,7 +61,7 @@ def localize(
         str | None,
         typer.Option(
             "--object",
-            help="Part (see 'geomtact objects') or mesh file; if it may be one of several, a folder, or names with commas.",
+            help="Object (see 'geomtact objects') or mesh file. For object identification: names with commas, or a folder.",
         ),
     ] = None,
     unit: Unit = None,
@@ -69,17 +69,15 @@ def localize(
     kind: KindName = Kind.auto.value,
     background: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="Image of the untouched sensor, for readings; of several images one for all, or one for each."
-        ),
+        typer.Option(help="Tactile image of the untouched sensor. Repeat the option to give one for each image."),
     ] = None,
     sensor_poses: Annotated[
         Path | None,
         typer.Option(
-            help="JSON of where each sensor is in the world: T_world_sensor, a 4x4 for each image, in metres."
+            help="Sensor extrinsics: JSON with T_world_sensor, a 4x4 matrix for each image, in metres. See below."
         ),
     ] = None,
-    prior: Annotated[Path | None, typer.Option(help="posterior.npz of what is known before, or its folder.")] = None,
+    prior: Annotated[Path | None, typer.Option(help="Prior: posterior.npz of earlier touches, or its folder.")] = None,
     approach: Approaches = None,
     effort: EffortName = None,
     scorer: ScorerName = None,
@@ -89,33 +87,28 @@ def localize(
     camera: Annotated[
         str | None,
         typer.Option(
-            help="In place of images: number, device or URL of a camera. A line of JSON for its newest image."
+            help="Instead of images: number, device or URL of a camera. Prints a JSON line for its newest image, repeatedly."
         ),
     ] = None,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="The same for the newest image in a folder that is being filled.")
-    ] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="The same for the newest image in a folder.")] = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder for result.json, posterior.npz, report.html and report.png.")
     ] = None,
     report: Annotated[
         str | None,
-        typer.Option(
-            metavar="|".join(Report), help="Which report goes into --out; both by default.", show_default=False
-        ),
+        typer.Option(metavar="|".join(Report), help="Report to write into --out, both by default.", show_default=False),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print result.json, and nothing else, to standard output.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print only result.json to standard output.")] = False,
     max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Localize a part from one image, or from those of several sensors: print the most probable poses and write a report.
+    """Localize an object from one image, or one image per sensor: print the most probable poses and write a report.
 
-    With --camera or --watch, one image after the other by itself, until Ctrl-C; images that come meanwhile are passed over, and
-    the first without contact serves as background if none is given.
+    Options that you leave out come from the nearest geomtact.toml (this folder or above), then from the image's metadata.
 
-    What is not given is taken from the nearest geomtact.toml (this folder or above), then from the image's metadata.
+    --camera and --watch localize the newest image, again and again, until Ctrl-C. Images in between are skipped. Without
+    --background, the first image without contact serves as background.
+
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in the image.
     """
     from geomtact.cli.parts import parts_of
@@ -126,7 +119,7 @@ def localize(
     if report is not None:
         check_name("report", report, Report)
         if out is None and report != Report.none:
-            raise UsageError("--report needs --out, the folder that it is written into")
+            raise UsageError("--report needs --out, the folder to write into; give it")
     prior = prior and posterior_file(prior, "--prior")
     images = images or []
     live = camera is not None or watch
@@ -148,11 +141,11 @@ def localize(
     parts = parts_of(values["object"])
     if len(parts) > 1 and (live or prior is not None):
         raise UsageError(
-            "--object: several parts go with images alone, not with --camera, --watch or --prior; give one of them"
+            "--object: several objects exclude --camera, --watch and --prior; give one object, or leave these out"
         )
     sides = approach_from(approach)
     if len(parts) > 1 and sides:
-        raise UsageError("--approach: the sides of one part; give one part by --object")
+        raise UsageError("--approach needs exactly one object; give one by --object")
     if len(parts) == 1:
         values["object"] = parts[0]
 
@@ -169,7 +162,7 @@ def localize(
     for image, told, used in zip(images, metadata, of_each, strict=True):
         _doubt(image, told, parts[0] if len(parts) == 1 else None, used)
     if len(parts) > 1 and found.foreign:
-        tell("warning: what is shown is unlike all of the parts: is it another one?")
+        tell("warning: the contact is out-of-distribution for every candidate: it may be of another object")
     for warning in found.posterior.warnings:
         tell(f"warning: {warning}")
     _give(asked, found, took, out, _reports(report), as_json)
@@ -179,12 +172,12 @@ def localize(
 
 
 def _doubt(image: Path, told: Mapping[str, Any], part: str | None, sensor: str | None) -> None:
-    """Say where an image's metadata name another part or sensor than it is localized with."""
+    """Warn where an image's metadata name another object or sensor than it is localized with."""
     from geomtact.files import printable
 
     for word, made, used in (("of", told.get("geomtact:object"), part), ("with", told.get("geomtact:sensor"), sensor)):
         if made and used and Path(made).stem != printable(Path(used).stem):
-            tell(f"warning: {image} was made {word} {made}, as its metadata says, and is localized on {used}")
+            tell(f"warning: {image} was made {word} {made} by its metadata, but is localized {word} {used}")
 
 
 @dataclass(frozen=True)
@@ -234,7 +227,7 @@ def _follow(asked: _Asked, camera: str | None) -> None:
     from geomtact.cli.frames import camera_frames, newest_in
     from geomtact.cli.live import localize_live
 
-    # a camera that is not there is told before minutes go into an index
+    # a missing camera is reported before minutes go into an index
     sensor = asked.values["sensor"] and asked.mounting.of(asked.values["sensor"])
     frames = newest_in(asked.images[0]) if camera is None else camera_frames(camera, sensor)
     options = {"kind": asked.kind, "prior": asked.prior, "effort": asked.values["effort"], "seed": asked.seed}
@@ -256,7 +249,7 @@ def _identified(asked: _Asked, parts: Sequence[str | None], placed: SensorPoses 
     backgrounds = asked.backgrounds or [values["background"]] * len(images)
     for image, gel, background in zip(images, gels, backgrounds, strict=True):
         if gel is not None:
-            # a bad image is told before minutes go into an index
+            # a bad image is reported before minutes go into an index
             read_observation(image, asked.mounting.of(gel), asked.kind, background)
     frame = "sensor" if placed is None else "world"
     took, units = 0.0, dict(zip(parts, units_of(parts, values["unit"]), strict=True))
@@ -322,20 +315,19 @@ def _give(
         typer.echo(to_text(content), nl=False)
     else:
         if candidates:
-            _print_parts(found)
+            _print_candidates(found)
         _print(posterior, modes, out, reports)
 
 
 def _without_contact(asked: _Asked, kind: str) -> str:
-    """What is said where nothing is felt; ``kind`` of what was read."""
+    """The message without contact; ``kind`` of the image as it was read."""
     where = "the image" if len(asked.images) == 1 else f"any of the {len(asked.images)} images"
-    advice = f"it was taken for a {kind}; give a --background, or say what it is with --kind"
+    what = {"reading": "a tactile image", "height": "a depth map"}.get(kind, "a mask")
+    advice = f"it was read as {what}; give --background, or another --kind"
     if kind == "mask":
-        advice = "a mask's contact is what is not 0; look whether it is the right file, and touch more firmly"
+        advice = "contact is where a mask is not 0; check the file, or touch more firmly"
     elif asked.values["background"] is not None:
-        advice = (
-            "nothing stands out of the --background; look whether that is of the untouched gel, and touch more firmly"
-        )
+        advice = "it equals the --background; check that this shows the untouched sensor, or touch more firmly"
     return f"no contact found in {where}; {advice}"
 
 
@@ -347,12 +339,12 @@ def _check_images(images: list[Path], sensor_poses: Path | None) -> None:
     UsageError, InputError
     """
     if not images:
-        raise UsageError("expected an image, got none; give one, or a folder and --watch, or --camera 0")
+        raise UsageError("expected an image, got none; give one, a folder with --watch, or --camera 0")
     for image in images:
         if image.is_dir():
             raise InputError(
-                f"{image}: is a folder; give the images in it, localize the newest with --watch, or follow them as a sequence "
-                "with 'geomtact track'"
+                f"{image}: expected an image, got a folder; give the images in it, use --watch for the newest, or "
+                "'geomtact track' for a sequence"
             )
     if sensor_poses is None and len(images) > 1:
         raise UsageError(f"{len(images)} images need --sensor-poses FILE.json; or localize them one at a time")
@@ -366,23 +358,23 @@ def _check_live(images: list[Path], camera: str | None, watch: bool, unsuited: l
     UsageError, InputError
     """
     if camera is not None and (images or watch):
-        raise UsageError("--camera stands in place of images and of --watch; give one of them")
+        raise UsageError("--camera replaces images and --watch; give one of them")
     if watch and len(images) != 1:
         raise UsageError(f"--watch: expected one folder, got {len(images)}")
     if watch and not images[0].is_dir():
-        raise InputError(f"--watch: {images[0]} is no folder; give the one that is being filled")
+        raise InputError(f"--watch {images[0]}: expected the folder that receives images; give it")
     if unsuited:
         raise UsageError(
-            f"{unsuited[0]} does not go with --camera and --watch, which print a line of JSON an image; leave it"
+            f"{unsuited[0]} excludes --camera and --watch, which print a JSON line per image; leave it out"
         )
 
 
-def _print_parts(found: Identification) -> None:
+def _print_candidates(found: Identification) -> None:
     rows = [
         [c.name, f"{100 * c.probability:.1f} %", f"{c.log_evidence:.1f}", "yes" if c.unlike else ""]
         for c in found.candidates
     ]
-    print_table(("part", "probability", "log evidence", "unlike"), rows, ("probability", "log evidence"))
+    print_table(("object", "probability", "log evidence", "outlier"), rows, ("probability", "log evidence"))
 
 
 def _reports(asked: str | None) -> list[str]:

@@ -24,22 +24,20 @@ _KEYS = ("T_world_sensor", "travel", "cost", "probe")
 
 def next_touch(
     posterior: Annotated[
-        Path, typer.Argument(help="posterior.npz of what is known now, or its folder.", show_default=False)
+        Path, typer.Argument(help="Current posterior: posterior.npz, or its folder.", show_default=False)
     ],
     actions: Annotated[
-        Path | None, typer.Option(help="JSON with the touches and probes to choose from; else some all round.")
+        Path | None, typer.Option(help="JSON of the touches and probes to rank. Default: touches from all around.")
     ] = None,
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for next_touch.json and next_touch.png.")] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print next_touch.json, and nothing else, to standard output.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print only next_touch.json to standard output.")] = False,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Say which touch is expected to tell most about the pose, for its cost.
+    """Rank the next touches by their expected information gain about the pose per cost.
 
-    Actions are in the posterior's frame, in metres: {"actions": LIST}, each {"T_world_sensor": 4x4, "travel": 0.1, "cost": 1}
-    or {"probe": {"point": XYZ, "direction": XYZ}}.
+    Actions are in the posterior's frame, in metres: {"actions": LIST}. Each is {"T_world_sensor": 4x4, "travel": 0.1,
+    "cost": 1} or {"probe": {"point": XYZ, "direction": XYZ}}.
     """
     from geomtact.inference.posterior import Posterior
     from geomtact.planning import next_touch as planning
@@ -60,13 +58,12 @@ def next_touch(
         typer.echo(to_text(content), nl=False)
         return
     typer.echo(f"{known.mesh.name} on {known.sensor.name}, {known.frame} frame; {len(ranked)} actions")
-    headings = ["", "action", "from x, y, z [mm]", "along x, y, z", "nats", "discards", "meets it", "cost"]
-    print_table(
-        headings, [_row(k + 1, a) for k, a in enumerate(ranked[:_FIRST])], ["", "nats", "discards", "meets it", "cost"]
-    )
+    right = ["", "expected gain [nats]", "discarded", "P(contact)", "cost"]
+    headings = [right[0], "action", "from x, y, z [mm]", "along x, y, z", *right[1:]]
+    print_table(headings, [_row(k + 1, a) for k, a in enumerate(ranked[:_FIRST])], right)
     if note is not None:
         typer.echo(note)
-    typer.echo(f"written: {out}/next_touch.json and .png" if out else "for whole poses and a picture, give --out DIR")
+    typer.echo(f"written: {out}/next_touch.json and .png" if out else "for full poses and a figure, give --out DIR")
 
 
 def read_actions(path: Path) -> list[Touch | Probe]:
@@ -92,7 +89,7 @@ def read_actions(path: Path) -> list[Touch | Probe]:
             f'{path}: expected JSON {{"actions": [...]}} with touches and probes; see docs/formats.md'
         ) from None
     if not entries:
-        raise InputError(f"{path}: no actions to choose from; add some, or leave --actions out for touches all round")
+        raise InputError(f"{path}: no actions; add some, or leave --actions out for touches from all around")
     found = []
     for number, entry in enumerate(entries, 1):
         try:

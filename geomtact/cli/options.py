@@ -29,16 +29,16 @@ class Effort(StrEnum):
     exact = "exact"
 
 
-Unit = Annotated[str | None, typer.Option("--unit", help="Unit of a mesh file without one: mm, cm, m or inch.")]
+Unit = Annotated[str | None, typer.Option("--unit", help="Unit of a mesh file that states none: mm, cm, m or inch.")]
 ScorerName = Annotated[
-    str | None, typer.Option("--scorer", help="How contacts are compared: a score by name, or weights (.safetensors).")
+    str | None, typer.Option("--scorer", help="Score that compares contacts: its name, or its weights (.safetensors).")
 ]
 MaxPoses = Annotated[
     int | None,
     typer.Option(
         "--max-poses",
         min=1000,
-        help="About how many poses; plane faces add up to a quarter, on plates three quarters. 1.2 million by default.",
+        help="Number of poses in the contact index, 1.2 million by default. Plane faces add up to 75 %.",
         show_default=False,
     ),
 ]
@@ -47,20 +47,27 @@ Approaches = Annotated[
     typer.Option(
         "--approach",
         metavar="X,Y,Z[:DEGREES]",
-        help="Side that is touched, as the direction from the part towards the sensor in the part's frame: exactly that face, or "
-        "within so many degrees of it. May be repeated.",
+        help="Known contact face, as the direction from the object to the sensor in the object's frame. With DEGREES, every "
+        "direction within that angle. May be repeated.",
         show_default=False,
     ),
 ]
-SensorName = Annotated[str | None, typer.Option("--sensor", help="Name (see 'geomtact sensors') or TOML file.")]
-KindName = Annotated[str, typer.Option("--kind", metavar="|".join(Kind), help="What the images are.")]
-Background = Annotated[Path | None, typer.Option("--background", help="Image of the untouched sensor, for readings.")]
+SensorName = Annotated[str | None, typer.Option("--sensor", help="Sensor (see 'geomtact sensors') or TOML file.")]
+KindName = Annotated[
+    str,
+    typer.Option(
+        "--kind",
+        metavar="|".join(Kind),
+        help="What the images are: contact masks, depth maps (height) or tactile images (reading).",
+    ),
+]
+Background = Annotated[Path | None, typer.Option("--background", help="Tactile image of the untouched sensor.")]
 EffortName = Annotated[
     str | None,
     typer.Option(
         "--effort",
         metavar="|".join(Effort),
-        help="How much to compute; balanced by default.",
+        help="Computing effort, balanced by default.",
         show_default=False,
     ),
 ]
@@ -69,7 +76,7 @@ Rotate = Annotated[
     typer.Option(
         "--rotate",
         metavar="0|90|180|270",
-        help="Turn every image counter-clockwise by this many degrees before use; else as the sensor's file says.",
+        help="Turn every image counter-clockwise by this angle. Overrides the sensor's file.",
         show_default=False,
     ),
 ]
@@ -77,15 +84,16 @@ Mirror = Annotated[
     bool | None,
     typer.Option(
         "--mirror/--no-mirror",
-        help="Mirror every image left to right before that; else as the sensor's file says.",
+        help="Mirror every image left to right before it is turned. Overrides the sensor's file.",
         show_default=False,
     ),
 ]
-Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of all randomness.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of all random numbers.")]
 CacheDir = Annotated[
     Path | None,
     typer.Option(
-        "--cache-dir", help="Folder of the cached indexes; else $GEOMTACT_CACHE, else the user's cache folder."
+        "--cache-dir",
+        help="Folder of cached contact indexes. Default: $GEOMTACT_CACHE, else the user's cache folder.",
     ),
 ]
 
@@ -119,12 +127,12 @@ def approach_from(sides: list[str] | None) -> list[tuple[list[float], float]] | 
 
 @dataclass(frozen=True)
 class Mounting:
-    """How the command line says that the camera is mounted; None where it does not say it.
+    """How the camera is mounted by the command line; None where it leaves that to the sensor's file.
 
     Raises
     ------
     UsageError
-        It cannot be turned so.
+        The angle is no quarter turn.
     """
 
     rotate: int | None = None
@@ -137,8 +145,8 @@ class Mounting:
             raise UsageError(f"--rotate: expected 0, 90, 180 or 270 degrees, counter-clockwise, got {self.rotate}")
 
     @property
-    def said(self) -> bool:
-        """Whether the command line says it at all."""
+    def is_given(self) -> bool:
+        """Whether the command line gives any of it."""
         return self.rotate is not None or self.mirror is not None
 
     def of(self, sensor: str | Path | Sensor, masks: bool = True) -> Sensor:
@@ -146,7 +154,7 @@ class Mounting:
         from geomtact.sensing.sensor import Sensor
 
         found = Sensor.load(sensor)
-        if not self.said:
+        if not self.is_given:
             return found
         rotation = found.camera_rotation_deg if self.rotate is None else self.rotate
         mirrored = found.camera_mirrored if self.mirror is None else self.mirror

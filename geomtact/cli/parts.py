@@ -1,4 +1,4 @@
-"""Several parts by one --object: names with commas between them, or a folder of mesh files."""
+"""Several objects by one --object: names with commas between them, or a folder of mesh files."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from geomtact.errors import InputError
 
 
 def parts_of(object_name: str | None) -> list[str | None]:
-    """The parts that ``--object`` names, each as it would be named alone; bundled parts of a folder by their names.
+    """The objects that ``--object`` names, each as it would be named alone; bundled ones of a folder by their names.
 
     Raises
     ------
     InputError
-        A folder without meshes, or a part named twice.
+        A folder without meshes, or an object named twice.
     """
     from geomtact.geometry.catalogue import catalogue
     from geomtact.geometry.mesh_file import FORMATS
@@ -22,12 +22,12 @@ def parts_of(object_name: str | None) -> list[str | None]:
     if object_name is None or object_name in catalogue():
         return [object_name]
     if not object_name.strip():
-        raise InputError("--object: expected a part's name or a mesh file, got nothing; is a variable empty?")
+        raise InputError("--object: expected an object's name or a mesh file, got an empty text; check your variables")
     folder = Path(object_name)
     if not folder.is_dir():
         names = [name.strip() for name in object_name.split(",")] if not folder.exists() else [object_name]
         if len(set(names)) < len(names) or "" in names:
-            raise InputError(f"--object {object_name}: expected each part once, with a comma between two")
+            raise InputError(f"--object {object_name}: expected each object once, separated by commas")
         return list(names)
     bundled = {entry.file.resolve(): name for name, entry in catalogue().items()}
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in FORMATS and not p.name.startswith("."))
@@ -37,9 +37,9 @@ def parts_of(object_name: str | None) -> list[str | None]:
 
 
 def units_of(parts: Sequence[str | Path | None], unit: str | None) -> list[str | None]:
-    """The unit to load each part with: of several, ``unit`` is for those that state none; None lets a part's own serve.
+    """The unit to load each object with: of several, ``unit`` is for those that state none; None means the object's own.
 
-    If every part states its own, ``unit`` goes to all, so that one which contradicts it is refused as it would be alone.
+    If every object states its own, ``unit`` goes to all, so that one which contradicts it is refused as it would be alone.
     """
     from geomtact.geometry.mesh_file import states_unit
 

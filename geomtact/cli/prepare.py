@@ -1,4 +1,4 @@
-"""``geomtact prepare``: build and cache the index of a part on a sensor."""
+"""``geomtact prepare``: build and cache the contact index of an object on a sensor."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 
-_MANY_WINDOWS = 10  # long sides of the window, from which on a part's unit is doubted
+_MANY_WINDOWS = 10  # long sides of the window, from which on an object's unit is doubted
 
 
 def prepare(
     objects: Annotated[
         list[str] | None,
-        typer.Argument(metavar="OBJECT...", help="Part (see 'geomtact objects') or mesh file; or several."),
+        typer.Argument(metavar="OBJECT...", help="Objects (see 'geomtact objects') or mesh files."),
     ] = None,
     unit: Unit = None,
     sensor: SensorName = None,
@@ -36,8 +36,10 @@ def prepare(
     jobs: Jobs = None,
     ray: Ray = None,
 ) -> None:
-    """Build the index of a part on a sensor and cache it, so that 'localize' starts at once. Of several parts one is prepared for
-    each core at a time; those that are ready are passed over, and those that cannot be used are named at the end.
+    """Build and cache the contact index of an object on a sensor, so that 'localize' starts at once.
+
+    Several objects are prepared in parallel, one on each core. Objects whose index is cached are skipped. The command
+    lists at the end the objects that cannot be used.
     """
     import time
 
@@ -48,7 +50,7 @@ def prepare(
     sides = approach_from(approach)
     if jobs is not None or ray is not None or (objects is not None and len(objects) > 1):
         if sides:
-            raise UsageError("--approach: the sides of one part; give one part alone, without --jobs and --ray")
+            raise UsageError("--approach needs exactly one object, without --jobs and --ray; leave it out, or give one")
         _prepare_all(objects, values, sources, scorer, max_poses, cache_dir, jobs, ray)
     else:
         localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, approach=sides, given="OBJECT")
@@ -67,7 +69,7 @@ def _prepare_all(
     jobs: int | None,
     ray: str | None,
 ) -> None:
-    """Prepare several parts at a time.
+    """Prepare several objects in parallel.
 
     Raises
     ------
@@ -99,29 +101,29 @@ def _prepare_all(
         size = sum(entry.size_bytes for entry in cache_entries(folder))
         if cache_dir is None and size > DEFAULT_LIMIT:
             tell(
-                f"warning: the cache holds {size / 1e9:.0f} GB; the next part that is prepared alone brings it back to "
-                f"{DEFAULT_LIMIT / 1e9:.0f} GB. Prepare into a folder of your own, by --cache-dir, to keep all"
+                f"warning: the cache holds {size / 1e9:.0f} GB; the next single object prepared reduces it to "
+                f"{DEFAULT_LIMIT / 1e9:.0f} GB. To keep all, give a folder by --cache-dir"
             )
 
 
 def _doubt_unit_of_first(parts: list[str], unit: str | None, sensor: Sensor) -> None:
-    """As :func:`_doubt_unit`, of the first part that needs the unit: all that do have the one that is given."""
+    """As :func:`_doubt_unit`, of the first object that states no unit: all of those share the given one."""
     from geomtact.errors import GeomtactError
     from geomtact.geometry.mesh_file import load_mesh, states_unit
 
     first = next((part for part in parts if not states_unit(part)), None)
     if first is not None:
-        with contextlib.suppress(GeomtactError, OSError):  # which its task tells
+        with contextlib.suppress(GeomtactError, OSError):  # its task reports them
             _doubt_unit(load_mesh(first, unit, sensor=sensor), sensor)
 
 
 def _doubt_unit(mesh: Mesh, sensor: Sensor) -> None:
-    """Warn of a part that is so large that its unit may be wrong."""
+    """Warn of an object so large that its unit may be wrong."""
     windows = mesh.diameter / (2 * sensor.half_window.max())
     if windows > _MANY_WINDOWS:
         tell(
-            f"warning: {mesh.name} is {1e3 * mesh.diameter:.0f} mm across as read in {mesh.unit}, {windows:.0f} windows of "
-            f"the sensor {sensor.name!r}: if that is not its size, give its --unit; so large a part takes long to prepare"
+            f"warning: read in {mesh.unit}, {mesh.name} is {1e3 * mesh.diameter:.0f} mm across, {windows:.0f} windows of "
+            f"sensor {sensor.name!r}; if its size is another, give its --unit; so large an object takes long to prepare"
         )
 
 
@@ -159,7 +161,7 @@ def open_localizer(
     from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
 
     scorer = scorer or DEFAULT_SCORER
-    check_name(scorer)  # a wrong name is told before minutes go into an index
+    check_name(scorer)  # before minutes go into an index
     gel = Sensor.load(sensor) if mounting is None else mounting.of(sensor)
     mesh = load_mesh(object_name, values["unit"], sensor=gel)
     if prior is not None:

@@ -39,13 +39,13 @@ def resolve(
 
     Returns
     -------
-    values : the options, None where nobody says
+    values : the options, None where none of these gives one
     sources : where each one that was filled in comes from
 
     Notes
     -----
-    A unit belongs to the object that it is named with: the file's does not serve an object that the command line names,
-    nor the image's any other than the image's own.
+    A unit belongs to the object that it is given with: the file's does not apply to an object of the command line, nor
+    the image's to any other object.
     """
     values, sources = dict(given), {}
     path = find(start or Path.cwd())
@@ -56,10 +56,10 @@ def resolve(
         for key, value in entries.items():
             if key in values and values[key] is None:
                 values[key], sources[key] = value, str(path)
-    said = {key: (metadata or {}).get(f"geomtact:{key}") for key in ("object", "unit", "sensor")}
+    stated = {key: (metadata or {}).get(f"geomtact:{key}") for key in ("object", "unit", "sensor")}
     if values.get("object") is not None:
-        said["unit"] = None
-    for key, found in said.items():
+        stated["unit"] = None
+    for key, found in stated.items():
         if key in values and values[key] is None and found:
             values[key], sources[key] = found, "the image's metadata"
     return values, sources
@@ -77,8 +77,8 @@ def require(
     value = values.get(option)
     if value is None:
         raise UsageError(
-            f"which {option}? give {given or f'--{option} NAME'}, one of {', '.join(choices)}; or {other}; or set {option} "
-            f"in {FILE}"
+            f"no {option} given; give {given or f'--{option} NAME'}, one of {', '.join(choices)}; or {other}; or set "
+            f"{option} in {FILE}"
         )
     return value
 
@@ -100,14 +100,14 @@ def read(path: Path) -> dict[str, str]:
     try:
         entries = tomllib.loads(read_text(path))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as TOML ({error}); mend it or remove it") from None
+        raise InputError(f"{path}: cannot be read as TOML ({error}); correct or remove it") from None
     for key, value in entries.items():
         if key not in KEYS:
             raise InputError(f"{path}: unknown key {key!r}{nearest_name(key, KEYS)}")
         if not isinstance(value, str):
             raise InputError(f"{path}: {key} must be text in quotes, got {value!r}")
         if not value.strip():
-            raise InputError(f"{path}: {key} is empty; give it, or leave the line out")
+            raise InputError(f"{path}: {key} is empty; give a value, or remove the line")
         if key in ("object", "sensor", "background") and not is_bundled(key, value):
             # an object or a sensor may be a name; an image is a file
             beside = path.parent / _home(value)

@@ -1,4 +1,4 @@
-"""``--sensor-poses``: where several sensors are, which they are, and how well that is known."""
+"""``--sensor-poses``: the sensor extrinsics, which sensors they are, and their uncertainty."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class SensorPoses:
     ----------
     T_world_sensor : (n, 4, 4), one for each image
     sensor : n names or TOML files, where they are given
-    rig : how well the poses are known
+    rig : the uncertainty of the poses
     """
 
     T_world_sensor: Array
@@ -69,8 +69,8 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
             given = "{} of {}x{}".format(*T.shape)
         elif T.ndim == 1 and listed:
             given += ", not all 4x4"
-        wanted = f"for each of {images} images" if images > 1 else "for the image"
-        raise InputError(f"--sensor-poses {path}: T_world_sensor: expected a 4x4 matrix {wanted}, got {given}")
+        expected = f"for each of {images} images" if images > 1 else "for the image"
+        raise InputError(f"--sensor-poses {path}: T_world_sensor: expected a 4x4 matrix {expected}, got {given}")
     names = content.get("sensor")
     if names is not None and (not isinstance(names, list) or len(names) != images):
         got = str(len(names) if isinstance(names, list) else names)

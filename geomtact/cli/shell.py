@@ -49,7 +49,7 @@ def claim_output() -> None:
 
 
 def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
-    """``command`` with geomtact's and the system's errors told in one line, and the exit status that fits."""
+    """``command`` with geomtact's and the system's errors reported in one line, and the exit status that fits."""
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -64,7 +64,7 @@ def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(1) from None
         except OSError as error:
             where = f"{error.filename}: " if error.filename else ""
-            _tell_error(f"{where}{error.strerror or error}; check the path, its permissions and the space left there")
+            _tell_error(f"{where}{error.strerror or error}; check the path, its permissions and the free space")
             raise typer.Exit(BAD_INPUT) from None
 
     return run
@@ -72,14 +72,14 @@ def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
 
 @contextmanager
 def one_line_usage_errors() -> Iterator[None]:
-    """Tells in one line what is wrong with the command line, and exits."""
+    """Reports in one line what is wrong with the command line, and exits."""
     try:
         yield
     except UsageError as error:
         _tell_error(str(error))
         sys.exit(USAGE_ERROR)
     except (typer.Abort, EOFError):
-        _tell_error("stopped before it was done; nothing more is written")
+        _tell_error("stopped before the end; nothing more is written")
         sys.exit(1)
     except Exception as error:
         # typer's own errors, whose classes differ from version to version
@@ -89,7 +89,7 @@ def one_line_usage_errors() -> Iterator[None]:
         if message:  # it is empty where the help was printed
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "geomtact"
-            _tell_error(f"{message[0].lower()}{message[1:]}; '{command} --help' says what there is")
+            _tell_error(f"{message[0].lower()}{message[1:]}; run '{command} --help'")
         sys.exit(USAGE_ERROR)
 
 
@@ -102,7 +102,7 @@ def check_words(words: Sequence[str]) -> None:
     """
     if "" in words:
         after = ["geomtact", *words][words.index("")]
-        raise UsageError(f"expected a word after {after}, got an empty one; is a variable of the shell not set?")
+        raise UsageError(f"expected a value after {after}, got an empty text; check your shell variables")
 
 
 def check_folder(out: Path | None) -> None:
@@ -124,7 +124,7 @@ def check_file(path: Path | None, option: str) -> None:
     UsageError
     """
     if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-        raise UsageError(f"{option} {path}: expected a file in a folder that is there")
+        raise UsageError(f"{option} {path}: expected a file in an existing folder; create the folder, or give another")
 
 
 def posterior_file(path: Path, option: str = "") -> Path:
@@ -155,8 +155,8 @@ def _tell_error(text: str) -> None:
 def progress_bar(title: str) -> Iterator[Callable[[float, str], None]]:
     """A bar on standard error; yields what the library calls with the share done (0..1) and the step's name.
 
-    It shows only once the library reports, so a cached index shows none. Where standard error is no terminal, a line
-    tells of each step and of each tenth of it.
+    It shows only once the library reports, so a cached index shows none. Where standard error is no terminal, each step
+    and each tenth of it is a line.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -165,18 +165,18 @@ def progress_bar(title: str) -> Iterator[Callable[[float, str], None]]:
     columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
     bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
     task = bar.add_task(title, total=1.0)
-    started, told = False, ("", -1)
+    started, printed = False, ("", -1)
 
     def report(done: float, step: str = "") -> None:
-        nonlocal started, told
+        nonlocal started, printed
         if not started:
             started = True
             bar.start()
         description = f"{title}: {step}" if step else title
         bar.update(task, completed=done, description=description)
         reached = step, int(10 * done + 1e-9)
-        if not console.is_terminal and reached != told:
-            told = reached
+        if not console.is_terminal and reached != printed:
+            printed = reached
             tell(f"{description}, {10 * reached[1]} %")
 
     try:

@@ -1,4 +1,4 @@
-"""``geomtact simulate``: touches of a part at known poses, as images that carry their part and sensor."""
+"""``geomtact simulate``: touches of an object at known poses, as images that carry their object and sensor."""
 
 from __future__ import annotations
 
@@ -27,31 +27,34 @@ class NoiseName(StrEnum):
 
 def simulate(
     object_name: Annotated[
-        str | None, typer.Argument(metavar="OBJECT", help="Part (see 'geomtact objects') or mesh file.")
+        str | None, typer.Argument(metavar="OBJECT", help="Object (see 'geomtact objects') or mesh file.")
     ] = None,
     unit: Unit = None,
     sensor: SensorName = None,
     out: Annotated[Path, typer.Option(help="Folder for the images and their poses.")] = Path("."),
     n: Annotated[
         int | None,
-        typer.Option("--n", min=1, help="How many touches at random poses; one by default.", show_default=False),
+        typer.Option("--n", min=1, help="Number of touches at random poses, 1 by default.", show_default=False),
     ] = None,
     seed: Seed = 0,
     elastic: Annotated[
-        bool, typer.Option("--elastic/--geometric", help="Pressure of an elastic gel, or a threshold on the depth.")
-    ] = False,
-    noise: Annotated[NoiseName, typer.Option(help="How strongly the mask is spoilt.")] = NoiseName.none,
-    reading: Annotated[
         bool,
-        typer.Option("--reading", help="What the camera behind an elastic gel shows, and background.png, not masks."),
+        typer.Option("--elastic/--rigid", help="Contact of an elastic gel, by pressure, or a threshold on the depth."),
+    ] = False,
+    noise: Annotated[NoiseName, typer.Option(help="Strength of the noise on the mask.")] = NoiseName.none,
+    tactile_image: Annotated[
+        bool,
+        typer.Option(
+            "--tactile-image", help="Write tactile images of an elastic gel and background.png instead of masks."
+        ),
     ] = False,
     pose: Annotated[
-        Path | None, typer.Option(help='JSON with "T_sensor_object" (4x4, metres): one touch there.')
+        Path | None, typer.Option(help='JSON with "T_sensor_object" (4x4, metres): simulate one touch at this pose.')
     ] = None,
 ) -> None:
-    """Simulate touches: write OBJECT_1.png (contact mask, or reading) and OBJECT_1.json (true pose) and so on.
+    """Simulate touches at known poses: write OBJECT_1.png (contact mask or tactile image), OBJECT_1.json (true pose), ...
 
-    The images carry part and sensor in their metadata, so 'geomtact localize OBJECT_1.png' needs no options.
+    The images carry object and sensor in their metadata, so 'geomtact localize OBJECT_1.png' needs no options.
     """
     from geomtact.cli.project import require, resolve
     from geomtact.contact_space.space import ContactSpace
@@ -62,7 +65,7 @@ def simulate(
 
     check_folder(out)
     if pose is not None and n is not None:
-        raise UsageError("--pose is of one touch, --n of touches at random poses; give one of them")
+        raise UsageError("--pose simulates one touch, --n touches at random poses; give one of them")
     values, _ = resolve({"object": object_name, "unit": unit, "sensor": sensor})
     named = require(values, "object", list(catalogue()), "a mesh file with --unit", "OBJECT")
     sensor_named = require(values, "sensor", bundled_sensors(), "a TOML file")
@@ -71,7 +74,7 @@ def simulate(
     for warning in mesh.warnings:
         tell(f"warning: {warning}")
     space = ContactSpace(mesh, pressed)
-    elastic = elastic or reading
+    elastic = elastic or tactile_image
     strength = {NoiseName.none: noises.CLEAN, NoiseName.moderate: noises.MODERATE, NoiseName.heavy: noises.HEAVY}[noise]
 
     if pose is not None:
@@ -83,7 +86,7 @@ def simulate(
     # files are named in full, so that the image is understood from any folder
     metadata = {key: str(Path(v).resolve()) if Path(v).is_file() else v for key, v in values.items() if v is not None}
     out.mkdir(parents=True, exist_ok=True)
-    if reading:
+    if tactile_image:
         import numpy as np
 
         from geomtact.contact_space.touch import felt_height
@@ -104,17 +107,19 @@ def simulate(
             "sensor": pressed.name,
             "T_sensor_object": touch.T_sensor_object.tolist(),
             "penetration_mm": 1e3 * float(touch.penetration),
-            "contact": "elastic" if elastic else "geometric",
+            "contact": "elastic" if elastic else "rigid",
             "noise": noise.value,
             "seed": seed,
         }
-        _write(out / stem, shown[k - 1] if reading else touch.mask, truth, metadata)
+        _write(out / stem, shown[k - 1] if tactile_image else touch.mask, truth, metadata)
         typer.echo(f"{out / stem}.png: {100 * touch.mask.mean():.1f} % of the window in contact")
         if not 0 < touch.penetration <= pressed.max_penetration:
             what = "is too deep" if touch.penetration > 0 else "does not touch"
-            tell(f"warning: the part {what} there: the pose is T_sensor_object, in metres, the membrane at z = 0")
-    if reading:
-        typer.echo(f"{out / 'background.png'}: without contact, for --background")
+            tell(
+                f"warning: the object {what} at this pose; check that T_sensor_object is in metres, the membrane at z = 0"
+            )
+    if tactile_image:
+        typer.echo(f"{out / 'background.png'}: the untouched sensor, for --background")
 
 
 def read_pose(path: Path) -> Array:

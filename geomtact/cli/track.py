@@ -1,4 +1,4 @@
-"""``geomtact track``: a part followed through a sequence of images, a line of JSON for each."""
+"""``geomtact track``: an object tracked through a sequence of images, one JSON line per image."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ Source = Annotated[
     str,
     typer.Argument(
         metavar="DIR|VIDEO|CAMERA|-",
-        help="Folder of images, video, a camera's number, or - for paths from standard input.",
+        help="Folder of images, video, number of a camera, or - for paths on standard input.",
     ),
 ]
-ObjectName = Annotated[str | None, typer.Option("--object", help="Part (see 'geomtact objects') or mesh file.")]
+ObjectName = Annotated[str | None, typer.Option("--object", help="Object (see 'geomtact objects') or mesh file.")]
 MotionMm = Annotated[
     float,
-    typer.Option(min=0.001, max=1000, help="How far the part moves between frames at most, mean over its points."),
+    typer.Option(min=0.001, max=1000, help="Largest motion between two frames: mean distance of the object's points."),
 ]
 Follow = Annotated[bool, typer.Option("--follow", help="Wait for more images in the folder, until Ctrl-C.")]
-SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Go on after an image that cannot be read.")]
+SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Skip images that cannot be read.")]
 MOTION_MM = 8.0  # the thesis's
-UNTOUCHED = "no contact found in any image; give a --background, or say what they are with --kind"
+UNTOUCHED = "no contact found in any image; give --background, or the kind of the images by --kind"
 
 
 def track(
@@ -65,13 +65,13 @@ def track(
     kind: KindName = Kind.auto.value,
     background: Background = None,
     prior: Annotated[
-        Path | None, typer.Option(help="posterior.npz of what is known before the first frame, or its folder.")
+        Path | None, typer.Option(help="Prior of the first frame: a posterior.npz, or its folder.")
     ] = None,
     effort: EffortName = None,
     scorer: ScorerName = None,
     motion_mm: MotionMm = MOTION_MM,
-    most: Annotated[
-        int | None, typer.Option(min=1, help="Cells kept between frames at most, for speed; all that count by default.")
+    max_cells: Annotated[
+        int | None, typer.Option(min=1, help="Largest number of grid cells kept between frames. Fewer are faster.")
     ] = None,
     follow: Follow = False,
     skip_broken: SkipBroken = False,
@@ -80,21 +80,24 @@ def track(
     tum: Annotated[
         Path | None, typer.Option(help="Write the first modes as a TUM trajectory: timestamp tx ty tz qx qy qz qw.")
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Write one HTML file that plays the sequence.")] = None,
-    fps: Annotated[float, typer.Option(min=1e-6, help="Images a second, for the timestamps of a folder.")] = 1.0,
+    report: Annotated[Path | None, typer.Option(help="Write an HTML file that plays the sequence.")] = None,
+    fps: Annotated[float, typer.Option(min=1e-6, help="Images per second, for the timestamps of a folder.")] = 1.0,
     seed: Seed = 0,
     max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Follow a part through a sequence of images: print one line of JSON a frame, as soon as it is known.
+    """Track an object through a sequence of images: print one JSON line per image.
 
-    What is not given is taken from the nearest geomtact.toml (this folder or above), then from the first image's metadata.
+    Options that you leave out come from the nearest geomtact.toml (this folder or above), then from the first image's
+    metadata.
+
     Exit status: 0 done, 2 usage error, 3 bad input, 4 no contact in any image.
     """
     check_file(tum, "--tum")
     check_file(report, "--report")
     given = given_of(object_name, unit, sensor, background, effort)
-    options: dict[str, Any] = {"kind": kind, "prior": prior, "most": most, "skip_broken": skip_broken, "seed": seed}
+    options: dict[str, Any] = {"kind": kind, "prior": prior, "max_cells": max_cells, "skip_broken": skip_broken}
+    options["seed"] = seed
     options["mounting"] = Mounting(rotate, mirror)
     localizer, posteriors = open_track(source, given, follow, motion_mm, scorer, max_poses, cache_dir, **options)
 
@@ -117,7 +120,7 @@ def track(
         whole = True
     except KeyboardInterrupt:
         tell("stopped")
-    finally:  # what is known before a frame that cannot be read is kept
+    finally:  # the results before a frame that cannot be read are kept
         if tum is not None and (lines or whole):
             write_text(tum, "".join(lines))
         if report is not None and shown:
@@ -143,10 +146,9 @@ def open_track(
     seed: int,
     mounting: Mounting,
     prior: Path | None = None,
-    most: int | None = None,
+    max_cells: int | None = None,
 ) -> tuple[Localizer, Iterator[tuple[float | None, Posterior]]]:
-    """The localizer, and the time, if the source tells one, and the posterior of each frame; parameters as of :func:`track`."""
-
+    """The localizer, and each frame's time, if the source has one, and posterior; parameters as of :func:`track`."""
     from geomtact.sensing.reading import read_observation
 
     check_name("kind", kind, Kind)
@@ -169,21 +171,22 @@ def open_track(
     from geomtact.inference.sequence import track as followed
 
     options: dict[str, Any] = {"kind": kind, "background": values["background"], "prior": prior, "effort": effort}
-    options |= {"motion": UniformBall(1e-3 * motion_mm), "most": most, "on_error": "skip" if skip_broken else "raise"}
+    options |= {"motion": UniformBall(1e-3 * motion_mm), "most": max_cells}
+    options["on_error"] = "skip" if skip_broken else "raise"
     times: deque[float | None] = deque()
-    told = followed(localizer, _images(frames, times), seed=seed, **options)
-    return localizer, ((times.popleft(), posterior) for posterior in told)
+    posteriors = followed(localizer, _images(frames, times), seed=seed, **options)
+    return localizer, ((times.popleft(), posterior) for posterior in posteriors)
 
 
 def _metadata(source: str) -> dict[str, Any]:
-    """What the first image of a folder says of itself."""
+    """The metadata of the first image of a folder."""
     from geomtact.sensing.reading import read_metadata
 
     images = listed(Path(source)) if Path(source).is_dir() else []
     try:
         return read_metadata(images[0]) if images else {}
     except InputError:
-        return {}  # told with its number when its turn comes
+        return {}  # reported with its number when its turn comes
 
 
 def _images(frames: Iterator[Frame], times: deque[float | None]) -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""``geomtact view``: a part followed through a sequence of images, shown live in the browser."""
+"""``geomtact view``: an object tracked through a sequence of images, shown live in the browser."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ def view(
     rotate: Rotate = None,
     mirror: Mirror = None,
     host: Annotated[
-        str, typer.Option(help="Address to serve the page at; 0.0.0.0 lets other machines look.")
+        str, typer.Option(help="Address of the page; 0.0.0.0 serves it to other machines, too.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port; the next free one, if it is taken.")] = 8080,
-    stay: Annotated[bool, typer.Option(help="Go on serving the page after the last image, until Ctrl-C.")] = True,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port; if it is taken, the next free one.")] = 8080,
+    stay: Annotated[bool, typer.Option(help="Serve the page after the last image, until Ctrl-C.")] = True,
     seed: Seed = 0,
     max_poses: MaxPoses = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Follow a part as 'geomtact track' does, and show in the browser where it may be, live.
+    """Track an object as 'geomtact track' does, and show its pose distribution live in the browser.
 
-    The page shows the sensor, the contact, the part at its most probable pose and, faintly, at poses drawn from the posterior.
-    It needs viser: pip install 'geomtact\\[viz]'. Exit status as of 'geomtact track'.
+    The page shows the sensor, the contact and the object at its most probable pose. Faint copies are at poses drawn
+    from the posterior. Needs viser: pip install 'geomtact\\[viz]'. Exit status as of 'geomtact track'.
     """
     from geomtact.report.viewer import Viewer, check_viewer
 
@@ -89,7 +89,7 @@ def view(
             viewer.show(n, posterior)
             touched |= posterior.contact
         if stay:
-            tell("all images shown; the page is served until Ctrl-C")
+            tell("all images shown; press Ctrl-C to stop serving the page")
         while stay:
             time.sleep(1)
     except KeyboardInterrupt:

@@ -62,16 +62,16 @@ def draw_calibration(found: Calibrated, ball_diameter: float) -> bytes:
     grid[0, 0].set_ylabel("row [px]")
     grid[1, 0].set_ylabel("depth [mm]")
     grid[1, 0].legend(frameon=False, fontsize=8)
-    told, true = zip(*(ball_slopes(press, found.sensor, ball_diameter) for press in found.presses), strict=True)
+    measured, true = zip(*(ball_slopes(press, found.sensor, ball_diameter) for press in found.presses), strict=True)
     for k, name in enumerate("xy"):
         axes = last[k]
         axes.hexbin(
-            np.concatenate(true)[:, k], np.concatenate(told)[:, k], gridsize=50, bins="log", cmap="Blues", mincnt=1
+            np.concatenate(true)[:, k], np.concatenate(measured)[:, k], gridsize=50, bins="log", cmap="Blues", mincnt=1
         )
         axes.axline((0, 0), slope=1, color="black", lw=0.8)
-        axes.set(xlabel=f"slope of the ball along {name}", ylabel="slope told by colours")
+        axes.set(xlabel=f"slope of the ball along {name}", ylabel="slope measured by colours")
     last[2].hist(1e3 * found.diameters, bins=15, color=COLOURS[0])
-    last[2].axvline(1e3 * ball_diameter, color=COLOURS[1], ls="--", label="said")
+    last[2].axvline(1e3 * ball_diameter, color=COLOURS[1], ls="--", label="given")
     last[2].set(xlabel="ball's diameter by each press [mm]", ylabel="presses")
     last[2].legend(fontsize=8)
     return png(canvas)

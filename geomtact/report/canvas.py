@@ -1,4 +1,4 @@
-"""What all pictures of studies share: colours, and a PNG that says nothing of the program that drew it."""
+"""Colours of all figures, and a PNG without metadata of the program that drew it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,14 @@ from typing import Any, TypeVar
 
 _T = TypeVar("_T")
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe and Ito, told apart by all
+COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+)  # Okabe and Ito: distinct for colour-blind readers
 
 
 def coloured(what: Iterable[_T]) -> Iterator[tuple[_T, str]]:

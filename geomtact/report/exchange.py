@@ -1,4 +1,4 @@
-"""Poses in the words of other tools: TUM trajectories, BOP results, ROS messages as JSON, and a table for pandas."""
+"""Poses in other tools' formats: TUM trajectories, BOP results, ROS messages as JSON, and a table for pandas."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def from_tum(path: str | Path) -> tuple[Array, Array]:
         except ValueError:
             raise InputError(f"{where} expected timestamp tx ty tz qx qy qz qw, eight numbers") from None
         if not np.isfinite(row).all():
-            raise InputError(f"{where} expected finite numbers, got NaN or infinity; leave such lines out")
+            raise InputError(f"{where} expected finite numbers, got NaN or infinity; remove the line")
         norm = float(np.linalg.norm(row[4:]))
         if abs(norm - 1) > _NORM:
             raise InputError(
@@ -67,8 +67,8 @@ def from_tum(path: str | Path) -> tuple[Array, Array]:
 def to_bop(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write results as the BOP benchmark reads them (bop.felk.cvut.cz/challenges).
 
-    Each of ``rows`` has ``scene_id``, ``im_id``, ``obj_id``, ``score``, ``T`` (4, 4) [m], and ``time`` [s], -1 where it is not
-    told; the file has R row by row and t in millimetres.
+    Each of ``rows`` has ``scene_id``, ``im_id``, ``obj_id``, ``score``, ``T`` (4, 4) [m], and ``time`` [s], -1 where it is
+    left out; the file has R row by row and t in millimetres.
     """
     lines = [",".join(BOP)]
     for row in rows:

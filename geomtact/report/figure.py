@@ -1,4 +1,4 @@
-"""``report.png`` by matplotlib: the touch, the first modes and what is known of each coordinate."""
+"""``report.png`` by matplotlib: the touch, the first modes and the distribution of each coordinate."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 OBSERVED, SIMULATED, FIRST, BARS = "#D55E00", "#56B4E9", "#000000", "#0072B2"
 DPI, WIDTH = 100, 14.0
-# Heights in inches; those of the touch and of the modes, without the part, a row for each sensor
+# Heights in inches; those of the touch and of the modes, without the object, a row for each sensor
 _BANDS = {"touch": 3.9, "modes": 2.9, "marginals": 2.9}
 _COLUMNS = 5
 
@@ -92,9 +92,9 @@ def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummar
         axes = band.add_subplot(grid[row, 1])
         outline(axes, one.sensor, contact, OBSERVED)
         kind = one.observation.kind
-        how = f"read as {kind}"
+        how = f"read as {'depth map' if kind == 'height' else kind}"
         if kind == "reading":
-            how = f"reading, {one.observation.method} way" + " with heights" * (contact.height is not None)
+            how = f"{one.observation.method} method" + " with depths" * (contact.height is not None)
         title = f"The contact{of} ({_area_mm2(contact, one.sensor):.1f} mm², {how})"
         _in_window(axes, one.sensor, np.where(contact.mask, 0.75, 0.97), title)
     words = band.add_subplot(grid[:, 2])
@@ -112,7 +112,7 @@ def _modes(
     part: float,
     shown: Sequence[Shown],
 ) -> None:
-    """The contacts simulated at each mode, a row for each sensor, and below them the part there, which takes ``part`` inches."""
+    """The contacts simulated at each mode, a row for each sensor, and below them the object, ``part`` inches high."""
     grid = band.subplots(len(shown) + 1, _COLUMNS, height_ratios=[_BANDS["modes"]] * len(shown) + [part])
     for axes in grid[:, len(modes) :].ravel():
         axes.axis("off")
@@ -137,7 +137,7 @@ def _modes(
 
 
 def _over(posterior: Posterior, shown: Sequence[Shown]) -> str:
-    """Over which of several sensors the part is drawn."""
+    """The one of several sensors over which the object is drawn."""
     name = next((one.name for one in shown if one.observation is posterior.observations[0]), "")
     return f"over {name}" if name else ""
 
@@ -158,7 +158,7 @@ def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
         axes.ticklabel_format(useOffset=False)
     for axes in grid[len(all_samples) :]:
         axes.axis("off")
-        axes.text(0.5, 0.5, "the part is a ball:\nno turn to tell", ha="center", va="center", transform=axes.transAxes)
+        axes.text(0.5, 0.5, "a ball has\nno turn", ha="center", va="center", transform=axes.transAxes)
         break
     for axes in grid[len(all_samples) + 1 :]:
         axes.axis("off")
@@ -167,7 +167,7 @@ def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
 
 
 def _views(posterior: Posterior, modes: Sequence[Mode]) -> list[PartView]:
-    """The part at each mode."""
+    """The object at each mode."""
     painter = Painter(posterior.mesh, posterior.sensor)
     return [painter.paint(inverse(posterior.T_frame_sensor) @ mode.T) for mode in modes]
 
@@ -206,7 +206,7 @@ def _in_window(axes: Axes, sensor: Sensor, image: Array, title: str, small: bool
 
 
 def _draw_frame(axes: Axes, sensor: Sensor, place: Callable[[Any], Array]) -> None:
-    """The window's border and the sensor's x and y axes, over the picture of the part."""
+    """The window's border and the sensor's x and y axes, over the picture of the object."""
     x, y = 1e3 * sensor.half_window
     border = place(np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [-x, -y, 0]]))
     axes.plot(*border.T, color=BARS, lw=0.8)
@@ -223,12 +223,12 @@ def _words(posterior: Posterior, summaries: Sequence[ModeSummary]) -> list[str]:
     for s in summaries[:1]:
         lines += caution(summaries) or [f"Mode 1 holds {percent(s.probability)}."]
         lines += [
-            "Part's centre at mode 1: "
+            "Object's centre at mode 1: "
             + ", ".join(f"{a} = {v:.2f}" for a, v in zip("xyz", s.centre_mm + 0.0, strict=True))
             + " mm",
             f"Within the mode: standard deviation {s.centre_sd_mm:.2f} mm and {s.rotation_sd_deg:.1f}°.",
-            "What the contact tells about the six motions:",
-            s.told_in_words(),
+            "Observable directions:",
+            s.in_words(),
         ]
     return lines
 

@@ -1,4 +1,4 @@
-"""The posterior one coordinate at a time: where the part's centre lies, and how the part is turned against the first mode."""
+"""Marginals of the posterior: the position of the object's centre, and its turn and tilt relative to the first mode."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Samples:
         width = self.step * max(1, np.ceil((high - low) / ((most - 2) * self.step)))
         bins = int((high - low) // width) + 2
         start = low - 0.5 * (bins * width - (high - low))
-        # where values lie whole steps apart, no edge shall fall on them
+        # where values lie whole steps apart, no edge falls on them
         start = first - (np.floor((first - start) / self.step) + 0.5) * self.step
         return np.histogram(self.values, start + width * np.arange(bins + 1), weights=self.weights)
 
@@ -63,7 +63,7 @@ def marginals(posterior: Posterior, T_first: Array) -> list[Samples]:
     first = 1e3 * (T_first[:3, :3] @ centre + T_first[:3, 3])
     grid = posterior.index.resolution
     ball = posterior.mesh.symmetry is not None and posterior.mesh.symmetry.kind == "sphere"
-    # the height of a ball varies with its penetration alone, that of other parts more with the rotation, in like steps
+    # the height of a ball varies with its penetration alone, that of other objects mostly with the rotation
     depth_step = posterior.sensor.max_penetration / len(grid.penetrations)
     steps = 1e3 * np.array([grid.step, grid.step, depth_step if ball else grid.step])
     out = [

@@ -1,4 +1,4 @@
-"""Where the part may be, which touches would tell most of it, and what the best one would show: one picture."""
+"""One picture of the pose distribution, the touches of most expected information gain and the contacts of the best."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ def draw_next_touch(posterior: Posterior, ranked: Sequence[Action], seed: int = 
         if isinstance(ranked[0].of, Touch):
             _shown(lower.subplots(1, _SHOWN), posterior, ranked[0].of, poses)
             lower.suptitle(
-                f"What touch {ranked[0].number}, the best, would show with the part at {_SHOWN} of these places: the more "
-                "these differ, the more it tells",
+                f"Contacts of touch {ranked[0].number}, the best, with the object at {_SHOWN} of these poses: it "
+                "distinguishes poses whose contacts differ",
                 fontsize=10,
             )
         note = ambiguity(ranked)
         title = f"{posterior.mesh.name} on {posterior.sensor.name}, {posterior.frame} frame: where to touch next"
-        title += " (the darker, the likelier the part is there)"
+        title += " (dark: the object is probably there)"
         figure.suptitle(title if note is None else f"{title}\n{note}", fontsize=11)
         return png(canvas)
 
@@ -75,7 +75,7 @@ def draw_next_touch(posterior: Posterior, ranked: Sequence[Action], seed: int = 
 def _region(
     axes: Axes, posterior: Posterior, poses: Array, best: Sequence[Action], name: str, right: str, up: str, R: Array
 ) -> None:
-    """The share of ``poses`` at which the part covers a line of sight, the first sensor, and the ``best`` actions."""
+    """The share of ``poses`` at which the object covers a line of sight, the first sensor, and the ``best`` actions."""
     ends = np.concatenate([_path(posterior, action, poses) for action in best])
     outline = apply(poses, posterior.mesh.surface_points(128)).reshape(-1, 3)
     # of all sensors that touched, each taken to have the first one's window
@@ -111,11 +111,11 @@ def _region(
             va="center",
             bbox={"boxstyle": "circle,pad=0.15", "fc": "white", "ec": colour},
         )
-    axes.set(title=f"Where the part may be, {name}", xlabel=f"{right} [mm]", ylabel=f"{up} [mm]")
+    axes.set(title=f"Distribution of the object, {name}", xlabel=f"{right} [mm]", ylabel=f"{up} [mm]")
 
 
 def _covered(posterior: Posterior, poses: Array, R: Array, middle: Array, half: float) -> Array:
-    """Share (n, n) of ``poses`` (m, 4, 4) at which the part lies on the line of sight through each pixel."""
+    """Share (n, n) of ``poses`` (m, 4, 4) at which the object lies on the line of sight through each pixel."""
     # a camera without perspective is a sensor to the caster
     camera = Sensor("view", (_PIXELS, _PIXELS), (2 * half / _PIXELS,) * 2, 0.0, 1.0)
     T = transform(R, -np.append(middle, 0.0)) @ poses
@@ -133,9 +133,9 @@ def _path(posterior: Posterior, action: Action, poses: Array) -> Array:
 
 
 def _bars(axes: Axes, ranked: Sequence[Action]) -> None:
-    """Expected information of the best actions and of the last."""
-    known = [action for action in ranked if not action.roughly]
-    some = known if len(known) <= _BARS else [*known[: _BARS - 1], known[-1]]
+    """Expected information gain of the best actions and of the last."""
+    exact = [action for action in ranked if not action.roughly]
+    some = exact if len(exact) <= _BARS else [*exact[: _BARS - 1], exact[-1]]
     place = np.arange(len(some))
     colours = [*_COLOURS, *[_OTHERS] * len(some)][: len(some)]
     axes.barh(place, [a.expected_nats for a in some], color=colours)
@@ -144,14 +144,14 @@ def _bars(axes: Axes, ranked: Sequence[Action]) -> None:
     axes.invert_yaxis()
     for at, action in enumerate(some):
         cost = "" if action.cost == 1 else f", cost {action.cost:g}"
-        text = f" {action.expected_nats:.2f}, meets it with {100 * action.contact:.0f} %{cost}"
+        text = f" {action.expected_nats:.2f}, contact with {100 * action.contact:.0f} %{cost}"
         axes.text(action.expected_nats, at, text, va="center", fontsize=8)
     axes.set_xlim(0, 1.7 * max(0.1, *(a.expected_nats for a in some)))
     axes.spines[["top", "right"]].set_visible(False)
-    title = "Expected information"
+    title = "Expected information gain"
     if len(some) < len(ranked):
-        title = f"The best of {len(ranked)} actions,\nand the last of those tried at all poses"
-    axes.set(title=title, xlabel="nats about the pose; 0.7 tells two possibilities apart")
+        title = f"The best of {len(ranked)} actions,\nand the last of those evaluated at all poses"
+    axes.set(title=title, xlabel="expected gain [nats]; 0.7 halves the possible poses")
 
 
 def _shown(grid: NDArray, posterior: Posterior, touch: Touch, poses: Array) -> None:

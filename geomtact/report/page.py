@@ -33,10 +33,9 @@ details { margin: 1rem 0; } summary { cursor: pointer; }
 pre { background: var(--soft); padding: .8rem; overflow-x: auto; font-size: .85rem; border-radius: 6px; }
 """
 
-# what the axes of a frame are, in words
 _AXES = {
-    "sensor": ": x along image columns, y along image rows downwards, z out of the sensor towards the part",
-    "world": ", the one in which the sensors' poses are given",
+    "sensor": ": x along image columns, y along image rows downwards, z out of the sensor towards the object",
+    "world": " of the sensors' poses",
 }
 
 
@@ -54,32 +53,32 @@ def page(
     content : of result.json
     rows : the modes as a table, under ``summary.HEADINGS``
     facts : sentences under the title
-    pictures : PNGs "touch", "modes" and "marginals"; those that are not there are left out
-    turnable : what the view that can be turned shows, see ``report.turnable``
+    pictures : PNGs "touch", "modes" and "marginals"; a missing one is left out
+    turnable : content of the 3D view, see ``report.turnable``
     """
     name, sensor = escape(content["object"]["name"]), escape(content["sensor"])
     parts = [f"<h1>{name} on {sensor}</h1>"]
     parts += [f'<p class="warning">{escape(text)}</p>' for text in content["warnings"]]
     parts += ["<p>" + "<br>".join(map(escape, facts)) + "</p>"]
     if rows:
-        parts += ["<h2>Where the part may be</h2>", _table(HEADINGS, rows)]
+        parts += ["<h2>Most probable poses</h2>", _table(HEADINGS, rows)]
         parts += [
-            f"<p>In the {escape(content['frame'])} frame{_AXES[content['frame']]}. ± is the standard deviation in the least "
-            "certain direction, within the mode. Tilts are about x and y, turns about z, through the middle of the contact. "
-            "The exact matrices are in result.json and below.</p>"
+            f"<p>In the {escape(content['frame'])} frame{_AXES[content['frame']]}. ± is the standard deviation within the "
+            "mode, in its least certain direction. Tilts are about x and y, turns about z, through the middle of the contact. "
+            "The 4x4 matrices are in result.json and below.</p>"
         ]
     if turnable is not None:
         parts += _turnable(turnable, [mode["probability"] for mode in content["modes"]])
     parts += _picture("The touch", "the image and the contact found in it", pictures.get("touch"))
     parts += _picture(
-        "The modes", "simulated contacts over the observed outline, and the part there", pictures.get("modes")
+        "The modes", "simulated contacts over the observed outline, and the object there", pictures.get("modes")
     )
     parts += _picture(
-        "What is known of each coordinate", "marginal distributions of position and turn", pictures.get("marginals")
+        "Distribution of each coordinate", "marginal distributions of position and turn", pictures.get("marginals")
     )
     if "marginals" in pictures:
         parts += [
-            "<p>Turn and tilt are counted from mode 1, modulo the part's own symmetry; the dashed line is mode 1.</p>"
+            "<p>Turn and tilt are relative to mode 1, modulo the object's symmetry. The dashed line is mode 1.</p>"
         ]
     parts += _folded("Poses T (object to " + content["frame"] + " frame, metres)", [m["T"] for m in content["modes"]])
     timing = {stage: f"{ms:,.1f}" for stage, ms in content["timing_ms"].items()}
@@ -107,14 +106,14 @@ def _turnable(content: dict[str, Any], probabilities: Sequence[float]) -> list[s
     tabs = [f'<button role="tab" type="button">mode {k}: {percent(p)}</button>' for k, p in enumerate(probabilities, 1)]
     script = files("geomtact.report").joinpath("turnable.js").read_text("utf-8")
     return [
-        "<h2>The part at each mode</h2>",
+        "<h2>The object at each mode</h2>",
         '<section id="scene">',
         f'<div role="tablist" aria-label="modes">{"".join(tabs)}</div>',
         '<canvas tabindex="0" role="img"></canvas>',
-        "<p>Over the window (blue) the observed contact's border (orange). Drag to turn, or use the arrow keys on the picture, "
-        "and the wheel once it is chosen; the number keys choose a mode. "
-        '<label><input type="checkbox" checked> Where on the part the first contact may be, from seldom (blue) to most '
-        "likely (yellow)</label></p>",
+        "<p>Blue: the sensor's window. Orange: the border of the observed contact. Drag, or press the arrow keys on the "
+        "picture, to turn it. Click it to zoom with the wheel. The number keys choose a mode. "
+        '<label><input type="checkbox" checked> Probable places of the first contact on the object, from rare (blue) to most '
+        "probable (yellow)</label></p>",
         "</section>",
         f'<script id="scene-data" type="application/json">{json.dumps(content)}</script>',
         f"<script>\n{script}</script>",

@@ -24,7 +24,7 @@ def result(
     modes: Sequence[Mode],
     settings: Mapping[str, Any] | None = None,
     timing_ms: Mapping[str, float] | None = None,
-    parts: Sequence[Mapping[str, Any]] | None = None,
+    candidates: Sequence[Mapping[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """The content of ``result.json``, ready for ``json.dumps``.
 
@@ -33,7 +33,7 @@ def result(
     posterior : what was found
     modes : of the posterior, most probable first
     settings, timing_ms : added to the posterior's own; its own settings, which are the resolved ones, go first
-    parts : of which it may be, where there are several, the most probable first
+    candidates : of an object identification, the most probable first
     """
     mesh, sensor = posterior.mesh, posterior.sensor
     return plain(
@@ -41,7 +41,7 @@ def result(
             "schema": SCHEMA,
             "object": {"name": mesh.name, "sha256": mesh.sha256, "unit": mesh.unit},
             "sensor": sensor.name,
-            **({} if parts is None else {"parts": parts}),
+            **({} if candidates is None else {"candidates": candidates}),
             "frame": posterior.frame,
             "contact": bool(posterior.contact),
             "modes": [
@@ -56,6 +56,7 @@ def result(
                 }
                 for mode in modes
             ],
+            "information_gain_nats": -posterior.entropy_nats,
             "entropy_nats": posterior.entropy_nats,
             "effective_poses": posterior.effective_poses,
             "settings": {**(settings or {}), **posterior.settings, "seed": posterior.seed},

@@ -29,7 +29,7 @@ _EXTRA = """
 figure { margin: 0; } figure img { width: 100%; image-rendering: pixelated; } figcaption { font-size: .9rem; }
 .player { display: flex; gap: .8rem; align-items: center; } .player input { flex: 1; }
 .player button { font: inherit; width: 5rem; } svg { width: 100%; height: auto; overflow: visible; }
-svg text { font-size: 12px; fill: currentColor; } #told { min-height: 3.2rem; font-variant-numeric: tabular-nums; }
+svg text { font-size: 12px; fill: currentColor; } #summary { min-height: 3.2rem; font-variant-numeric: tabular-nums; }
 """
 _SCRIPT = """
 const slider = document.getElementById("frame"), play = document.getElementById("play");
@@ -43,7 +43,7 @@ function show(i) {
     element(name).style.visibility = f[name] ? "visible" : "hidden";
     if (f[name]) element(name).src = "data:image/png;base64," + f[name];
   }
-  element("told").textContent = f.told;
+  element("summary").textContent = f.summary;
   element("mark").setAttribute("x1", f.x);
   element("mark").setAttribute("x2", f.x);
   element("warnings").replaceChildren(...f.warnings.map(text => {
@@ -80,7 +80,7 @@ def sequence_frame(
     simulate : the contact at a pose T_sensor_object, without noise
     """
     out: dict[str, Any] = {key: line[key] for key in ("frame", "entropy_nats", "surprise_nats", "warnings")}
-    out |= {"image": None, "contact": None, "told": _told(line)}
+    out |= {"image": None, "contact": None, "summary": _summary(line)}
     for observation in posterior.observations[:1]:
         shown = _displayable(observation.image)
         colours = np.repeat(shown[..., None], 3, 2) if shown.ndim == 2 else shown
@@ -102,7 +102,7 @@ def sequence_page(name: str, sensor: str, frames: Sequence[Mapping[str, Any]]) -
     body = f"""<h1>{title}</h1>
 <div class="player"><button id="play">Play</button>
 <input id="frame" type="range" min="0" max="{len(frames) - 1}" value="0" aria-label="frame"><span id="number"></span></div>
-<p id="told"></p>
+<p id="summary"></p>
 <div id="warnings"></div>
 <div class="pictures">
 <figure><img id="image" alt="the image"><figcaption>The image</figcaption></figure>
@@ -110,7 +110,7 @@ def sequence_page(name: str, sensor: str, frames: Sequence[Mapping[str, Any]]) -
 <figcaption><span style="color: {SIMULATED}">&#9632;</span> contact simulated at the most probable pose,
 <span style="color: {OBSERVED}">&#9632;</span> observed outline</figcaption></figure>
 </div>
-<h2>What is known, frame by frame</h2>
+<h2>Information gain by frame</h2>
 {curve}"""
     # a closing tag inside a string would end the script
     script = f"const FRAMES = {data.replace('</', '<' + chr(92) + '/')};{_SCRIPT}"
@@ -121,41 +121,41 @@ def sequence_page(name: str, sensor: str, frames: Sequence[Mapping[str, Any]]) -
     )
 
 
-def _told(line: Mapping[str, Any]) -> str:
+def _summary(line: Mapping[str, Any]) -> str:
     if line["T"] is None:
         return "No contact."
     where = ", ".join(f"{x:.1f}" for x in line["translation_mm"])
-    known = f"{max(0.0, -line['entropy_nats']):.1f} nats are known. The first mode holds {percent(line['probability'])}"
+    gain = f"Information gain {max(0.0, -line['entropy_nats']):.1f} nats. Mode 1 holds {percent(line['probability'])}"
     surprise = line["surprise_nats"]
-    expected = f" What was known before makes the frame likelier by {surprise:+.1f} nats." if surprise else ""
-    return f"{known}, with the part's origin at ({where}) mm.{expected}"
+    expected = f" The earlier frames change the frame's log likelihood by {surprise:+.1f} nats." if surprise else ""
+    return f"{gain}, with the object's origin at ({where}) mm.{expected}"
 
 
 def _curve(entropy: Sequence[float | None]) -> tuple[str, list[float]]:
-    """An SVG of the nats known in each frame, and where along x each frame is."""
+    """An SVG of the information gain of each frame, and where along x each frame is."""
     wide, high = _CURVE
-    known = [None if e is None else max(0.0, -e) for e in entropy]
-    top = max([1.0, *(k for k in known if k is not None)])
-    x = np.linspace(0, wide, len(known)) if len(known) > 1 else np.array([wide / 2])
+    gain = [None if e is None else max(0.0, -e) for e in entropy]
+    top = max([1.0, *(k for k in gain if k is not None)])
+    x = np.linspace(0, wide, len(gain)) if len(gain) > 1 else np.array([wide / 2])
     pieces, pen = [], "M"
-    for place, k in zip(x, known, strict=True):
+    for place, k in zip(x, gain, strict=True):
         if k is not None:
             pieces.append(f"{pen}{place:.1f},{high * (1 - k / top):.1f}")
         pen = "M" if k is None else "L"
     dots = "".join(
         f'<circle cx="{place:.1f}" cy="{high * (1 - k / top):.1f}" r="2.5" fill="{SIMULATED}"/>'
-        for place, k in zip(x, known, strict=True)
+        for place, k in zip(x, gain, strict=True)
         if k is not None
     )
     svg = (
-        f'<svg viewBox="-40 -20 {wide + 56} {high + 52}" role="img" aria-label="nats known in each frame">'
+        f'<svg viewBox="-40 -20 {wide + 56} {high + 52}" role="img" aria-label="information gain of each frame">'
         f'<path d="M0,0V{high}H{wide}" fill="none" stroke="var(--line)"/>'
         f'<path d="{"".join(pieces)}" fill="none" stroke="{SIMULATED}" stroke-width="2"/>{dots}'
         f'<line id="mark" y1="0" y2="{high}" x1="0" x2="0" stroke="{OBSERVED}" stroke-width="1.5"/>'
         f'<text x="-6" y="4" text-anchor="end">{top:.1f}</text><text x="-6" y="{high + 4}" text-anchor="end">0</text>'
-        f'<text x="0" y="{high + 16}">1</text><text x="{wide}" y="{high + 16}" text-anchor="end">{len(known)}</text>'
+        f'<text x="0" y="{high + 16}">1</text><text x="{wide}" y="{high + 16}" text-anchor="end">{len(gain)}</text>'
         f'<text x="{wide / 2}" y="{high + 28}" text-anchor="middle">frame</text>'
-        '<text x="0" y="-4">nats known</text></svg>'
+        '<text x="0" y="-4">information gain [nats]</text></svg>'
     )
     return svg, [round(float(place), 1) for place in x]
 

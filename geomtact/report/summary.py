@@ -1,4 +1,4 @@
-"""A mode in plain numbers: where the part's centre lies, how it is turned, how surely, and what the contact tells."""
+"""A mode in plain numbers: position of the object's centre, rotation, standard deviations and observable directions."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from geomtact.inference.modes import Mode
     from geomtact.inference.posterior import Posterior
 
-# Motions of the part in the sensor frame about and along x, y and z through the contact's centre, in the order of a
+# Motions of the object in the sensor frame about and along x, y and z through the contact's centre, in the order of a
 # twist (rotations first).
 MOTIONS = ("tilt x", "tilt y", "turn z", "shift x", "shift y", "shift z")
-HEADINGS = ("mode", "probability", "centre x, y, z [mm]", "±", "rotation vector [°]", "±", "the contact tells")
-TOLD, HARDLY = 0.9, 0.1
+HEADINGS = ("mode", "probability", "centre x, y, z [mm]", "±", "rotation vector [°]", "±", "observable directions")
+OBSERVABLE, UNOBSERVABLE = 0.9, 0.1  # shares of a motion from which on, and up to which, it counts as such
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class ModeSummary:
     Attributes
     ----------
     probability : of the mode
-    centre_mm : (3,) the part's centre in the posterior's frame
+    centre_mm : (3,) the object's centre in the posterior's frame
     centre_sd_mm : standard deviation of the centre in its least certain direction; nan where unknown
-    rotvec_deg : (3,) rotation vector of the part in the posterior's frame
+    rotvec_deg : (3,) rotation vector of the object in the posterior's frame
     rotation_sd_deg : standard deviation of the rotation about its least certain axis; nan where unknown
-    told : share (0..1) of each motion of ``MOTIONS`` that the contact tells
+    observable : share (0..1) of each motion of ``MOTIONS`` that the contact constrains
     """
 
     probability: float
@@ -44,7 +44,7 @@ class ModeSummary:
     centre_sd_mm: float
     rotvec_deg: Array
     rotation_sd_deg: float
-    told: dict[str, float]
+    observable: dict[str, float]
 
     def cells(self, number: int) -> list[str]:
         """The mode as a row of a table under ``HEADINGS``."""
@@ -55,16 +55,17 @@ class ModeSummary:
             _sd(self.centre_sd_mm, 2),
             _list(self.rotvec_deg, 1),
             _sd(self.rotation_sd_deg, 1),
-            self.told_in_words(),
+            self.in_words(),
         ]
 
-    def told_in_words(self) -> str:
-        """Which motions the contact tells, e.g. ``"fixed: shift x, shift y, shift z; partly: tilt x; not: turn z"``."""
+    def in_words(self) -> str:
+        """The observable directions, e.g. ``"fixed: shift x, shift y, shift z; partly: tilt x; not: turn z"``."""
         groups: dict[str, list[str]] = {"fixed": [], "partly": [], "not": []}
-        for motion, share in self.told.items():
-            groups["fixed" if share >= TOLD else "not" if share <= HARDLY else "partly"].append(motion)
+        for motion, share in self.observable.items():
+            how = "fixed" if share >= OBSERVABLE else "not" if share <= UNOBSERVABLE else "partly"
+            groups[how].append(motion)
         if len(groups["not"]) == len(MOTIONS):
-            return "unknown"  # every contact tells at least the depth: this mode is not one that registration found
+            return "unknown"  # every contact constrains at least the depth: registration did not find this mode
         if len(groups["fixed"]) == len(MOTIONS):
             return "fixed: all six motions"
         return "; ".join(f"{how}: {', '.join(motions)}" for how, motions in groups.items() if motions)
@@ -76,7 +77,7 @@ def summarise(mode: Mode, centre: ArrayLike, contact_centre: ArrayLike = (0.0, 0
     Parameters
     ----------
     mode : from ``Posterior.modes``
-    centre : (3,) the part's centre, object frame [m]
+    centre : (3,) the object's centre, object frame [m]
     contact_centre : (3,) where the contact is, in the posterior's frame [m]; tilts and turns are about it
     """
     T, c = np.asarray(mode.T, float), np.asarray(centre, float)
@@ -88,15 +89,15 @@ def summarise(mode: Mode, centre: ArrayLike, contact_centre: ArrayLike = (0.0, 0
         centre_sd_mm=1e3 * _largest_sd(move @ mode.covariance @ move.T),
         rotvec_deg=np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec()),
         rotation_sd_deg=float(np.degrees(_largest_sd(np.asarray(mode.covariance)[:3, :3]))),
-        told=told(mode, contact_centre),
+        observable=observable_share(mode, contact_centre),
     )
 
 
-def told(mode: Mode, about: ArrayLike) -> dict[str, float]:
-    """Share (0..1) of each motion of ``MOTIONS`` about the point ``about`` (3,) [m] that the contact tells.
+def observable_share(mode: Mode, about: ArrayLike) -> dict[str, float]:
+    """Share (0..1) of each motion of ``MOTIONS`` about the point ``about`` (3,) [m] that the contact constrains.
 
-    What is not told is a space of motions. Carried from the object's origin to the point, it is told by how much of each
-    motion lies outside it; a long lever between the two would hide a lost rotation otherwise.
+    The unobservable motions form a subspace. It is carried from the object's origin to the point, as a long lever between
+    the two would hide a lost rotation otherwise. The share of a motion is what lies outside this subspace.
     """
     R, length = mode.T[:3, :3], mode.length
     rows = np.asarray(mode.observable, float).reshape(-1, 6)
@@ -134,41 +135,39 @@ def summaries_of(posterior: Posterior, modes: Sequence[Mode]) -> list[ModeSummar
 
 
 def facts(posterior: Posterior) -> list[str]:
-    """What the whole distribution amounts to, one sentence each."""
+    """Sentences on the whole distribution: contacts, information gain, number of poses."""
     if not posterior.contact:
         several = len(posterior.observations) > 1
         return [f"No contact was found in {'any of the images' if several else 'the image'}."]
-    known = max(0.0, -posterior.entropy_nats)
+    gain = max(0.0, -posterior.entropy_nats)
     empty = [str(number) for number, touched in enumerate(posterior.settings.get("touched", []), 1) if not touched]
-    said = (
-        [f"No contact on sensor {' and '.join(empty)}: it counts against poses that would touch there."]
-        if empty
-        else []
-    )
-    found = sorted({o.method for o in posterior.observations if o.method})
-    if found:
-        said.append(f"The contact was found in the {' and in the '.join(found)} way.")
-    left = f"one part in {np.exp(min(known, 700)):,.0f} of all poses that touch is left"
-    if known >= 14:
-        left = "less than one part in a million of all poses that touch is left"
-    elif known < 0.7:
-        left = f"{100 * np.exp(-known):.0f} % of all poses that touch are left"
+    lines = []
+    if empty:
+        lines.append(f"Sensor {' and '.join(empty)} has no contact: poses that would touch there are less probable.")
+    methods = sorted({o.method for o in posterior.observations if o.method})
+    if methods:
+        lines.append(f"Method of contact detection: {' and '.join(methods)}.")
+    left = f"1 in {np.exp(min(gain, 700)):,.0f}"
+    if gain >= 14:
+        left = "less than 1 in a million"
+    elif gain < 0.7:
+        left = f"{100 * np.exp(-gain):.0f} %"
     return [
-        *said,
-        f"{known:.1f} nats are known: {left}.",
-        f"{posterior.effective_poses:,.0f} of the grid's {len(posterior.index):,} poses carry the probability.",
+        *lines,
+        f"Information gain: {gain:.1f} nats; {left} of all touching poses remains.",
+        f"{posterior.effective_poses:,.0f} of {len(posterior.index):,} grid poses carry the probability.",
     ]
 
 
 def caution(modes: Sequence[ModeSummary]) -> list[str]:
-    """What to think of the first mode before its pose is believed; nothing if it holds half of the probability."""
+    """A caution about the first mode; nothing if it holds half of the probability."""
     if not modes or modes[0].probability >= 0.5:
         return []
-    return [f"The part is probably not at mode 1, which holds {percent(modes[0].probability)}."]
+    return [f"The object is probably not at mode 1, which holds {percent(modes[0].probability)}."]
 
 
 def percent(share: float) -> str:
-    """A share (0..1) in percent; what is small is not written as nothing."""
+    """A share (0..1) in percent; a small share is not written as 0."""
     return f"{100 * share:.1f} %" if share >= 0.001 else "< 0.1 %"
 
 

@@ -1,4 +1,4 @@
-// The part at each mode over the sensors' windows, turned by mouse, finger or keys. No library, no network.
+// The object at each mode over the sensors' windows, turned by mouse, finger or keys. No library, no network.
 (() => {
   "use strict";
   const root = document.getElementById("scene");
@@ -46,7 +46,7 @@
      out vec4 pixel;
      void main() {
        pixel = colour;
-       if (kind == 1) { // the part, each face lit as it lies
+       if (kind == 1) { // the object, each face lit as it lies
          vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
          pixel.rgb *= 0.45 + 0.55 * abs(normal.z);
        } else if (kind == 2) { // where it may have been touched, from blue to yellow
@@ -141,7 +141,7 @@
       tab.setAttribute("aria-selected", i === mode);
       tab.tabIndex = i === mode ? 0 : -1;
     });
-    canvas.setAttribute("aria-label", `the part at ${tabs[mode].textContent.trim()}`);
+    canvas.setAttribute("aria-label", `the object at ${tabs[mode].textContent.trim()}`);
     draw();
   };
   const turned = (right, up) => {

@@ -1,4 +1,4 @@
-"""What the page's 3D view shows: the part at each mode, the sensors' windows, and where the part may have been touched."""
+"""Content of the page's 3D view: the object at each mode, the sensors' windows, and the probable places of the contact."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NEAR = 0.02  # of the object's diameter, over which a touch spreads
 
 def turnable(posterior: Posterior, modes: Sequence[Mode], shown: Sequence[Shown]) -> dict[str, Any]:
     """The content of the view, ready for JSON: arrays as base64 of little-endian numbers, lengths in millimetres, all but the
-    part's own points in the first sensor's frame."""
+    object's own points in the first sensor's frame."""
     T_sensor_frame = inverse(posterior.T_frame_sensor)
     T = np.array([_mm(T_sensor_frame @ mode.T) for mode in modes])
     mesh = coarser(posterior.mesh, _FACES)
@@ -37,7 +37,7 @@ def turnable(posterior: Posterior, modes: Sequence[Mode], shown: Sequence[Shown]
         T_first = _mm(T_sensor_frame @ one.T_frame_sensor)
         windows.append(apply(T_first, 1e3 * one.sensor.corners))
         outlines += [apply(T_first, 1e3 * line) for line in outlines_of(one.observation.contact.mask, one.sensor)]
-    # a sensor that felt nothing may stand far away
+    # a sensor without contact may be far away
     near = [window for window, one in zip(windows, shown, strict=True) if one.observation.contact.mask.any()]
     seen = np.concatenate([*near, apply(T[0], vertices)])
     middle = 0.5 * (seen.min(0) + seen.max(0))

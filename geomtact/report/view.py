@@ -1,4 +1,4 @@
-"""A picture of the part on the sensor's window, by casting parallel rays from beside the sensor."""
+"""A picture of the object on the sensor's window, by casting parallel rays from beside the sensor."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from geomtact.sensing.sensor import Sensor
 
 _PART, _WINDOW, _BACKGROUND = np.array([0.72, 0.75, 0.80]), np.array([0.0, 0.45, 0.70]), np.array([1.0, 1.0, 1.0])
 _WINDOW_OPACITY = 0.35
-_SHOWN = 4  # diagonals of the window around it, within which the part is shown
+_SHOWN = 4  # diagonals of the window around it, within which the object is shown
 # The viewer stands beyond the image's top edge, so x points right and z up, a little to the left of the middle.
 _TOWARDS_VIEWER = np.array([-0.45, -0.75, 0.5])
 
@@ -40,7 +40,7 @@ class PartView:
 
 
 class Painter:
-    """Draws one part at several poses; its ray caster is built once."""
+    """Draws one object at several poses; its ray caster is built once."""
 
     def __init__(self, mesh: Mesh, sensor: Sensor, pixels: int = 300):
         self.mesh, self.sensor, self.pixels = mesh, sensor, pixels
@@ -48,7 +48,7 @@ class Painter:
         self._scene = scene_of((mesh.vertices - self._centre).astype(np.float32)[mesh.faces])
 
     def paint(self, T_sensor_object: Array) -> PartView:
-        """The part at ``T_sensor_object`` (4, 4), with the sensor's window; far ends of a very long part are cut off."""
+        """The object at ``T_sensor_object`` (4, 4), with the sensor's window; far ends of a very long object are cut off."""
         back = _TOWARDS_VIEWER / np.linalg.norm(_TOWARDS_VIEWER)
         right = np.cross([0.0, 0.0, 1.0], back)
         right /= np.linalg.norm(right)

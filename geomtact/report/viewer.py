@@ -1,4 +1,4 @@
-"""A live view in the browser: the sensor, what it feels, and where the part may be (extra ``viz``)."""
+"""A live view in the browser: the sensor, its contact and the distribution of the object's pose (extra ``viz``)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from geomtact.se3 import Array, apply
 if TYPE_CHECKING:
     from geomtact.inference.posterior import Posterior
 
-_FACES = 3_000  # of the part, that are drawn so often
+_FACES = 3_000  # of the object, as it is drawn often
 _POSES = 60  # of the posterior, that are drawn through one another
 _FAINT = 0.06  # opacity of each
 _CM = 100.0  # a unit of the scene is a centimetre
@@ -29,11 +29,11 @@ _WINDOW, _CONTACT = (110, 110, 110), (20, 20, 20)
 
 
 class Viewer:
-    """A page that shows the last posterior it was given: the part at poses drawn from it, and at its first mode.
+    """A page that shows the last posterior it was given: the object at poses drawn from it, and at its first mode.
 
     Parameters
     ----------
-    mesh : of the part
+    mesh : of the object
     host, port : where the page is served; the next free port, if this one is taken
 
     Raises
@@ -50,7 +50,7 @@ class Viewer:
         name = socket.gethostname() if host == _EVERY else host
         self.url = f"http://{name}:{self._server.get_port()}"
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
-        self._told = self._server.gui.add_markdown("")
+        self._summary = self._server.gui.add_markdown("")
         self._image = self._server.gui.add_image(np.zeros((1, 1, 3), np.uint8), label="image")
         mesh = coarser(mesh, _FACES)
         shape = _CM * mesh.vertices, np.asarray(mesh.faces)
@@ -82,14 +82,17 @@ class Viewer:
         )
         modes = posterior.modes(1) if contact else []
         self._drawn.visible = self._mode.visible = bool(modes)
-        told = "no contact"
+        summary = "no contact"
         if modes:
             some, first = posterior.sample(_POSES, self._rng), modes[0]
             self._drawn.batched_wxyzs = _wxyz(some)
             self._drawn.batched_positions = np.float32(_CM) * some[:, :3, 3].astype(np.float32)
             self._mode.wxyz, self._mode.position = _wxyz(first.T), _CM * first.T[:3, 3]
-            told = f"first mode {100 * first.probability:.1f} %, entropy {posterior.entropy_nats:.1f} nats"
-        self._told.content = "\n\n".join([f"**{posterior.mesh.name}, frame {number}**", told, *posterior.warnings])
+            gain = max(0.0, -posterior.entropy_nats)
+            summary = f"mode 1: {100 * first.probability:.1f} %, information gain {gain:.1f} nats"
+        self._summary.content = "\n\n".join(
+            [f"**{posterior.mesh.name}, frame {number}**", summary, *posterior.warnings]
+        )
 
     def stop(self) -> None:
         """Serve the page no longer."""
@@ -97,7 +100,7 @@ class Viewer:
 
 
 def check_viewer(host: str) -> None:
-    """Refuse what a page cannot be served by, before any work is done.
+    """Refuse to serve where viser or the address is missing, before any work is done.
 
     Raises
     ------
@@ -111,7 +114,7 @@ def check_viewer(host: str) -> None:
             pass
     except OSError as error:
         raise UsageError(
-            f"--host {host}: no address of this machine ({error.strerror or error}); give 127.0.0.1, or 0.0.0.0 for all of them"
+            f"--host {host}: no address of this machine ({error.strerror or error}); give 127.0.0.1, or 0.0.0.0 for all"
         ) from None
 
 

@@ -29,7 +29,7 @@ def write_all(
     shown: Sequence[Shown],
     settings: Mapping[str, Any] | None = None,
     timing_ms: Mapping[str, float] | None = None,
-    parts: Sequence[Mapping[str, Any]] | None = None,
+    candidates: Sequence[Mapping[str, Any]] | None = None,
     reports: Sequence[str] = REPORTS,
 ) -> dict[str, Any]:
     """Write posterior.npz, result.json and the reports into ``folder``, which is made if need be.
@@ -40,7 +40,7 @@ def write_all(
     posterior, modes : what was found
     shown : what each sensor showed, see ``report.shown``
     settings, timing_ms : added to the posterior's own in result.json
-    parts : of which it may be, where there are several
+    candidates : of an object identification, the most probable first
     reports : which of ``REPORTS`` are written: report.html, report.png
 
     Returns
@@ -56,7 +56,7 @@ def write_all(
     if picture is not None and "png" in reports:
         write_bytes(folder / "report.png", picture.whole)
     timing = {**(timing_ms or {}), "report": 1e3 * (time.perf_counter() - began)}
-    content = result(posterior, modes, settings, timing, parts)
+    content = result(posterior, modes, settings, timing, candidates)
     if picture is not None and "html" in reports:
         view = turnable(posterior, modes, shown) if modes else None
         html = page(content, table(summaries), [*facts(posterior), *caution(summaries)], picture.bands, view)
