@@ -173,7 +173,7 @@ def test_an_image_that_is_broken_is_skipped_but_the_first_is_not(localizer, caps
 def test_the_command_line(localizer, readings, monkeypatch, tmp_path):
     module = importlib.import_module("geomtact.cli.localize")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "open_localizer", lambda *_, **__: localizer)
+    monkeypatch.setattr("geomtact.cli.request.Request.open", lambda *_, **__: localizer)
     app = typer.Typer()
     app.command()(one_line_errors(module.localize))
 

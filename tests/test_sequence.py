@@ -413,7 +413,7 @@ def command(flat_nut, monkeypatch, tmp_path):
     module = importlib.import_module("geomtact.cli.track")  # the package has the command itself by this name
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "open_localizer", lambda *_, **__: flat_nut)
+    monkeypatch.setattr("geomtact.cli.request.Request.open", lambda *_, **__: flat_nut)
     app = typer.Typer()
     app.command()(one_line_errors(module.track))
 
@@ -497,7 +497,7 @@ def test_track_follows_a_folder_that_is_being_filled(command, folder, monkeypatc
 
 
 def test_track_tells_what_is_wrong_in_one_line(command, folder):
-    for source, told in (("absent", "no such folder, video or camera"), ("text.avi", "cannot be read as a video")):
+    for source, told in (("absent", "no such folder, video or camera"), ("text.avi", "OpenCV cannot read this video")):
         (folder.parent / "text.avi").write_text("no video")
         assert told in command(source, status=3).stderr.splitlines()[-1]
     assert "is one image" in command(folder / "f_2.png", status=2).stderr
@@ -506,7 +506,7 @@ def test_track_tells_what_is_wrong_in_one_line(command, folder):
     (folder / "f_3.png").write_bytes(b"broken")
     assert "frame 2: " in command(folder, "--tum", "some.txt", status=3).stderr
     assert len((folder.parent / "some.txt").read_text().splitlines()) == 1, "what was known before it is kept"
-    assert "expected a file in a folder that is there" in command(folder, "--tum", "no/x.txt", status=2).stderr
+    assert "expected a file in an existing folder" in command(folder, "--tum", "no/x.txt", status=2).stderr
     lines = [json.loads(s) for s in command(folder, "--skip-broken").stdout.splitlines()]
     assert [bool(line["warnings"]) for line in lines] == [False, True, False, False]
     write_image(folder / "f_2.png", np.zeros((240, 320), bool))

@@ -86,8 +86,7 @@ def test_a_mask_of_zeros_and_ones_is_shown_white_on_black(shown, flat_nut, a_tou
 def test_the_command_shows_every_image(flat_nut, a_touch, tmp_path, monkeypatch, cache_dir):
     seen = []
     monkeypatch.setattr(Viewer, "show", lambda self, n, posterior: seen.append((n, posterior.contact)))
-    module = importlib.import_module("geomtact.cli.track")  # the package has the command itself by this name
-    monkeypatch.setattr(module, "open_localizer", lambda *_, **__: flat_nut)
+    monkeypatch.setattr("geomtact.cli.request.Request.open", lambda *_, **__: flat_nut)
     width, height = flat_nut.sensor.image_size_px
     write_image(tmp_path / "0.png", np.zeros((height, width), bool))
     words = [

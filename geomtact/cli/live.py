@@ -3,18 +3,47 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from geomtact.cli.frames import Frame
+from geomtact.cli.frames import Frame, camera_frames, newest_in
 from geomtact.cli.lines import line_of, to_line
+from geomtact.cli.request import Request
 from geomtact.cli.shell import tell
-from geomtact.errors import InputError
+from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from geomtact.inference.localizer import Localizer
+
+
+def follow(request: Request, images: Sequence[Path], camera: str | None) -> bool:
+    """Localize the newest image of a camera, or of the folder in ``images``, again and again; whether any showed contact."""
+    # a missing camera is reported before minutes go into an index
+    frames = newest_in(images[0]) if camera is None else camera_frames(camera, request.mounted())
+    options = {"kind": request.kind, "prior": request.prior, "effort": request.effort, "seed": request.seed}
+    return localize_live(request.open(), frames, request.values["background"], options)
+
+
+def check_live(images: list[Path], camera: str | None, watch: bool, unsuited: list[str]) -> None:
+    """Refuse what does not go with --camera or --watch.
+
+    Raises
+    ------
+    UsageError, InputError
+    """
+    if camera is not None and (images or watch):
+        raise UsageError("--camera replaces images and --watch; give one of them")
+    if watch and len(images) != 1:
+        raise UsageError(f"--watch: expected one folder, got {len(images)}")
+    if watch and not images[0].is_dir():
+        raise InputError(f"--watch {images[0]}: expected the folder that receives images; give it")
+    if unsuited:
+        raise UsageError(
+            f"{unsuited[0]} excludes --camera and --watch, which print a JSON line per image; leave it out"
+        )
 
 
 def localize_live(

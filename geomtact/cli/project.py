@@ -13,19 +13,6 @@ FILE = "geomtact.toml"
 KEYS = ("object", "unit", "sensor", "background", "effort")
 
 
-def given_of(
-    object_name: str | None, unit: str | None, sensor: str | None, background: Path | None, effort: str | None
-) -> dict[str, str | None]:
-    """What the command line gives, as :func:`resolve` takes it."""
-    return {
-        "object": object_name,
-        "unit": unit,
-        "sensor": sensor,
-        "background": None if background is None else str(background),
-        "effort": effort,
-    }
-
-
 def resolve(
     given: Mapping[str, str | None], metadata: Mapping[str, str] | None = None, start: Path | None = None
 ) -> tuple[dict[str, str | None], dict[str, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +14,6 @@ from geomtact.cli.lines import line_of, to_line
 from geomtact.cli.options import (
     Background,
     CacheDir,
-    Effort,
     EffortName,
     Kind,
     KindName,
@@ -26,11 +25,9 @@ from geomtact.cli.options import (
     Seed,
     SensorName,
     Unit,
-    check_name,
 )
-from geomtact.cli.prepare import open_localizer
-from geomtact.cli.project import given_of, resolve
-from geomtact.cli.shell import NO_CONTACT, check_file, posterior_file, tell
+from geomtact.cli.request import Request
+from geomtact.cli.shell import NO_CONTACT, check_file, tell
 from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text
 
@@ -95,11 +92,21 @@ def track(
     """
     check_file(tum, "--tum")
     check_file(report, "--report")
-    given = given_of(object_name, unit, sensor, background, effort)
-    options: dict[str, Any] = {"kind": kind, "prior": prior, "max_cells": max_cells, "skip_broken": skip_broken}
-    options["seed"] = seed
-    options["mounting"] = Mounting(rotate, mirror)
-    localizer, posteriors = open_track(source, given, follow, motion_mm, scorer, max_poses, cache_dir, **options)
+    localizer, posteriors = open_track(
+        source,
+        follow,
+        skip_broken,
+        motion_mm,
+        {"object": object_name, "unit": unit, "sensor": sensor, "background": background, "effort": effort},
+        max_cells=max_cells,
+        kind=kind,
+        prior=prior,
+        scorer=scorer,
+        seed=seed,
+        max_poses=max_poses,
+        cache_dir=cache_dir,
+        mounting=Mounting(rotate, mirror),
+    )
 
     from geomtact.report.exchange import tum_line
 
@@ -134,47 +141,47 @@ def track(
 
 def open_track(
     source: str,
-    given: dict[str, str | None],
     follow: bool,
-    motion_mm: float,
-    scorer: str | None,
-    max_poses: int | None,
-    cache_dir: Path | None,
-    *,
-    kind: str,
     skip_broken: bool,
-    seed: int,
-    mounting: Mounting,
-    prior: Path | None = None,
+    motion_mm: float,
+    given: Mapping[str, str | Path | None],
     max_cells: int | None = None,
+    **options: Any,
 ) -> tuple[Localizer, Iterator[tuple[float | None, Posterior]]]:
-    """The localizer, and each frame's time, if the source has one, and posterior; parameters as of :func:`track`."""
+    """The localizer, and each frame's time, if the source has one, and posterior.
+
+    Parameters as of :func:`track`; ``given`` and ``options`` as of :meth:`Request.of`.
+    """
     from geomtact.sensing.reading import read_observation
 
-    check_name("kind", kind, Kind)
-    prior = prior and posterior_file(prior, "--prior")
     if follow and not Path(source).is_dir():
         raise UsageError(f"--follow: expected a folder to watch, got {source}")
-    values, sources = resolve(given, _metadata(source))
-    effort = values["effort"] or Effort.balanced.value
-    check_name("effort", effort, Effort, sources.get("effort"))
-    sensor = mounting.of(values["sensor"]) if values["sensor"] else None
+    request = Request.of(given, _metadata(source), **options)
+    sensor, background = request.mounted(), request.values["background"]
 
     def check(image: Any) -> None:
         if sensor is not None and not skip_broken:
-            read_observation(image, sensor, kind, values["background"])
+            read_observation(image, sensor, request.kind, background)
 
-    frames = all_frames(source, follow, sensor, check, masks=kind == Kind.mask.value)
-    localizer = open_localizer(values, sources, scorer, cache_dir, max_poses, prior, mounting=mounting)
+    frames = all_frames(source, follow, sensor, check, masks=request.kind == Kind.mask.value)
+    localizer = request.open()
 
     from geomtact.inference.motion import UniformBall
     from geomtact.inference.sequence import track as followed
 
-    options: dict[str, Any] = {"kind": kind, "background": values["background"], "prior": prior, "effort": effort}
-    options |= {"motion": UniformBall(1e-3 * motion_mm), "most": max_cells}
-    options["on_error"] = "skip" if skip_broken else "raise"
     times: deque[float | None] = deque()
-    posteriors = followed(localizer, _images(frames, times), seed=seed, **options)
+    posteriors = followed(
+        localizer,
+        _images(frames, times),
+        kind=request.kind,
+        background=background,
+        prior=request.prior,
+        effort=request.effort,
+        seed=request.seed,
+        motion=UniformBall(1e-3 * motion_mm),
+        most=max_cells,
+        on_error="skip" if skip_broken else "raise",
+    )
     return localizer, ((times.popleft(), posterior) for posterior in posteriors)
 
 

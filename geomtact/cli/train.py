@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from geomtact.cli.apart import Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
 from geomtact.cli.options import Seed, Unit
+from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
 from geomtact.cli.parts import parts_of
 from geomtact.cli.shell import progress_bar, tell
 from geomtact.errors import InputError, UsageError

@@ -22,7 +22,6 @@ from geomtact.cli.options import (
     SensorName,
     Unit,
 )
-from geomtact.cli.project import given_of
 from geomtact.cli.shell import NO_CONTACT, tell
 from geomtact.cli.track import (
     MOTION_MM,
@@ -67,18 +66,17 @@ def view(
     from geomtact.report.viewer import Viewer, check_viewer
 
     check_viewer(host)  # before minutes go into an index
-    given = given_of(object_name, unit, sensor, background, effort)
     localizer, posteriors = open_track(
         source,
-        given,
         follow,
+        skip_broken,
         motion_mm,
-        scorer,
-        max_poses,
-        cache_dir,
+        {"object": object_name, "unit": unit, "sensor": sensor, "background": background, "effort": effort},
         kind=kind,
-        skip_broken=skip_broken,
+        scorer=scorer,
         seed=seed,
+        max_poses=max_poses,
+        cache_dir=cache_dir,
         mounting=Mounting(rotate, mirror),
     )
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from geomtact.cli.apart import Command, Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
+from geomtact.cli.parallel import Command, Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
 from tools.studies.common import study_file
 
 
