@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from geomtact import Localizer, Mesh, Posterior, Sensor
 from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.report.shown import shown_of
+from geomtact.report.sensor_image import sensor_images
 from geomtact.report.write import write_all
 from geomtact.se3 import inverse, random_rotations, transform
 
@@ -178,7 +178,7 @@ def test_readings_of_another_simulator_run_from_rgb_to_a_report(marker, tmp_path
         assert posterior.contact and posterior.observation.kind == "reading"
         assert posterior.entropy_nats < 0
     posterior = read[0][0]
-    write_all(tmp_path / "out", posterior, posterior.modes(3), shown_of(posterior, localizer), {}, {})
+    write_all(tmp_path / "out", posterior, posterior.modes(3), sensor_images(posterior, localizer), {}, {})
     names = {"result.json", "posterior.npz", "report.html", "report.png"}
     assert names <= {path.name for path in (tmp_path / "out").iterdir()}
 

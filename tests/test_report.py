@@ -23,7 +23,7 @@ from geomtact.files import write_whole
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
 from geomtact.report.result import plain, result, to_text
-from geomtact.report.shown import Shown, shown_of
+from geomtact.report.sensor_image import SensorImage, sensor_images
 from geomtact.report.summary import (
     MOTIONS,
     caution,
@@ -61,7 +61,7 @@ class FakeIndex:
 
 def alone(posterior, simulate):
     """The one sensor's image."""
-    return [Shown(posterior.sensor, posterior.T_frame_sensor, posterior.observations[0], simulate)]
+    return [SensorImage(posterior.sensor, posterior.T_frame_sensor, posterior.observations[0], simulate)]
 
 
 @pytest.fixture(scope="module")
@@ -441,7 +441,7 @@ def test_several_sensors_are_shown_in_their_order(plug, rng):
     far = se3.transform(np.eye(3), [0, 0, 0.5]) @ sensors[0]
     images = [np.zeros_like(touches[0].mask), *(touch.mask for touch in touches)]
     posterior = plug.localize(images, "mask", None, np.stack([far, *sensors]))
-    shown = shown_of(posterior, plug)
+    shown = sensor_images(posterior, plug)
     assert [one.name for one in shown] == ["sensor 1", "sensor 2", "sensor 3"]
     for one, image, at in zip(shown, images, [far, *sensors], strict=True):
         np.testing.assert_array_equal(one.observation.contact.mask, image)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from geomtact.cli.frames import Frame, camera_frames, newest_in
-from geomtact.cli.lines import line_of, to_line
 from geomtact.cli.request import Request
 from geomtact.cli.shell import tell
 from geomtact.errors import InputError, UsageError
@@ -54,6 +53,8 @@ def localize_live(
     Without a ``background``, the first tactile image without contact serves as that of the following ones. An image that
     cannot be read brings a warning and is skipped, unless it is the first.
     """
+    from geomtact.report.result import frame_line, to_line
+
     touched = False
     try:
         for n, frame in enumerate(frames, 1):
@@ -68,7 +69,7 @@ def localize_live(
             touched |= posterior.contact
             if background is None and not posterior.contact and posterior.observation.kind == "reading":
                 background = frame.image
-            line = line_of(n, posterior)
+            line = frame_line(n, posterior)
             own = {
                 "image": frame.image if isinstance(frame.image, str) else None,
                 "time": frame.time,

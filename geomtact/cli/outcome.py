@@ -49,10 +49,10 @@ def give(
     }
     candidates = [asdict(candidate) for candidate in found.candidates] if len(found.candidates) > 1 else None
     if out is not None:
-        from geomtact.report.shown import shown_of
+        from geomtact.report.sensor_image import sensor_images
         from geomtact.report.write import write_all
 
-        shown = shown_of(posterior, found.localizer)
+        shown = sensor_images(posterior, found.localizer)
         content = write_all(out, posterior, modes, shown, settings, timing, candidates, reports)
     elif as_json:
         content = result(posterior, modes, settings, timing, candidates)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.frames import Frame, all_frames, listed
-from geomtact.cli.lines import line_of, to_line
 from geomtact.cli.options import (
     Background,
     CacheDir,
@@ -109,13 +108,14 @@ def track(
     )
 
     from geomtact.report.exchange import tum_line
+    from geomtact.report.result import frame_line, to_line
 
     lines: list[str] = []
     shown: list[dict[str, Any]] = []
     touched = whole = False
     try:
         for n, (at, posterior) in enumerate(posteriors, 1):
-            line = line_of(n, posterior) | {"surprise_nats": posterior.settings["surprise_nats"]}
+            line = frame_line(n, posterior) | {"surprise_nats": posterior.settings["surprise_nats"]}
             touched |= posterior.contact
             typer.echo(to_line(line))
             if line["T"] is not None:

@@ -1,4 +1,4 @@
-"""Colours of all figures, and a PNG without metadata of the program that drew it."""
+"""Colours of all figures, images brought to 0..1, and PNGs without metadata of the program that drew them."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Iterable, Iterator
 from itertools import cycle
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.se3 import Array
+
 _T = TypeVar("_T")
 
-COLOURS = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-)  # Okabe and Ito: distinct for colour-blind readers
+# Okabe and Ito's, distinct for colour-blind readers
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+BARS, OBSERVED, SIMULATED, FIRST = COLOURS[0], COLOURS[1], COLOURS[5], "#000000"
 
 
 def coloured(what: Iterable[_T]) -> Iterator[tuple[_T, str]]:
@@ -29,3 +29,27 @@ def png(canvas: Any) -> bytes:
     out = io.BytesIO()
     canvas.print_png(out, metadata={"Software": None})
     return out.getvalue()
+
+
+def png_of(pixels: NDArray[np.uint8], **options: Any) -> bytes:
+    """An image (H, W, 3) as PNG."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(out, "PNG", **options)
+    return out.getvalue()
+
+
+def rgb(colour: str) -> Array:
+    """RGB in 0..1 of a colour ``#rrggbb``."""
+    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+
+
+def displayable(image: Any) -> Array:
+    """Any image as read, (H, W) or (H, W, 3), brought to 0..1."""
+    shown = np.asarray(image)
+    if shown.dtype == np.uint8:
+        return shown / 255.0 if shown.max(initial=0) > 1 else shown.astype(float)
+    shown = np.nan_to_num(shown.astype(float))
+    low, high = min(shown.min(initial=0), 0.0), shown.max(initial=0)
+    return (shown - low) / (high - low) if high > low else np.zeros(shown.shape)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from geomtact.report.canvas import BARS, FIRST, OBSERVED, SIMULATED, displayable, png_of, rgb
 from geomtact.report.marginals import Samples, marginals
-from geomtact.report.shown import Shown
+from geomtact.report.sensor_image import SensorImage
 from geomtact.report.summary import ModeSummary, caution, facts, percent
 from geomtact.report.view import Painter, PartView
 from geomtact.se3 import Array, inverse
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from geomtact.inference.modes import Mode
     from geomtact.inference.posterior import Posterior
 
-# Okabe and Ito's colours, told apart by colour-blind readers too.
-OBSERVED, SIMULATED, FIRST, BARS = "#D55E00", "#56B4E9", "#000000", "#0072B2"
 DPI, WIDTH = 100, 14.0
 # Heights in inches; those of the touch and of the modes, without the object, a row for each sensor
 _BANDS = {"touch": 3.9, "modes": 2.9, "marginals": 2.9}
@@ -42,7 +40,7 @@ class Picture:
 
 
 def draw(
-    posterior: Posterior, modes: Sequence[Mode], summaries: Sequence[ModeSummary], shown: Sequence[Shown]
+    posterior: Posterior, modes: Sequence[Mode], summaries: Sequence[ModeSummary], shown: Sequence[SensorImage]
 ) -> Picture:
     """Draw the report.
 
@@ -50,7 +48,7 @@ def draw(
     ----------
     posterior : what was found
     modes, summaries : the modes to show, at most five, and their plain numbers
-    shown : what each sensor showed
+    shown : each sensor's image
     """
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -80,15 +78,17 @@ def draw(
     cut = {name: pixels[edges[k] : edges[k + 1]] for k, name in enumerate(names)}
     # the page has its own text and table instead of the words beside the touch
     cut["touch"] = cut["touch"][:, :words_start]
-    return Picture(_png(pixels), {name: _png(band) for name, band in cut.items()})
+    return Picture(png_of(pixels), {name: png_of(band) for name, band in cut.items()})
 
 
-def _touch(band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummary], shown: Sequence[Shown]) -> Axes:
+def _touch(
+    band: SubFigure, posterior: Posterior, summaries: Sequence[ModeSummary], shown: Sequence[SensorImage]
+) -> Axes:
     """The images, the contacts and a summary in words, whose axes are returned."""
     grid = band.add_gridspec(len(shown), 3)
     for row, one in enumerate(shown):
         contact, of = one.observation.contact, f", {one.name}" if one.name else ""
-        _in_window(band.add_subplot(grid[row, 0]), one.sensor, _displayable(one.observation.image), f"The image{of}")
+        _in_window(band.add_subplot(grid[row, 0]), one.sensor, displayable(one.observation.image), f"The image{of}")
         axes = band.add_subplot(grid[row, 1])
         outline(axes, one.sensor, contact, OBSERVED)
         kind = one.observation.kind
@@ -110,7 +110,7 @@ def _modes(
     modes: Sequence[Mode],
     views: Sequence[PartView],
     part: float,
-    shown: Sequence[Shown],
+    shown: Sequence[SensorImage],
 ) -> None:
     """The contacts simulated at each mode, a row for each sensor, and below them the object, ``part`` inches high."""
     grid = band.subplots(len(shown) + 1, _COLUMNS, height_ratios=[_BANDS["modes"]] * len(shown) + [part])
@@ -120,7 +120,7 @@ def _modes(
         for axes, one in zip(grid[:, column], shown, strict=False):
             contact = one.at(mode.T)
             there = np.ones((*contact.mask.shape, 3))
-            there[contact.mask] = _rgb(SIMULATED)
+            there[contact.mask] = rgb(SIMULATED)
             title = f"mode {column + 1}: {percent(mode.probability)}"
             _in_window(axes, one.sensor, there, f"{title}, {one.name}" if one.name else title, small=True)
             outline(axes, one.sensor, one.observation.contact, OBSERVED)
@@ -136,7 +136,7 @@ def _modes(
     band.legend(*above.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
 
 
-def _over(posterior: Posterior, shown: Sequence[Shown]) -> str:
+def _over(posterior: Posterior, shown: Sequence[SensorImage]) -> str:
     """The one of several sensors over which the object is drawn."""
     name = next((one.name for one in shown if one.observation is posterior.observations[0]), "")
     return f"over {name}" if name else ""
@@ -236,25 +236,3 @@ def _words(posterior: Posterior, summaries: Sequence[ModeSummary]) -> list[str]:
 def _area_mm2(contact: Contact, sensor: Sensor) -> float:
     window = 4e6 * float(np.prod(sensor.half_window))
     return float(contact.mask.mean()) * window
-
-
-def _displayable(image: Any) -> Array:
-    """Any image as read, (H, W) or (H, W, 3), brought to 0..1."""
-    shown = np.asarray(image)
-    if shown.dtype == np.uint8:
-        return shown / 255.0 if shown.max(initial=0) > 1 else shown.astype(float)
-    shown = np.nan_to_num(shown.astype(float))
-    low, high = min(shown.min(initial=0), 0.0), shown.max(initial=0)
-    return (shown - low) / (high - low) if high > low else np.zeros(shown.shape)
-
-
-def _rgb(colour: str) -> Array:
-    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
-
-
-def _png(pixels: np.ndarray) -> bytes:
-    from PIL import Image
-
-    out = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(out, "PNG")
-    return out.getvalue()

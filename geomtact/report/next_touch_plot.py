@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from geomtact.planning.actions import Touch
 from geomtact.planning.belief import draw_cells
 from geomtact.planning.next_touch import Action, ambiguity
-from geomtact.report.canvas import png
-from geomtact.report.figure import FIRST, SIMULATED
+from geomtact.report.canvas import COLOURS, FIRST, SIMULATED, png, rgb
 from geomtact.se3 import Array, apply, inverse, transform
 from geomtact.sensing.sensor import Sensor
 
@@ -21,8 +20,7 @@ if TYPE_CHECKING:
 
     from geomtact.inference.posterior import Posterior
 
-# Okabe and Ito's colours, which colour-blind readers tell apart too
-_COLOURS = ("#D55E00", "#0072B2", "#009E73")
+_COLOURS = (COLOURS[1], COLOURS[0], COLOURS[2])
 _OTHERS = "#999999"
 _POSES, _SHOWN, _BARS = 48, 5, 12
 _PIXELS = 160
@@ -162,7 +160,7 @@ def _shown(grid: NDArray, posterior: Posterior, touch: Touch, poses: Array) -> N
     for axes, there, pose in zip(grid, stopped, poses, strict=False):
         mask = posterior.space.caster.contact(posterior.sensor, inverse(there) @ pose).mask
         shown = np.ones((*mask.shape, 3))
-        shown[mask] = [int(SIMULATED[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+        shown[mask] = rgb(SIMULATED)
         axes.imshow(shown, extent=(-x, x, y, -y), interpolation="nearest")
         went = 1e3 * float((there[:3, 3] - touch.T_world_sensor[:3, 3]) @ touch.T_world_sensor[:3, 2])
         axes.set(title=f"stops after {went:.1f} mm" if mask.any() else "no contact", xlabel="x [mm]")

@@ -1,4 +1,4 @@
-"""``result.json``: a localization for scripts, under the schema ``geomtact/localization/1``."""
+"""JSON for scripts: ``result.json`` under the schema ``geomtact/localization/1``, and the lines of a sequence."""
 
 from __future__ import annotations
 
@@ -65,6 +65,27 @@ def result(
             "warnings": list(posterior.warnings),
         }
     )
+
+
+def frame_line(n: int, posterior: Posterior) -> dict[str, Any]:
+    """The ``n``-th image of a sequence: its contact (None if it could not be read), information and first mode."""
+    first = next(iter(posterior.modes(1)), None)
+    return {
+        "frame": n,
+        "contact": posterior.contact if posterior.observations else None,
+        "information_gain_nats": -posterior.entropy_nats if posterior.contact else None,
+        "entropy_nats": posterior.entropy_nats if posterior.contact else None,
+        "probability": None if first is None else first.probability,
+        "T": None if first is None else first.T,
+        "quat_xyzw": None if first is None else quat_xyzw(first.T),
+        "translation_mm": None if first is None else 1e3 * first.T[:3, 3],
+        "warnings": posterior.warnings,
+    }
+
+
+def to_line(content: Mapping[str, Any]) -> str:
+    """JSON text without a line break."""
+    return json.dumps(plain(content), allow_nan=False)
 
 
 def to_text(content: Mapping[str, Any]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.report.figure import OBSERVED, SIMULATED, _displayable, _rgb
+from geomtact.report.canvas import OBSERVED, SIMULATED, displayable, png_of, rgb
 from geomtact.report.page import STYLE
 from geomtact.report.result import plain
 from geomtact.report.summary import percent
@@ -82,14 +81,14 @@ def sequence_frame(
     out: dict[str, Any] = {key: line[key] for key in ("frame", "entropy_nats", "surprise_nats", "warnings")}
     out |= {"image": None, "contact": None, "summary": _summary(line)}
     for observation in posterior.observations[:1]:
-        shown = _displayable(observation.image)
+        shown = displayable(observation.image)
         colours = np.repeat(shown[..., None], 3, 2) if shown.ndim == 2 else shown
         out["image"] = _png(colours)
         mask = observation.contact.mask
         drawn = np.ones((*mask.shape, 3))
         if line["T"] is not None:
-            drawn[simulate(inverse(posterior.T_frame_sensor) @ line["T"]).mask] = _rgb(SIMULATED)
-        drawn[_border(mask)] = _rgb(OBSERVED)
+            drawn[simulate(inverse(posterior.T_frame_sensor) @ line["T"]).mask] = rgb(SIMULATED)
+        drawn[_border(mask)] = rgb(OBSERVED)
         out["contact"] = _png(drawn)
     return out
 
@@ -174,6 +173,4 @@ def _png(colours: Array) -> str:
 
     image = Image.fromarray(np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8))
     image.thumbnail((_WIDTH, _WIDTH))
-    out = io.BytesIO()
-    image.save(out, "PNG", optimize=True)
-    return base64.b64encode(out.getvalue()).decode("ascii")
+    return base64.b64encode(png_of(np.asarray(image), optimize=True)).decode("ascii")

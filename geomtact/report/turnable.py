@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomtact.geometry.mesh import coarser
-from geomtact.report.shown import Shown
+from geomtact.report.sensor_image import SensorImage
 from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.sensor import Sensor
 
@@ -24,7 +24,7 @@ _POINTS, _POSES, _SHAPE = 4000, 200, (24, 32)  # of the surface, of the posterio
 _NEAR = 0.02  # of the object's diameter, over which a touch spreads
 
 
-def turnable(posterior: Posterior, modes: Sequence[Mode], shown: Sequence[Shown]) -> dict[str, Any]:
+def turnable(posterior: Posterior, modes: Sequence[Mode], shown: Sequence[SensorImage]) -> dict[str, Any]:
     """The content of the view, ready for JSON: arrays as base64 of little-endian numbers, lengths in millimetres, all but the
     object's own points in the first sensor's frame."""
     T_sensor_frame = inverse(posterior.T_frame_sensor)

@@ -11,7 +11,7 @@ from geomtact.files import write_bytes, write_text
 from geomtact.report.figure import draw
 from geomtact.report.page import page
 from geomtact.report.result import result, to_text
-from geomtact.report.shown import Shown
+from geomtact.report.sensor_image import SensorImage
 from geomtact.report.summary import caution, facts, summaries_of, table
 from geomtact.report.turnable import turnable
 
@@ -26,7 +26,7 @@ def write_all(
     folder: Path,
     posterior: Posterior,
     modes: Sequence[Mode],
-    shown: Sequence[Shown],
+    shown: Sequence[SensorImage],
     settings: Mapping[str, Any] | None = None,
     timing_ms: Mapping[str, float] | None = None,
     candidates: Sequence[Mapping[str, Any]] | None = None,
@@ -38,7 +38,7 @@ def write_all(
     ----------
     folder : where to
     posterior, modes : what was found
-    shown : what each sensor showed, see ``report.shown``
+    shown : each sensor's image, see ``report.sensor_image``
     settings, timing_ms : added to the posterior's own in result.json
     candidates : of an object identification, the most probable first
     reports : which of ``REPORTS`` are written: report.html, report.png

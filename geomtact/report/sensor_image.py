@@ -1,4 +1,4 @@
-"""What each sensor showed, and what it would show with the part elsewhere."""
+"""Each sensor's image with its contact, and the contact simulated with the object at another pose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class SensorImage:
     """One sensor's image.
 
     Attributes
@@ -38,12 +38,12 @@ class Shown:
     name: str = ""
 
     def at(self, T_frame_object: Array) -> Contact:
-        """What it would show with the object at ``T_frame_object`` (4, 4)."""
+        """The contact simulated with the object at ``T_frame_object`` (4, 4)."""
         return self.simulate(inverse(self.T_frame_sensor) @ T_frame_object)
 
 
-def shown_of(posterior: Posterior, localizer: Localizer) -> list[Shown]:
-    """What ``posterior`` was made from by ``localizer``, the images in the order in which they were given."""
+def sensor_images(posterior: Posterior, localizer: Localizer) -> list[SensorImage]:
+    """The images of ``posterior``, which ``localizer`` made, in the order in which they were given."""
     settings, seen = posterior.settings, posterior.observations
     poses = [np.asarray(T) for T in settings.get("T_world_sensor", [posterior.T_frame_sensor])]
     touched = settings.get("touched", [True])
@@ -51,6 +51,6 @@ def shown_of(posterior: Posterior, localizer: Localizer) -> list[Shown]:
     in_order = [*seen[1 : first + 1], *seen[:1], *seen[first + 1 :]]
     each = (localizer, *localizer.others) if localizer.others else repeat(localizer)
     return [
-        Shown(one.sensor, T, observation, one.simulate, f"sensor {number}" if len(poses) > 1 else "")
+        SensorImage(one.sensor, T, observation, one.simulate, f"sensor {number}" if len(poses) > 1 else "")
         for number, (one, T, observation) in enumerate(zip(each, poses, in_order, strict=False), 1)
     ]
