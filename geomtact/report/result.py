@@ -56,7 +56,7 @@ def result(
                 }
                 for mode in modes
             ],
-            "information_gain_nats": -posterior.entropy_nats,
+            "information_gain_nats": 0.0 - posterior.entropy_nats,
             "entropy_nats": posterior.entropy_nats,
             "effective_poses": posterior.effective_poses,
             "settings": {**(settings or {}), **posterior.settings, "seed": posterior.seed},
@@ -73,7 +73,7 @@ def frame_line(n: int, posterior: Posterior) -> dict[str, Any]:
     return {
         "frame": n,
         "contact": posterior.contact if posterior.observations else None,
-        "information_gain_nats": -posterior.entropy_nats if posterior.contact else None,
+        "information_gain_nats": 0.0 - posterior.entropy_nats if posterior.contact else None,
         "entropy_nats": posterior.entropy_nats if posterior.contact else None,
         "probability": None if first is None else first.probability,
         "T": None if first is None else first.T,
