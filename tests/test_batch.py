@@ -228,14 +228,13 @@ def test_several_parts_are_trained_for_each_into_a_folder(tmp_path):
     }
     for wrong, said in (
         ([*words, "--out", "one.safetensors"], "--out one.safetensors: expected a folder for the weights of 2 parts"),
-        ([*words[:1], "--object", "ball", *words[3:], "--jobs", "2"], "--jobs and --ray train for several parts"),
+        ([*words[:1], "--object", "ball", *words[3:], "--jobs", "2"], "--jobs and --ray train for several objects"),
         (
-            ["train", "--object", "ball", *words[3:], "--width", "64"],
-            "--width does not go with --architecture resnet50",
+            ["train", "--object", "ball", *words[3:], "--steps", "64"],
+            "--steps does not go with --architecture resnet50",
         ),
-        (["train", "--architecture", "mask", "--pairs", "64"], "--pairs does not go with --architecture mask"),
-        (["train", "--architecture", "mask", "--object", "ball"], "--object does not go with --architecture mask"),
-        (["train", "--side", "64"], "--side does not go with --architecture encoder"),
+        (["train", "--object", "ball", "--architecture", "mask"], "mask: expected encoder or resnet50"),
+        (["train", "--object", "ball", "--side", "64"], "--side does not go with --architecture encoder"),
     ):
         refused = CliRunner().invoke(app, wrong)
         assert refused.exit_code == 2 and said in refused.output, refused.output

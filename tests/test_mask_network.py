@@ -17,10 +17,7 @@ from geomtact.sensing.local_shape import find_contact
 from geomtact.sensing.mask_network import CHANNELS, WEIGHTS, MaskNetwork, contact_probability, seen, smoothed
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
-from geomtact.training import presses
-from geomtact.training.presses import PRESSES, READINGS, make_presses, press_part
 from geomtact.training.state import read_weights
-from geomtact.training.train_mask import Settings, train_mask, validate, write_mask_network
 from tools.studies.__main__ import app as studies
 from tools.studies.readings.study import (
     Imprint,
@@ -32,6 +29,9 @@ from tools.studies.readings.study import (
     overlap,
     summarise_contacts,
 )
+from tools.training import presses
+from tools.training.contact import Settings, train_mask, validate, write_mask_network
+from tools.training.presses import PRESSES, READINGS, make_presses, press_part
 
 
 def disk(x, y, r, shape=(120, 160)):

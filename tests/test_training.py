@@ -21,11 +21,11 @@ from geomtact.sensing.sensor import Sensor
 from geomtact.training import scenes as scenes_module
 from geomtact.training.augment import AUGMENTATIONS, augmented
 from geomtact.training.card import write_encoder
-from geomtact.training.dataset import part_scenes
-from geomtact.training.parts import random_part
+from geomtact.training.dataset import object_scenes
 from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, make_scene
 from geomtact.training.state import claim, resume, save_state
 from geomtact.training.train import Settings, scene_gain, train
+from tools.training.procedural import random_object
 
 TINY = Settings(steps=6, scenes_a_step=2, touches=20, stored=200, width=32, dimension=8, validation=1)
 
@@ -53,13 +53,13 @@ def weights():
     return {name: value.numpy() for name, value in Encoder(48, 8).state_dict().items()}
 
 
-def test_a_procedural_part_is_a_solid_of_its_size_and_repeats():
+def test_a_procedural_object_is_a_solid_of_its_size_and_repeats():
     for seed in range(12):
-        part = random_part(seed, 0.05)
-        assert load_mesh(part).sha256 == part.sha256, "it passes all checks that a user's mesh has to pass"
-        assert (random_part(seed, 0.05).vertices == part.vertices).all()
-        size = part.vertices.max(0) - part.vertices.min(0)
-        assert np.linalg.norm(size) >= 0.05 * 0.999 and part.diameter <= 0.05 * np.sqrt(3)
+        made = random_object(seed, 0.05)
+        assert load_mesh(made).sha256 == made.sha256, "it passes all checks that a user's mesh has to pass"
+        assert (random_object(seed, 0.05).vertices == made.vertices).all()
+        size = made.vertices.max(0) - made.vertices.min(0)
+        assert np.linalg.norm(size) >= 0.05 * 0.999 and made.diameter <= 0.05 * np.sqrt(3)
 
 
 def test_a_touch_lies_near_the_stored_contact_of_its_cell(scenes):
@@ -254,9 +254,9 @@ def test_weights_for_one_part_serve_no_other(weights, tmp_path, ball):
 
 def test_scenes_are_made_once_and_repeat(tmp_path):
     mesh, sensor = load_mesh("hex_nut"), Sensor.load("gelsight-mini")
-    first = part_scenes(tmp_path, mesh, sensor, 20_000, 2, seed=4, processes=1)
+    first = object_scenes(tmp_path, mesh, sensor, 20_000, 2, seed=4, processes=1)
     times = {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()}
-    second = part_scenes(tmp_path, mesh, sensor, 20_000, 2, seed=4, processes=1)
+    second = object_scenes(tmp_path, mesh, sensor, 20_000, 2, seed=4, processes=1)
     assert {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()} == times and len(times) == 2
     for a, b in zip(first, second, strict=True):
         assert (a.stored == b.stored).all() and (a.true == b.true).all()

@@ -234,10 +234,10 @@ def augmentations() -> Figure:
     import torch
 
     from geomtact.training.augment import AUGMENTATIONS
-    from geomtact.training.parts import random_part
     from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, make_scene
+    from tools.training.procedural import random_object
 
-    scene = make_scene(random_part(11, 0.06), Sensor.load("gelslim"), 600_000, np.random.default_rng(5))
+    scene = make_scene(random_object(11, 0.06), Sensor.load("gelslim"), 600_000, np.random.default_rng(5))
     touches, soft = unpack(scene.touches, TOUCH_SHAPE), np.flatnonzero(scene.elastic)
     elastic = touches[soft]
     # middling contacts, as different as five of them can be

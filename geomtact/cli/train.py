@@ -1,10 +1,10 @@
-"""``geomtact train``: the shared encoder from nothing, or fine-tuned for one part; and what finds contacts in readings."""
+"""``geomtact train``: the shared encoder fine-tuned for an object, or the thesis's network for it."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,53 +12,44 @@ from geomtact.cli.options import Seed, Unit
 from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
 from geomtact.cli.parts import parts_of
 from geomtact.cli.shell import progress_bar, tell
-from geomtact.errors import InputError, UsageError
+from geomtact.errors import UsageError
 
-MASK = "mask"  # a name for --architecture, beside those of encoders
-# options that say nothing to an architecture
-_OF_RESNET, _OF_ENCODER = ("pairs", "side"), ("width", "dimension")
-_UNSUITED = {
-    "encoder": _OF_RESNET,
-    MASK: ("object_name", "unit", *_OF_RESNET, *_OF_ENCODER),
-    "resnet50": ("scenes", "steps", "start", *_OF_ENCODER),
-}
-_TUNING_RATE = 3e-4  # a step of fine-tuning must not undo what many parts taught
+if TYPE_CHECKING:
+    from geomtact.geometry.mesh import Mesh
+    from geomtact.sensing.sensor import Sensor
+
+# options that an architecture does not have
+_UNSUITED = {"encoder": ("pairs", "side"), "resnet50": ("scenes", "steps", "start")}
+_TUNING_RATE = 3e-4  # of the 2e-3 of a training from nothing: fine-tuning keeps most of what the start has learned
 
 
 def train(
-    out: Annotated[
-        Path, typer.Option(help="Weights file to write, a folder for several; the card and curves go beside it.")
-    ] = Path("encoder.safetensors"),
     object_name: Annotated[
-        str | None,
+        str,
         typer.Option(
             "--object",
             metavar="OBJECT",
-            help="Fine-tune for this part or mesh file; for each of several by a folder, or names with commas.",
+            help="Train for this object or mesh file; for each of several by a folder, or names with commas.",
         ),
-    ] = None,
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Weights file to write, a folder for several; the card and curves go beside it.")
+    ] = Path("encoder.safetensors"),
     unit: Unit = None,
-    sensor: Annotated[str, typer.Option(help="Of the part: name or TOML file.")] = "gelslim",
-    scenes: Annotated[int | None, typer.Option(min=50, help="Scenes; 600 by default, 80 of one part.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps; 4000 by default, 600 for one part.")] = None,
+    sensor: Annotated[str, typer.Option(help="Name or TOML file.")] = "gelslim",
+    scenes: Annotated[int | None, typer.Option(min=50, help="Simulated scenes of an encoder; 80 by default.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps of an encoder; 600 by default.")] = None,
     start: Annotated[
-        Path | None, typer.Option(help="Weights to start from; for one part those that geomtact brings along.")
+        Path | None, typer.Option(help="Weights that an encoder starts from; the bundled ones by default.")
     ] = None,
     architecture: Annotated[
-        str,
-        typer.Option(
-            help="encoder; mask: what finds the contact in a reading; or resnet50: the thesis's network, for one part."
-        ),
+        str, typer.Option(help="encoder: fine-tune the shared encoder; resnet50: train the thesis's network.")
     ] = "encoder",
     pairs: Annotated[
         int | None, typer.Option(min=32, help="Pairs of contacts that a resnet50 learns from; 100,000 by default.")
     ] = None,
     side: Annotated[
         int | None, typer.Option(min=32, help="Pixels along the side of a resnet50's images; 224 by default.")
-    ] = None,
-    width: Annotated[int | None, typer.Option(min=8, help="Neurons a layer of an encoder; 512 by default.")] = None,
-    dimension: Annotated[
-        int | None, typer.Option(min=2, help="Numbers that an encoder makes of a contact; 16 by default.")
     ] = None,
     rate: Annotated[float | None, typer.Option(min=1e-9, help="Learning rate, where the usual one diverges.")] = None,
     seed: Seed = 0,
@@ -68,11 +59,10 @@ def train(
     jobs: Jobs = None,
     ray: Ray = None,
 ) -> None:
-    """Train the encoder that compares contacts. A stopped run goes on where it was.
+    """Train the network that compares contacts for an object. A stopped run goes on where it was.
 
-    Without --object it learns from procedural parts and serves every part. With --object, the shared encoder is fine-tuned on
-    simulated touches of that part, or of each of several, one for each core at a time. Use the result as
-    Localizer.prepare(..., scorer="FILE.safetensors").
+    The shared encoder is fine-tuned on simulated touches of the object, or of each of several, one for each core at a time.
+    Use the result as Localizer.prepare(..., scorer="FILE.safetensors").
     """
     options = dict(locals())
     parts = parts_of(object_name)
@@ -80,66 +70,72 @@ def train(
         _train_each([str(part) for part in parts], options)
         return
     if jobs is not None or ray is not None:
-        raise UsageError("--jobs and --ray train for several parts: give them with --object, with commas between them")
+        raise UsageError(
+            "--jobs and --ray train for several objects: give them with --object, with commas between them"
+        )
     if out.suffix != ".safetensors":
         raise UsageError(f"--out {out}: expected a name that ends in .safetensors")
-    from geomtact.scoring.encoder import ARCHITECTURE, THESIS, WEIGHTS
-
-    if architecture not in (ARCHITECTURE, MASK, THESIS):
-        raise UsageError(f"--architecture {architecture}: expected {ARCHITECTURE}, {MASK} or {THESIS}")
+    if architecture not in _UNSUITED:
+        raise UsageError(f"--architecture {architecture}: expected {' or '.join(_UNSUITED)}")
     for name in _UNSUITED[architecture]:
         if options[name] is not None:
-            option = "--object" if name == "object_name" else f"--{name}"
-            raise UsageError(f"{option} does not go with --architecture {architecture}; leave it out")
+            raise UsageError(f"--{name} does not go with --architecture {architecture}; leave it out")
+    from geomtact.geometry.mesh_file import load_mesh
+    from geomtact.scoring.encoder import THESIS
+    from geomtact.sensing.sensor import Sensor
+
     work = work or out.with_name(f"{out.stem}.training")
-    if architecture == MASK:
-        _train_mask(out, work, scenes or 600, steps or 6000, rate, seed, start)
-        return
+    gel = Sensor.load(sensor)
+    mesh = load_mesh(object_name, unit, sensor=gel)
     if architecture == THESIS:
-        if object_name is None:
-            raise UsageError(f"--architecture {THESIS}: the thesis's network is trained for one part; give --object")
-        _train_thesis(out, work, object_name, unit, sensor, pairs or 100_000, side or 224, rate, seed)
-        return
-    from geomtact.training import dataset
+        _train_thesis(out, work, mesh, gel, pairs or 100_000, side or 224, rate, seed)
+        written = [out, out.with_suffix(".json").name]
+    else:
+        _fine_tune(out, work, mesh, gel, scenes or 80, steps or 600, start, rate or _TUNING_RATE, seed)
+        written = [out, out.with_suffix(".json").name, out.with_suffix(".png").name]
+    typer.echo(f"written: {', '.join(map(str, written[:-1]))} and {written[-1]}")
+
+
+def _fine_tune(
+    out: Path, work: Path, mesh: Mesh, sensor: Sensor, n: int, steps: int, start: Path | None, rate: float, seed: int
+) -> None:
+    """The shared encoder, or the weights ``start``, fine-tuned for one object."""
+    from geomtact.contact_space.resolution import MAX_POSES
+    from geomtact.scoring.encoder import ARCHITECTURE, WEIGHTS
     from geomtact.training.card import write_encoder
-    from geomtact.training.state import claim, read_weights, whose
+    from geomtact.training.dataset import object_scenes
+    from geomtact.training.state import claim, read_weights, sha256_of, size_of, whose
     from geomtact.training.train import Settings
     from geomtact.training.train import train as run
 
-    settings = Settings(steps=steps or 4000, width=width or 512, dimension=dimension or 16, seed=seed)
-    recipe = {"architecture": ARCHITECTURE, "width": settings.width, "dimension": settings.dimension, "seed": seed}
+    start = start or WEIGHTS
+    recipe = {"part": mesh.sha256, "sensor": sensor.sha256, "start": sha256_of(start)}
+    weights = read_weights(start)
+    settings = Settings(steps=steps, **size_of(weights), seed=seed, rate=rate, validation=max(n // 8, 5))
+    size = {"architecture": ARCHITECTURE, "width": settings.width, "dimension": settings.dimension, "seed": seed}
+    claim(work, size | recipe)
     with progress_bar("training") as progress:
-        if object_name is None:
-            n = scenes or 600
-            claim(work, recipe | {"start": _sha256(start)})
-            made = dataset.shared_scenes(work / "scenes", n, seed, progress)
-            data: dict[str, Any] = {
-                "parts": "procedural",
-                "sensors": dataset.SENSORS,
-                "sizes": dataset.SIZES,
-                "poses": dataset.POSES,
-            }
-        else:
-            from geomtact.contact_space.resolution import MAX_POSES
-            from geomtact.geometry.mesh_file import load_mesh
-            from geomtact.sensing.sensor import Sensor
-
-            gel = Sensor.load(sensor)
-            mesh = load_mesh(object_name, unit, sensor=gel)
-            n = scenes or 80
-            start = start or WEIGHTS
-            claim(work, recipe | {"part": mesh.sha256, "sensor": gel.sha256, "start": _sha256(start)})
-            made = dataset.part_scenes(work / "scenes", mesh, gel, MAX_POSES, n, seed, progress)
-            data = whose(mesh, gel)
-            settings = replace(settings, steps=steps or 600, rate=_TUNING_RATE, validation=max(n // 8, 5))
-        if rate is not None:
-            settings = replace(settings, rate=rate)
-        if start is not None:
-            data["start"] = start.name
-        network, curve = run(made, settings, work, progress, start=read_weights(start) if start is not None else None)
-    write_encoder(out, network, curve, settings, made, data)
+        made = object_scenes(work / "scenes", mesh, sensor, MAX_POSES, n, seed, progress)
+        network, curve = run(made, settings, work, progress, start=weights)
+    write_encoder(out, network, curve, settings, made, whose(mesh, sensor) | {"start": start.name})
     tell(f"{curve.validation[-1]:.2f} nats on scenes that it never saw")
-    typer.echo(f"written: {out}, {out.with_suffix('.json').name} and {out.with_suffix('.png').name}")
+
+
+def _train_thesis(
+    out: Path, work: Path, mesh: Mesh, sensor: Sensor, pairs: int, side: int, rate: float | None, seed: int
+) -> None:
+    """The thesis's network for one object."""
+    from geomtact.contact_space.space import ContactSpace
+    from geomtact.scoring.encoder import THESIS
+    from geomtact.training.state import claim
+    from geomtact.training.thesis import Settings, train_thesis
+
+    settings = Settings(pairs=pairs, side=side, seed=seed)
+    if rate is not None:
+        settings = replace(settings, rate=rate)
+    claim(work, {"architecture": THESIS, "seed": seed, "part": mesh.sha256, "sensor": sensor.sha256})
+    with progress_bar("training") as progress:
+        train_thesis(ContactSpace(mesh.with_symmetry(), sensor), settings, work, out, progress)
 
 
 def _train_each(parts: list[str], options: dict[str, Any]) -> None:
@@ -162,66 +158,3 @@ def _train_each(parts: list[str], options: dict[str, Any]) -> None:
         own = {"object_name": name, "unit": unit, "out": folder / f"{Path(name).stem}.safetensors"}
         tasks.append((train, same | own))
     do_all(quietly, tasks, parts, "trained", jobs, ray)
-
-
-def _sha256(path: Path | None) -> str | None:
-    """Of the weights to start from."""
-    import hashlib
-
-    if path is None:
-        return None
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        raise InputError(f"--start {path}: no such file; give a file that 'geomtact train' wrote") from None
-
-
-def _train_mask(
-    out: Path, work: Path, parts: int, steps: int, rate: float | None, seed: int, start: Path | None
-) -> None:
-    """The network that finds the contact in a reading."""
-    from geomtact.training.presses import make_presses
-    from geomtact.training.state import claim, read_weights
-    from geomtact.training.train_mask import Settings, train_mask, write_mask_network
-
-    settings = Settings(steps=steps, seed=seed)
-    if rate is not None:
-        settings = replace(settings, rate=rate)
-    began, weights = _sha256(start), None if start is None else read_weights(start)
-    claim(work, {"architecture": MASK, "seed": seed, "start": began})
-    with progress_bar("training") as progress:
-        made = make_presses(work / "presses", parts, seed, progress)
-        network, curve = train_mask(made, settings, work, progress, start=weights)
-    write_mask_network(out, network, curve, settings, sum(len(p.seen) for p in made), began)
-    tell(f"overlaps the contact by {curve['validation'][-1]:.2f} on parts that it never saw")
-    typer.echo(f"written: {out} and {out.with_suffix('.json').name}")
-
-
-def _train_thesis(
-    out: Path,
-    work: Path,
-    object_name: str,
-    unit: str | None,
-    sensor: str,
-    pairs: int,
-    side: int,
-    rate: float | None,
-    seed: int,
-) -> None:
-    """The thesis's network for one part."""
-    from geomtact.contact_space.space import ContactSpace
-    from geomtact.geometry.mesh_file import load_mesh
-    from geomtact.scoring.encoder import THESIS
-    from geomtact.sensing.sensor import Sensor
-    from geomtact.training.state import claim
-    from geomtact.training.thesis import Settings, train_thesis
-
-    gel = Sensor.load(sensor)
-    mesh = load_mesh(object_name, unit, sensor=gel).with_symmetry()
-    settings = Settings(pairs=pairs, side=side, seed=seed)
-    if rate is not None:
-        settings = replace(settings, rate=rate)
-    claim(work, {"architecture": THESIS, "seed": seed, "part": mesh.sha256, "sensor": gel.sha256})
-    with progress_bar("training") as progress:
-        train_thesis(ContactSpace(mesh, gel), settings, work, out, progress)
-    typer.echo(f"written: {out} and {out.with_suffix('.json').name}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +21,7 @@ from geomtact.sensing.sensor import Sensor
 
 Curve = dict[str, list[float]]
 _FILE, _RECIPE = "state.safetensors", "recipe.json"
+_ANOTHER = "--start: the weights of another network; give a file that 'geomtact train' wrote"
 _FREE = ("rate",)  # a setting that a resumed run may change
 
 
@@ -64,12 +66,30 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
         ) from None
 
 
+def sha256_of(start: Path | None) -> str | None:
+    """SHA-256 of the weights to start from, None for none."""
+    if start is None:
+        return None
+    try:
+        return hashlib.sha256(start.read_bytes()).hexdigest()
+    except OSError:
+        raise InputError(f"--start {start}: no such file; give a file that 'geomtact train' wrote") from None
+
+
 def begin_with(network: nn.Module, weights: Mapping[str, torch.Tensor]) -> None:
     """Give ``network`` the ``weights`` to start from; those of another one are refused."""
     try:
         network.load_state_dict(weights)
     except RuntimeError:
-        raise InputError("--start: the weights of another network; give a file that 'geomtact train' wrote") from None
+        raise InputError(_ANOTHER) from None
+
+
+def size_of(weights: Mapping[str, torch.Tensor]) -> dict[str, int]:
+    """``width`` and ``dimension`` of an encoder's weights."""
+    try:
+        return {"width": len(weights["trunk.0.bias"]), "dimension": len(weights["heads.touch.2.bias"])}
+    except KeyError:
+        raise InputError(_ANOTHER) from None
 
 
 def save_state(

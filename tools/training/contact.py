@@ -1,4 +1,4 @@
-"""Trains the network that tells the contact from a change of colour, by cross entropy: its outputs are probabilities."""
+"""Trains the network that finds the contact in a change of colour, by cross entropy: its outputs are probabilities."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import torch.nn.functional as F
 from geomtact.errors import InputError
 from geomtact.progress import Progress
 from geomtact.sensing.mask_network import CHANNELS, MaskNetwork
-from geomtact.training import presses, readings
 from geomtact.training.card import write_network
 from geomtact.training.loop import descend, steps
-from geomtact.training.presses import Presses
-from geomtact.training.state import begin_with, resume, save_state
+from geomtact.training.state import begin_with, claim, read_weights, resume, save_state, sha256_of
+from tools.training import presses, tactile_images
+from tools.training.presses import Presses, make_presses
 
 SCHEMA = "geomtact/mask-network/1"
 _FIRST = "down.0.0.weight"  # of what the network sees
@@ -33,6 +33,21 @@ class Settings:
     weight_decay: float = 1e-4
     validation: int = 40  # parts that are never trained on
     seed: int = 0
+
+
+def train_contact_network(
+    out: Path, work: Path, n: int, settings: Settings, start: Path | None = None, progress: Progress | None = None
+) -> float:
+    """Train on presses of ``n`` objects and write ``out`` and its card; the overlap (IoU) on objects never seen.
+
+    ``work`` keeps the presses and the state; ``start`` names weights to begin with.
+    """
+    began, weights = sha256_of(start), None if start is None else read_weights(start)
+    claim(work, {"architecture": "mask", "seed": settings.seed, "start": began})
+    made = make_presses(work / "presses", n, settings.seed, progress)
+    network, curve = train_mask(made, settings, work, progress, start=weights)
+    write_mask_network(out, network, curve, settings, sum(len(p.seen) for p in made), began)
+    return curve["validation"][-1]
 
 
 def train_mask(
@@ -109,10 +124,10 @@ def write_mask_network(
     start: str | None = None,
 ) -> None:
     """Write ``path`` (safetensors, half precision) and beside it the card (.json): ``n`` presses were trained on, drawn from what
-    ``training.presses`` and ``training.readings`` say; ``start`` is the SHA-256 of the weights that training began with."""
+    ``presses`` and ``tactile_images`` say; ``start`` is the SHA-256 of the weights that training began with."""
     drawn = {
         name.lower(): value
-        for module in (presses, readings)
+        for module in (presses, tactile_images)
         for name, value in vars(module).items()
         if name.isupper() and not name.startswith("_")
     }

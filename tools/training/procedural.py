@@ -1,4 +1,4 @@
-"""Procedural parts to learn from: random machine-like solids that are no part of any evaluation."""
+"""Procedural objects to learn from: random machine-like solids that no evaluation uses."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _SIDES = (32, 64)  # of a circle
 _TRIES = 20
 
 
-def random_part(seed: int, size: float) -> Mesh:
-    """The procedural part of ``seed``: a body with features added, cut away and repeated; the same for the same seed.
+def random_object(seed: int, size: float) -> Mesh:
+    """The procedural object of ``seed``: a body with features added, cut away and repeated; the same for the same seed.
 
     ``size`` is its longest side [m].
     """
@@ -35,11 +35,11 @@ def random_part(seed: int, size: float) -> Mesh:
         vertices = (vertices - (low + high) / 2) * (size / (high - low).max())
         turned = vertices @ Rotation.random(random_state=int(rng.integers(1 << 31))).as_matrix().T
         return Mesh(turned, np.asarray(mesh.tri_verts, np.int32), f"procedural {seed}", "m")
-    raise RuntimeError(f"no connected part came of seed {seed} in {_TRIES} tries; use another seed")
+    raise RuntimeError(f"no connected object came of seed {seed} in {_TRIES} tries; use another seed")
 
 
 def _body(rng: np.random.Generator) -> Manifold:
-    """What a part starts from, about 1 in size: turned, extruded, a block, or a chain of blocks and rods."""
+    """What an object starts from, about 1 in size: turned, extruded, a block, or a chain of blocks and rods."""
     makers: list[Callable[[np.random.Generator], Manifold]] = [_turned, _extruded, _block, _rod]
     solid = makers[rng.integers(4)](rng)
     if rng.random() < 0.35:  # two bodies that meet, as in elbows and brackets

@@ -20,8 +20,8 @@ from geomtact.sensing.elastic import elastic_contact
 from geomtact.sensing.mask_network import CHANNELS, side_shape, to_side
 from geomtact.sensing.sensor import Sensor
 from geomtact.training.numbered import made_once
-from geomtact.training.parts import random_part
-from geomtact.training.readings import random_sight
+from tools.training.procedural import random_object
+from tools.training.tactile_images import random_sight
 
 SHAPE = (120, 160)  # of what the camera shows
 READINGS = 4  # of each press
@@ -116,4 +116,4 @@ def _part(rng: np.random.Generator, window: float) -> Mesh:
     if rng.random() < BALLS:
         ball = trimesh.creation.icosphere(subdivisions=5, radius=np.exp(rng.uniform(*np.log(RADII))))
         return Mesh(ball.vertices, ball.faces, "ball", "m")
-    return random_part(int(rng.integers(1 << 31)), window * float(np.exp(rng.uniform(*np.log(SIZES)))))
+    return random_object(int(rng.integers(1 << 31)), window * float(np.exp(rng.uniform(*np.log(SIZES)))))

@@ -1,6 +1,6 @@
-"""Readings to learn from: presses under random lamps, with the noise of cameras and gels.
+"""Tactile images to learn from: presses under random lamps, with the noise of cameras and gels.
 
-How a sensor is lit is drawn anew for every reading, so that the network learns what all sensors have in common: the gel bends
+How a sensor is lit is drawn anew for every image, so that the network learns what all sensors have in common: the gel bends
 around what it is touched by.
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from geomtact.se3 import Array
 from geomtact.sensing.change import colour_change
 from geomtact.sensing.mask_network import seen
-from geomtact.training.lamps import Lamps, lit
+from tools.training.lamps import Lamps, lit
 
 Image = NDArray[np.float32]
 
