@@ -14,7 +14,8 @@ from geomtact.errors import GeomtactError, InputError
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.scoring import precision
 from geomtact.scoring.catalogue import descriptor_of
-from geomtact.scoring.encoder import BASIS, SHAPE, WEIGHTS, Tower, load_weights, moment_features, vector
+from geomtact.scoring.contact_features import BASIS, SHAPE, moment_features
+from geomtact.scoring.encoder import WEIGHTS, Tower, load_weights, vector
 from geomtact.scoring.network import Encoder, run
 from geomtact.sensing.moments import moments
 from geomtact.sensing.sensor import Sensor

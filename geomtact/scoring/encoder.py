@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +19,7 @@ from scipy.special import erf
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
+from geomtact.scoring.contact_features import BASIS, SHAPE, moment_features
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.contact import Shown
 from geomtact.sensing.moments import cleaned
@@ -27,9 +27,6 @@ from geomtact.sensing.sensor import Sensor
 
 WEIGHTS = Path(__file__).with_name("encoder.safetensors")  # trained once for all parts, with a card beside it
 ARCHITECTURE, THESIS = "encoder", "resnet50"  # as the metadata of weights name them
-SHAPE = (24, 32)  # of what the network sees: the whole window, lying
-BESIDE = 8  # numbers beside the pixels: six moments, and two of the grid's cell
-_PIXEL = 2 / SHAPE[1] / float(np.hypot(1, SHAPE[0] / SHAPE[1]))  # in units of the window's half diagonal
 _CHUNK = 1 << 13  # vectors compared at a time
 Weights = dict[str, NDArray[np.float32]]
 
@@ -118,33 +115,6 @@ def vector(
         x = _gelu(weights[f"{layer}.weight"] @ x + weights[f"{layer}.bias"])
     x = _gelu(weights[f"heads.{head}.0.weight"] @ np.concatenate([x, m]) + weights[f"heads.{head}.0.bias"])
     return np.asarray(weights[f"heads.{head}.2.weight"] @ x + weights[f"heads.{head}.2.bias"], np.float32)
-
-
-def moment_features(sums: Any, xp: Any) -> Any:
-    """The six moments (n, 6) of contacts as in ``sensing.moments``, brought to a spread near 1.
-
-    ``sums`` (n, 6) are the images times ``BASIS``; ``xp`` is numpy or torch.
-    """
-    area = sums[:, 0].clip(min=0.25)
-    mx, my, xx, xy, yy = (sums[:, 1:] / area[:, None]).T
-    xx = (xx - mx * mx).clip(min=0) + _PIXEL**2 / 12
-    yy = (yy - my * my).clip(min=0) + _PIXEL**2 / 12
-    xy = xy - mx * my
-    middle = (xx + yy) / 2
-    spread = xp.minimum(xp.hypot((xx - yy) / 2, xy), middle - _PIXEL**2 / 24)
-    large, small = middle + spread, middle - spread
-    stretch, angle = 0.5 * xp.log(large / small), xp.arctan2(2 * xy, xx - yy)
-    size = (0.5 * xp.log(area * _PIXEL**2) + 2, 0.25 * xp.log(large * small) + 1.2)
-    return xp.stack([3 * mx, 3 * my, *size, stretch * xp.cos(angle), stretch * xp.sin(angle)], 1)
-
-
-def _basis() -> NDArray[np.float32]:
-    y, x = (((np.arange(n) - (n - 1) / 2) * _PIXEL) for n in SHAPE)
-    X, Y = (c.ravel() for c in np.meshgrid(x, y))
-    return np.stack([np.ones_like(X), X, Y, X * X, X * Y, Y * Y], 1).astype(np.float32)
-
-
-BASIS = _basis()  # (768, 6): sums of an image's pixels times 1, x, y and their products
 
 
 def about(path: Path) -> dict[str, str]:

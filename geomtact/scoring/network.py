@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from geomtact.scoring.encoder import BASIS, BESIDE, SHAPE, moment_features
+from geomtact.scoring.contact_features import BASIS, BESIDE, SHAPE, moment_features
 from geomtact.scoring.precision import autocast
 
 _BATCH = 8192

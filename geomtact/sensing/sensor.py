@@ -20,8 +20,9 @@ from geomtact.errors import SensorError, did_you_mean, nearest_name
 from geomtact.files import read_text
 from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable
+from geomtact.sensing.sensor_file import toml_text, toml_values
 
-_OTHERS = (".yaml", ".yml", ".json")  # of files that other makers' programs read
+_FOREIGN = (".yaml", ".yml", ".json")  # of files that other makers' programs read
 HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
 CONTACT_METHODS = ("auto", "classical", "pressure", "learned")  # of finding the contact in a reading, the default first
 
@@ -146,32 +147,37 @@ class Sensor:
             return cls.from_toml(_folder().joinpath(f"{text}.toml").read_text("utf-8"), text)
         path = Path(text)
         suffix = path.suffix.lower()
-        if suffix in (".toml", *_OTHERS) or path.is_file():
+        if suffix in (".toml", *_FOREIGN) or path.is_file():
             try:
-                said = read_text(path)
+                content = read_text(path)
             except FileNotFoundError:
                 raise SensorError(f"sensor file {path}: no such file; give a TOML file or a bundled sensor") from None
             except (OSError, ValueError) as error:
                 raise SensorError(f"sensor file {path}: cannot be read ({error}); give a TOML file") from None
-            if suffix not in _OTHERS:
-                return cls.from_toml(said, str(path))
-            from geomtact.sensing.others import sensor_of_others
+            if suffix not in _FOREIGN:
+                return cls.from_toml(content, str(path))
+            from geomtact.sensing.foreign_sensor_files import BASE, foreign_values
 
-            return sensor_of_others(said, str(path))
+            base = _folder().joinpath(f"{BASE}.toml").read_text("utf-8")
+            return cls._named(str(path), foreign_values(content, str(path), toml_values(base, BASE, fields(cls))))
         raise SensorError(f"no sensor named {text!r}{nearest_name(text, bundled_sensors())}; or give a .toml file")
 
     @classmethod
     def from_toml(cls, text: str, origin: str = "sensor") -> Sensor:
         """Parse the TOML text of one sensor; ``origin`` names it in errors."""
-        from geomtact.sensing.sensor_file import sensor_of_toml
+        return cls._named(origin, toml_values(text, origin, fields(cls)))
 
-        return sensor_of_toml(text, origin)
+    @classmethod
+    def _named(cls, origin: str, values: dict[str, Any]) -> Sensor:
+        """The sensor of the fields ``values``; errors name ``origin``."""
+        try:
+            return cls(**values)
+        except SensorError as error:
+            raise SensorError(f"{origin}: {error}") from None
 
     def to_toml(self) -> str:
         """The TOML text that :meth:`from_toml` reads back to the same sensor."""
-        from geomtact.sensing.sensor_file import toml_of_sensor
-
-        return toml_of_sensor(self)
+        return toml_text({f.name: getattr(self, f.name) for f in fields(self)}, fields(self))
 
     @cached_property
     def sha256(self) -> str:

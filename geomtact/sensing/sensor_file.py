@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import MISSING, fields
+from collections.abc import Mapping
+from dataclasses import MISSING, Field
 from typing import Any
 
 from geomtact.errors import SensorError, nearest_name
 from geomtact.sensing.colour import ColourTable
-from geomtact.sensing.sensor import Sensor
 
 _LENGTHS = (
     "pixel_pitch",
@@ -20,16 +20,24 @@ _LENGTHS = (
     "height_noise",
 )
 _PAIRS, _TEXTS = ("image_size_px", "pixel_pitch"), ("name", "contact_method", "note")
-_KEYS = {f"{f.name}_mm" if f.name in _LENGTHS else f.name: f for f in fields(Sensor)}
-_REQUIRED = [key for key, f in _KEYS.items() if f.default is MISSING]
-_ALWAYS = (*_REQUIRED, "membrane_radius_mm")  # others are written where they are not the default
+_ALWAYS = "membrane_radius"  # is written even where it is the default
 _SWITCHES, _WHOLE = ("camera_mirrored", "camera_masks"), ("camera_rotation_deg", "driver_rotation_deg")
 _COLOUR_KEYS = ("weights", "slope_rms", "height_rms_mm", "contact_depth_mm")
 _BACKGROUND = "background"  # in [colour], which files of before do not hold
 
 
-def sensor_of_toml(text: str, origin: str) -> Sensor:
-    """As :meth:`Sensor.from_toml`."""
+Fields = tuple[Field[Any], ...]
+
+
+def toml_values(text: str, origin: str, fields: Fields) -> dict[str, Any]:
+    """The values of a sensor's ``fields`` that the TOML ``text`` gives, lengths in metres; ``origin`` names it in errors.
+
+    Raises
+    ------
+    SensorError
+        It is not valid TOML, a key is unknown or missing, or a value has the wrong type.
+    """
+    keys = _keys(fields)
     try:
         data = tomllib.loads(text)
     except RecursionError:
@@ -41,49 +49,53 @@ def sensor_of_toml(text: str, origin: str) -> Sensor:
             f"{origin}: not valid TOML ({error}); write lines such as name = \"mine\", see 'geomtact sensors'"
         ) from None
     for key in data:
-        if key not in _KEYS:
-            raise SensorError(f"{origin}: unknown key {key!r}{nearest_name(key, _KEYS)}")
-    missing = [repr(key) for key in _REQUIRED if key not in data]
+        if key not in keys:
+            raise SensorError(f"{origin}: unknown key {key!r}{nearest_name(key, keys)}")
+    missing = [repr(key) for key, f in keys.items() if f.default is MISSING and key not in data]
     if missing:
         which = f"the key {missing[0]} is" if len(missing) == 1 else f"the keys {', '.join(missing)} are"
         raise SensorError(f"{origin}: {which} missing; add what docs/formats.md says of a sensor's file")
     try:
-        return Sensor(**{_KEYS[key].name: _value(key, value) for key, value in data.items()})
+        return {keys[key].name: _value(key, keys[key].name, value) for key, value in data.items()}
     except SensorError as error:
         raise SensorError(f"{origin}: {error}") from None
 
 
-def toml_of_sensor(sensor: Sensor) -> str:
-    """As :meth:`Sensor.to_toml`."""
+def toml_text(sensor: Mapping[str, Any], fields: Fields) -> str:
+    """The TOML text of a sensor's ``fields`` by name; all but the required ones only where they are not the default."""
     lines = []
-    for key, f in _KEYS.items():
-        value = getattr(sensor, f.name)
-        if f.name == "colour" or (key not in _ALWAYS and (value is None or value == f.default)):
+    for key, f in _keys(fields).items():
+        value = sensor[f.name]
+        if f.name == "colour" or (f.name != _ALWAYS and (value is None or value == f.default)):
             continue
         values = value if f.name in _PAIRS else [value]
         if f.name in _LENGTHS:
             values = [_mm(v) for v in values]
         text = ", ".join(_toml_string(v) if f.name in _TEXTS else str(v).lower() for v in values)
         lines.append(f"{key} = [{text}]" if f.name in _PAIRS else f"{key} = {text}")
-    if sensor.colour is not None:
+    colour = sensor["colour"]
+    if colour is not None:
         lines += [
             "",
             "[colour]",
-            f"slope_rms = {sensor.colour.slope_rms:.6g}",
-            f"height_rms_mm = {_mm(sensor.colour.height_rms)}",
-            f"contact_depth_mm = {_mm(sensor.colour.contact_depth)}",
+            f"slope_rms = {colour.slope_rms:.6g}",
+            f"height_rms_mm = {_mm(colour.height_rms)}",
+            f"contact_depth_mm = {_mm(colour.contact_depth)}",
         ]
-        rows = ("  [" + ", ".join(f"{w:.9g}" for w in row) + "]," for row in sensor.colour.weights)
+        rows = ("  [" + ", ".join(f"{w:.9g}" for w in row) + "]," for row in colour.weights)
         lines += ["weights = [", *rows, "]"]
-        if sensor.colour.background is not None:
-            rows = ("  [" + ", ".join(f"{v:.3g}" for v in row) + "]," for row in sensor.colour.background)
+        if colour.background is not None:
+            rows = ("  [" + ", ".join(f"{v:.3g}" for v in row) + "]," for row in colour.background)
             lines += [f"{_BACKGROUND} = [", *rows, "]"]
     return "\n".join(lines) + "\n"
 
 
-def _value(key: str, value: Any) -> Any:
-    """What the field of a ``key`` is to be, in metres."""
-    name = _KEYS[key].name
+def _keys(fields: Fields) -> dict[str, Field[Any]]:
+    return {f"{f.name}_mm" if f.name in _LENGTHS else f.name: f for f in fields}
+
+
+def _value(key: str, name: str, value: Any) -> Any:
+    """The value of the field ``name``, whose key is ``key``, in metres."""
     if name == "colour":
         if not isinstance(value, dict):
             raise SensorError(f"{key} must be a table, got {value!r}; write [{key}]")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import unpack
 from geomtact.errors import InputError
 from geomtact.progress import Progress
-from geomtact.scoring.encoder import SHAPE
+from geomtact.scoring.contact_features import SHAPE
 from geomtact.scoring.network import Encoder
 from geomtact.scoring.precision import autocast
 from geomtact.sensing.moments import without_specks

@@ -1,4 +1,4 @@
-"""Sensor files of other makers: what gs_sdk, TACTO and gsrobotics write of a sensor's geometry, read as a :class:`Sensor`.
+"""Sensor files of other makers: what gs_sdk, TACTO and gsrobotics write of a sensor's geometry, read as a sensor's fields.
 
 None says how deep a gel may be pressed in, and gs_sdk nothing of the camera's distance: then 2 mm, and parallel rays. gsrobotics'
 file says no more than which part of a GelSight Mini's frame its images show.
@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from geomtact.errors import SensorError
-from geomtact.sensing.sensor import Sensor
 
+BASE = "gelsight-mini"  # the bundled sensor that a file of gsrobotics completes
+Values = dict[str, Any]
 _DEPTH = 2e-3  # m that an object can press in
 _TACTO_SIZE = (240, 320)  # px; the file does not say
 _GSROBOTICS = ("camera_width", "camera_height", "border_fraction")
@@ -27,12 +27,12 @@ _KINDS = (
 )
 
 
-def sensor_of_others(text: str, origin: str) -> Sensor:
-    """The sensor that the YAML file of gs_sdk or of TACTO, or the JSON file of gsrobotics, named ``origin``, describes.
+def foreign_values(text: str, origin: str, base: Values) -> Values:
+    """The fields of the sensor in the YAML file of gs_sdk or TACTO, or the JSON file of gsrobotics, named ``origin``.
 
     ``ppmm`` of gs_sdk is millimetres per pixel. TACTO's gel, if curved, is taken for a sphere that falls by ``curvatureMax`` to
     the gel's corners, seen from the camera's ``position`` with ``yfov``; its picture has 240 x 320 px. gsrobotics' sensor is a
-    GelSight Mini, of whose frame ``border_fraction`` is cut off at each side.
+    GelSight Mini, whose fields are ``base``, and ``border_fraction`` of its frame is cut off at each side.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def sensor_of_others(text: str, origin: str) -> Sensor:
         if isinstance(data, dict) and isinstance(data.get("sensor"), dict):
             return _of_tacto(data["sensor"], name)
         if isinstance(data, dict) and any(key in data for key in _GSROBOTICS):
-            return _of_gsrobotics(data, name)
+            return _of_gsrobotics(data, name, base)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise SensorError(f"{origin}: expected {_KINDS}; what this one holds is not valid ({error})") from None
     except SensorError as error:
@@ -61,24 +61,24 @@ def sensor_of_others(text: str, origin: str) -> Sensor:
     raise SensorError(f"{origin}: expected {_KINDS}; or write a TOML file, see 'geomtact sensors'")
 
 
-def _of_gs_sdk(data: Mapping[str, Any], name: str) -> Sensor:
+def _of_gs_sdk(data: Mapping[str, Any], name: str) -> Values:
     pitch = 1e-3 * _number(data["ppmm"])
     if pitch > 1e-3:
         raise SensorError(f"ppmm is millimetres per pixel in gs_sdk, and {data['ppmm']} are too many; give 1 over it")
     if type(data["imgw"]) is not int or type(data["imgh"]) is not int:
         raise SensorError(f"imgw and imgh must be whole numbers, got {data['imgw']} and {data['imgh']}")
     named = data.get("device_name")
-    return Sensor(
-        named if isinstance(named, str) and named else name,
-        (data["imgw"], data["imgh"]),
-        (pitch, pitch),
-        camera_distance=0.0,
-        max_penetration=_DEPTH,
-        note=f"From gs_sdk's file {name}, which says nothing of the camera's distance, the gel's curvature and its depth.",
-    )
+    return {
+        "name": named if isinstance(named, str) and named else name,
+        "image_size_px": (data["imgw"], data["imgh"]),
+        "pixel_pitch": (pitch, pitch),
+        "camera_distance": 0.0,
+        "max_penetration": _DEPTH,
+        "note": f"From gs_sdk's file {name}, which says nothing of the camera's distance, the gel's curvature and its depth.",
+    }
 
 
-def _of_tacto(data: Mapping[str, Any], name: str) -> Sensor:
+def _of_tacto(data: Mapping[str, Any], name: str) -> Values:
     camera, gel = data["camera"], data["gel"]
     if gel.get("mesh") or (isinstance(camera, list) and len(camera) != 1):
         raise SensorError("expected one camera before a flat or spherical gel; write a TOML file for others")
@@ -95,15 +95,15 @@ def _of_tacto(data: Mapping[str, Any], name: str) -> Sensor:
     pitch = 2 * distance * float(np.tan(np.radians(view) / 2)) / height
     fall = _number(gel.get("curvatureMax", 0)) if gel.get("curvature") else 0.0
     corner2 = (_number(gel["width"]) ** 2 + _number(gel["height"]) ** 2) / 4
-    return Sensor(
-        name,
-        (width, height),
-        (pitch, pitch),
-        distance,
-        _DEPTH,
-        membrane_radius=(corner2 + fall**2) / (2 * fall) if fall > 0 else 0.0,
-        note=f"From TACTO's file {name}, which says nothing of the gel's depth: 2 mm. The picture is taken as 240 x 320 px.",
-    )
+    return {
+        "name": name,
+        "image_size_px": (width, height),
+        "pixel_pitch": (pitch, pitch),
+        "camera_distance": distance,
+        "max_penetration": _DEPTH,
+        "membrane_radius": (corner2 + fall**2) / (2 * fall) if fall > 0 else 0.0,
+        "note": f"From TACTO's file {name}, which says nothing of the gel's depth: 2 mm. The picture is taken as 240 x 320 px.",
+    }
 
 
 def _number(value: Any) -> float:
@@ -113,7 +113,7 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-def _of_gsrobotics(data: Mapping[str, Any], name: str) -> Sensor:
+def _of_gsrobotics(data: Mapping[str, Any], name: str, base: Values) -> Values:
     for key in _GSROBOTICS:
         if key not in data:
             raise SensorError(f"the key {key!r} is missing; gsrobotics writes {', '.join(_GSROBOTICS)}")
@@ -122,15 +122,14 @@ def _of_gsrobotics(data: Mapping[str, Any], name: str) -> Sensor:
         raise SensorError(f"camera_width and camera_height must be whole numbers > 0, got {width!r} and {height!r}")
     if isinstance(border, bool) or not 0 <= border <= _MOST_CUT:
         raise SensorError(f"border_fraction is the share cut off at each side, 0 to {_MOST_CUT}, got {border!r}")
-    mini = Sensor.load("gelsight-mini")
-    frame = 2 * mini.half_window / (1 - 2 * mini.border_fraction)  # of the camera, on the membrane [m]
+    window = np.asarray(base["image_size_px"]) * np.asarray(base["pixel_pitch"])
+    frame = window / (1 - 2 * base.get("border_fraction", 0.0))  # of the camera, on the membrane [m]
     x, y = (float(f"{pitch:.6g}") for pitch in frame * (1 - 2 * border) / (width, height))
-    return replace(
-        mini,
-        name=name,
-        image_size_px=(width, height),
-        pixel_pitch=(x, y),
-        border_fraction=float(border),
-        note=f"From gsrobotics' file {name}: a GelSight Mini, of whose frame {100 * border:g} % are cut off at each side. All "
+    return base | {
+        "name": name,
+        "image_size_px": (width, height),
+        "pixel_pitch": (x, y),
+        "border_fraction": float(border),
+        "note": f"From gsrobotics' file {name}: a GelSight Mini, of whose frame {100 * border:g} % are cut off at each side. All "
         "else is gelsight-mini's, the frame's size on the membrane too.",
-    )
+    }
