@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.geometry.polygons import edges_of
 from geomtact.se3 import Array
 
 # By how much corners may lie beside a common plane: of the size the last of six digits, as text is written with, and of the
@@ -67,7 +68,7 @@ def _neighbours(faces: NDArray[np.integer], has_width: NDArray[np.bool_]) -> tup
     from scipy.sparse.csgraph import connected_components
 
     n = len(faces)
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges = np.sort(edges_of(faces), axis=1)
     order = np.lexsort(edges.T)
     edges, owner = edges[order], order % n
     first = np.concatenate([[True], (edges[1:] != edges[:-1]).any(1)])

@@ -144,6 +144,11 @@ class Polygons:
         )
 
 
+def edges_of(faces: NDArray[np.integer]) -> NDArray[np.integer]:
+    """The edges (3 F, 2) of triangles (F, 3), as they go round them: all first ones, all second ones, all third ones."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
 def _fan(rings: Indices) -> Indices:
     """Triangles (m (n - 2), 3) of faces ``rings`` (m, n), all from their first corners."""
     n = rings.shape[1]

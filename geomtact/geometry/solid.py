@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.errors import MeshError
+from geomtact.geometry.polygons import edges_of
 from geomtact.se3 import Array
 
 _NO_VOLUME = 1e-12  # of the cube of a body's size: more than rounding leaves of a sheet, less than any needle has
@@ -35,7 +35,7 @@ def check_solid(vertices: Array, faces: NDArray[np.int32], path: Path) -> None:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    edges = edges_of(faces).astype(np.int64)
     _, index, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     excess = np.bincount(index.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
     bare = int((uses % 2 == 1).sum())
@@ -53,10 +53,9 @@ def check_solid(vertices: Array, faces: NDArray[np.int32], path: Path) -> None:
     join = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
     count, body_of_vertex = connected_components(join, directed=False)
     body = body_of_vertex[faces[:, 0]]
-    low, high = (
-        _bounds(vertices, body_of_vertex, count, np.minimum),
-        _bounds(vertices, body_of_vertex, count, np.maximum),
-    )
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, body_of_vertex, vertices)
+    np.maximum.at(high, body_of_vertex, vertices)
     sizes = np.linalg.norm(high - low, axis=1)
     a, b, c = np.moveaxis(vertices[faces] - low[body][:, None], 1, 0)
     volume = np.bincount(body, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, minlength=count)
@@ -76,10 +75,10 @@ def check_solid(vertices: Array, faces: NDArray[np.int32], path: Path) -> None:
         if not inside.all():
             raise MeshError(
                 f"{path}: a body about ({place_mm(vertices[faces[body == k]])}) mm, whose faces look inwards, passes through "
-                "another; subtract it in CAD and export the part again"
+                "another; subtract it in CAD and export the object again"
             )
     if volume.sum() < 1e-6 * sizes.max() ** 3:
-        raise MeshError(f"{path}: the surface encloses no volume; give a solid part")
+        raise MeshError(f"{path}: the surface encloses no volume; give a solid object")
 
 
 def _inside(corners: Array, size: float, bodies: list[Array]) -> NDArray[np.bool_]:
@@ -102,12 +101,6 @@ def _winding_number(corners: Array, point: Array) -> float:
     ab, bc, ca = (np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (b, c), (c, a)))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))
     return float(np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2 * np.pi))
-
-
-def _bounds(vertices: Array, body: NDArray, count: int, pick: Callable) -> Array:
-    out = np.full((count, 3), np.inf if pick is np.minimum else -np.inf)
-    pick.at(out, body, vertices)  # type: ignore[attr-defined]
-    return out
 
 
 def place_mm(corners: Array) -> str:

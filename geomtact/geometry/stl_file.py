@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geomtact.errors import MeshError
-from geomtact.geometry.polygons import Polygons
+from geomtact.geometry.polygons import Polygons, edges_of
 from geomtact.geometry.text_numbers import number, single_bytes
 from geomtact.se3 import Array
 
@@ -39,30 +38,30 @@ def read_stl(data: bytes) -> Polygons:
 
 
 def _of_binary(data: bytes) -> Polygons:
-    said, there = int.from_bytes(data[80:_HEAD], "little"), (len(data) - _HEAD) // _EACH
+    stated, there = int.from_bytes(data[80:_HEAD], "little"), (len(data) - _HEAD) // _EACH
     layout = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     corners = np.frombuffer(data, layout, there, _HEAD)["corners"].astype(float)
-    beyond = len(data) - _HEAD - _EACH * said
+    beyond = len(data) - _HEAD - _EACH * stated
     if beyond < 0:
         if there and beyond % _EACH == 0 and _is_closed(corners):
             return _polygons(
                 corners,
-                f"says that it holds {said:,} triangles; the {there:,} that are there close a surface and are read",
+                f"says that it holds {stated:,} triangles; the {there:,} that are there close a surface and are read",
             )
         raise MeshError(
-            f"is cut short: expected {_HEAD + _EACH * said:,} bytes for the triangles that it says it holds, "
+            f"is cut short: expected {_HEAD + _EACH * stated:,} bytes for the triangles that it says it holds, "
             f"found {len(data):,}; copy or export it again"
         )
     if beyond == 0:
         return _polygons(corners)
-    more = corners[said:]
+    more = corners[stated:]
     padding = bool((more == more[:, :1]).all())  # no bytes of a whole triangle, or triangles of no extent
-    short, whole = said > 0 and (padding or _is_closed(corners[:said])), not padding and _is_closed(corners)
+    short, whole = stated > 0 and (padding or _is_closed(corners[:stated])), not padding and _is_closed(corners)
     if short and not whole:
-        return _polygons(corners[:said], f"{beyond:,} bytes after the last triangle are passed over")
-    if not short and (whole or (said == 0 and beyond % _EACH == 0)):
-        return _polygons(corners, f"says that it holds {said:,} triangles; all {there:,} that are there are read")
-    raise MeshError(f"says that it holds {said:,} triangles, but is long enough for {there:,}; export the mesh again")
+        return _polygons(corners[:stated], f"{beyond:,} bytes after the last triangle are passed over")
+    if not short and (whole or (stated == 0 and beyond % _EACH == 0)):
+        return _polygons(corners, f"says that it holds {stated:,} triangles; all {there:,} that are there are read")
+    raise MeshError(f"says that it holds {stated:,} triangles, but is long enough for {there:,}; export the mesh again")
 
 
 def _of_text(text: bytes) -> Polygons:
@@ -98,6 +97,5 @@ def _is_closed(corners: Array) -> bool:
     if not len(corners) or not np.isfinite(corners).all():
         return False
     _, vertex = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    faces: NDArray = vertex.reshape(-1, 3)
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges = np.sort(edges_of(vertex.reshape(-1, 3)), axis=1)
     return bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())

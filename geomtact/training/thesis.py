@@ -1,8 +1,7 @@
-"""Trains the thesis's network for one part (6.1.4): pairs of simulated contacts, told apart by the distance of their poses."""
+"""Trains the thesis's network for one object (6.1.4): pairs of simulated contacts, labelled by the distance of their poses."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -10,19 +9,19 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from safetensors.torch import save_file
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError
-from geomtact.files import write_text, write_whole
 from geomtact.geometry.distance import PoseDistance
 from geomtact.progress import Progress
 from geomtact.scoring.encoder import THESIS
 from geomtact.scoring.precision import autocast
 from geomtact.scoring.resnet import SIDE, encode, make_network, resized
 from geomtact.se3 import Array, exp
+from geomtact.training.card import write_network
 from geomtact.training.state import not_a_number, resume, save_state, whose
 
+SCHEMA = "geomtact/resnet50/1"
 NEAR, FAR = 5e-3, 20e-3  # m: pose distance of positive pairs at most, of negative pairs at least
 SLACK = 0.3  # a similarity up to which a negative pair costs nothing
 _CAST = (48, 64)  # pixels of the simulated contacts
@@ -124,21 +123,14 @@ def train_thesis(
             save_state(folder, network, optimizer, asdict(settings), step + 1, {"loss": losses})
         if progress:
             progress((step + 1) / steps, f"training ResNet-50, loss {np.mean(losses[-50:]):.4f}")
-    weights = {name: value.detach().cpu().half().contiguous() for name, value in network.state_dict().items()}
-    meta = {
-        "architecture": THESIS,
-        "side": str(settings.side),
-        **whose(space.mesh, space.sensor),
-    }
-    write_whole(out, lambda temporary: save_file(weights, temporary, meta))
+    meta = {"architecture": THESIS, "side": str(settings.side), **whose(space.mesh, space.sensor)}
     card = {
-        "schema": "geomtact/resnet50/1",
         **meta,
         "settings": asdict(settings),
         "device": device,
         "loss": [float(np.mean(part)) for part in np.array_split(losses, min(50, len(losses)))],
     }
-    write_text(out.with_suffix(".json"), json.dumps(card, indent=1) + "\n")
+    write_network(out, network.cpu(), SCHEMA, card, meta)
 
 
 def _small_motions(n: int, radius: float, rng: np.random.Generator) -> Array:
