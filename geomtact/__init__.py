@@ -1,4 +1,4 @@
-"""geomtact: where a known part lies, told by the shape of one tactile contact, as a distribution over its whole pose.
+"""geomtact: the full probability distribution of an object's pose, from its mesh and the shape of one tactile contact.
 
 The public names below are loaded when first used, so that ``import geomtact`` takes no time.
 """

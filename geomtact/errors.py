@@ -24,7 +24,7 @@ class MeshError(InputError):
 
 
 class ImageError(InputError):
-    """An image cannot be used: unreadable, of another size than the sensor, or of no known kind."""
+    """An image cannot be used: unreadable, of another size than the sensor, or of none of the kinds."""
 
 
 class SensorError(InputError):
@@ -43,19 +43,19 @@ class CacheError(InputError):
     """The cache folder cannot be read or written."""
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """``"; did you mean 'x'?"`` for the known name nearest to ``name``, ``""`` if none is near."""
-    stems = {_stem(each): each for each in sorted(known, reverse=True)}
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """``"; did you mean 'x'?"`` for the one of ``names`` nearest to ``name``, ``""`` if none is near."""
+    stems = {_stem(each): each for each in sorted(names, reverse=True)}
     close = difflib.get_close_matches(_stem(name), sorted(stems), n=1)
     return f"; did you mean {stems[close[0]]!r}?" if close else ""
 
 
 def _stem(name: str) -> str:
-    """What tells one name from another: neither case nor a file's suffix."""
+    """What distinguishes one name from another: neither case nor a file's suffix."""
     return PurePath(name).stem.lower()
 
 
-def nearest_name(name: str, known: Iterable[str]) -> str:
-    """:func:`did_you_mean`, and the list of known names."""
-    known = sorted(known)
-    return f"{did_you_mean(name, known)} (known: {', '.join(known)})"
+def nearest_name(name: str, names: Iterable[str]) -> str:
+    """:func:`did_you_mean`, and the list of names."""
+    names = sorted(names)
+    return f"{did_you_mean(name, names)} (known: {', '.join(names)})"

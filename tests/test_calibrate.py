@@ -11,7 +11,7 @@ import geomtact
 from geomtact import ImageError, InputError, Sensor, SensorError, UsageError, contact_height
 from geomtact.cli import app
 from geomtact.sensing.ball import diameter_of
-from geomtact.sensing.calibrate import calibrate, calibrated, measured_diameter
+from geomtact.sensing.calibrate import calibrate, calibrate_sensor, measured_diameter
 from geomtact.sensing.colour import TERMS, ColourTable, fit_weights, terms
 from geomtact.sensing.image_file import read_image, write_image
 from geomtact.sensing.membrane import membrane_curvature
@@ -66,7 +66,7 @@ def presses(diameter, places=PLACES, seed=0, bend=0.0):
 @pytest.fixture(scope="module")
 def found():
     images, background = presses(8 * MM)
-    return calibrated(images, 8 * MM, background, PITCH, name="made")
+    return calibrate_sensor(images, 8 * MM, background, PITCH, name="made")
 
 
 def test_an_opaque_alpha_channel_changes_nothing(tmp_path):
@@ -100,10 +100,10 @@ def test_heights_of_a_ball_it_was_not_calibrated_with(found, diameter):
 def test_a_bulging_membrane_takes_its_own_slope_off_the_balls():
     images, background = presses(8 * MM, bend=35 * MM)
     curved = Sensor("curved", SHAPE[::-1], (PITCH, PITCH), 0.0, 2 * MM, membrane_radius=35 * MM)
-    found = calibrated(images, 8 * MM, background, sensor=curved)
+    found = calibrate_sensor(images, 8 * MM, background, sensor=curved)
     assert np.median(found.diameters) == pytest.approx(8 * MM, rel=0.03)
     # taken for flat, its bulge passes for a tenth of the ball's curvature
-    flat = calibrated(images, 8 * MM, background, PITCH)
+    flat = calibrate_sensor(images, 8 * MM, background, PITCH)
     press = found.presses[0]
     told = [measured_diameter(press, sensor) for sensor in (found.sensor, flat.sensor)]
     assert told[0] == pytest.approx(8 * MM, rel=0.05)
@@ -116,20 +116,20 @@ def test_two_balls_tell_how_a_membrane_bulges_and_that_a_flat_one_does_not():
         found = []
         for diameter, seed in ((6 * MM, 1), (10 * MM, 2)):
             images, background = presses(diameter, seed=seed, bend=bend)
-            found += [calibrated(images, diameter, background, PITCH), diameter]
+            found += [calibrate_sensor(images, diameter, background, PITCH), diameter]
         curvature, std = membrane_curvature(*found)
         if bend:
             assert 0.7 < curvature * bend < 1.1 and curvature > 3 * std
         else:
             assert abs(curvature) < 2.5 and std < 1
-    with pytest.raises(InputError, match="tell nothing of the membrane"):
+    with pytest.raises(InputError, match="determine nothing of the membrane"):
         membrane_curvature(*found[:3], 7 * MM)
     with pytest.raises(InputError, match="the balls contradict each other"):
         membrane_curvature(*found[:3], 20 * MM)
     swapped = [
         one
         for diameter, said in ((6 * MM, 10 * MM), (10 * MM, 6 * MM))
-        for one in (calibrated(*presses(diameter)[:1], said, presses(diameter)[1], PITCH), said)
+        for one in (calibrate_sensor(*presses(diameter)[:1], said, presses(diameter)[1], PITCH), said)
     ]
     with pytest.raises(InputError, match="be hollow.*not exchanged"):
         membrane_curvature(*swapped)
@@ -137,15 +137,17 @@ def test_two_balls_tell_how_a_membrane_bulges_and_that_a_flat_one_does_not():
 
 def test_presses_all_in_one_place_or_few_are_doubted():
     images, background = presses(8 * MM, [(40, 35), (70, 60), (50, 70)])
-    said = calibrated(images, 8 * MM, background, PITCH).warnings
+    said = calibrate_sensor(images, 8 * MM, background, PITCH).warnings
     assert "presses lie within 19 % of the window's width and 29 % of its height" in said[0]
     images, background = presses(8 * MM, PLACES[:3])
-    assert any("measure the ball" in warning for warning in calibrated(images, 8 * MM, background, PITCH).warnings)
-    found = calibrated([*images, images[0]], 8 * MM, background, PITCH)
+    assert any(
+        "measure the ball" in warning for warning in calibrate_sensor(images, 8 * MM, background, PITCH).warnings
+    )
+    found = calibrate_sensor([*images, images[0]], 8 * MM, background, PITCH)
     assert found.left_out == {"press 4": "it is the same image as one before"}
     assert not any("no ball of that size" in warning for warning in found.warnings)
     untouched = [np.clip(background.astype(int) + n, 0, 255).astype(np.uint8) for n in range(4)]
-    doubted = calibrated([*images, *images, *untouched], 8 * MM, background, PITCH).warnings
+    doubted = calibrate_sensor([*images, *images, *untouched], 8 * MM, background, PITCH).warnings
     assert "on 4 presses no ball of that size was found, on 3 it was" in doubted[0]
 
 
@@ -154,7 +156,7 @@ def test_a_pitch_with_which_imprints_are_wider_than_the_ball_is_doubted():
     rng = np.random.default_rng(0)
     made = [lit(pressed(4 * MM, place, contact=1.2 * MM)[1], rng) for place in PLACES]
     wide = lit(pressed(12 * MM, (80, 60), contact=2.4 * MM)[1], rng)[0]
-    found = calibrated([*(image for image, _ in made), wide], 4 * MM, made[0][1], PITCH)
+    found = calibrate_sensor([*(image for image, _ in made), wide], 4 * MM, made[0][1], PITCH)
     assert "is wider than the ball" in found.left_out[f"press {len(PLACES) + 1}"]
     allowed = float(re.search(r"allows a pitch of ([0-9.]+) mm at most", found.warnings[0])[1])
     assert allowed * MM == pytest.approx(PITCH * 2.0 / 2.4, rel=0.1)
@@ -163,7 +165,7 @@ def test_a_pitch_with_which_imprints_are_wider_than_the_ball_is_doubted():
 def test_a_press_of_another_ball_is_named(found):
     assert found.warnings == []
     images, background = presses(8 * MM)
-    mixed = calibrated([*images, presses(14 * MM, PLACES[:1])[0][0]], 8 * MM, background, PITCH)
+    mixed = calibrate_sensor([*images, presses(14 * MM, PLACES[:1])[0][0]], 8 * MM, background, PITCH)
     assert any(f"on press {len(PLACES) + 1} no ball is seen, or one more than 40 %" in said for said in mixed.warnings)
 
 
@@ -172,10 +174,10 @@ def test_a_background_in_which_the_ball_is_pressed_in_is_refused_as_is_one_place
     with pytest.raises(
         InputError, match="nearly all presses differ from the background around column .* without contact"
     ):
-        calibrated(images[1:], 8 * MM, images[0], PITCH)
+        calibrate_sensor(images[1:], 8 * MM, images[0], PITCH)
     images, background = presses(8 * MM, [(70, 55), (73, 60), (76, 58)])
     with pytest.raises(InputError, match="or all presses lie there"):
-        calibrated(images, 8 * MM, background, PITCH)
+        calibrate_sensor(images, 8 * MM, background, PITCH)
 
 
 def test_large_images_take_no_more_memory_at_a_time(found):
@@ -214,7 +216,7 @@ def test_what_is_no_ball_is_left_out_and_named(rng):
     bar = np.zeros((*SHAPE, 2))
     bar[30:40, 20:140, 1], bar[80:90, 20:140, 1] = 0.5, -0.5
     images = [background, lit(bar, rng)[0], *images[:3]]
-    found = calibrated(images, 8 * MM, background, PITCH)
+    found = calibrate_sensor(images, 8 * MM, background, PITCH)
     assert set(found.left_out) == {"press 1", "press 2"} and "no contact" in found.left_out["press 1"]
     with pytest.raises(InputError, match=r"3 presses or more are needed, 2 of 4 serve \(press 1: no contact"):
         calibrate(images[:4], 8 * MM, background, PITCH)
@@ -305,9 +307,9 @@ def test_real_presses_of_one_ball_measure_the_other(data_folder, used, judged):
     folder = data_folder / "gelslam_gsmini_balls"
     own, other = (sorted((folder / f"{d:.3f}mm").glob("*.png")) for d in (used, judged))
     background = folder / "background.png"
-    table = calibrated(own, used * MM, background, sensor="gelsight-mini")
+    table = calibrate_sensor(own, used * MM, background, sensor="gelsight-mini")
     assert np.median(table.diameters) == pytest.approx(used * MM, rel=0.05)
     assert len(table.presses) >= 0.8 * len(own)
-    found = calibrated(other, judged * MM, background, sensor="gelsight-mini").presses
+    found = calibrate_sensor(other, judged * MM, background, sensor="gelsight-mini").presses
     told = [measured_diameter(press, table.sensor) for press in found]
     assert np.median(told) == pytest.approx(judged * MM, rel=0.05)

@@ -47,7 +47,7 @@ def test_another_unit_is_refused_with_its_conversion(depth, unit, conversion):
     for array in (given, given.astype(np.float32)):
         with pytest.raises(ImageError, match=re.escape(conversion)) as error:
             read(array)
-        assert "expected heights in metres up to about 0.002" in str(error.value) and "\n" not in str(error.value)
+        assert "expected depths in metres up to about 0.002" in str(error.value) and "\n" not in str(error.value)
     for factor in re.findall(r" by ([\d.e-]+)", str(error.value)):
         assert 0.01 * 2e-3 <= float(factor) * given.max() <= 1.5 * 2e-3
 
@@ -56,7 +56,7 @@ def test_the_message_for_gs_sdks_pixels():
     with pytest.raises(ImageError) as error:
         read(ball(5e-4) / PITCH)
     assert str(error.value) == (
-        "image: expected heights in metres up to about 0.002, the largest is 7.886; multiply pixels (of gs_sdk) by "
+        "image: expected depths in metres up to about 0.002, the largest is 7.886; multiply pixels (of gs_sdk) by "
         "6.34e-05; or is it a camera's image: --kind reading"
     )
 
@@ -111,7 +111,7 @@ def test_noise_about_0_alone_is_no_contact(rng, sigma, width):
     seen = read(given)
     assert not seen.contact.mask.any() and not seen.contact.height.any()
     assert seen.warnings == [
-        f"image: heights of {1e6 * given.min():.2g} to {1e6 * given.max():.2g} micrometres are noise about 0: taken as no contact"
+        f"image: depths of {1e6 * given.min():.2g} to {1e6 * given.max():.2g} micrometres are noise about 0: taken as no contact"
     ]
 
 
@@ -126,13 +126,13 @@ def test_noise_about_0_alone_is_no_contact(rng, sigma, width):
 )
 def test_what_is_as_low_as_high_is_not_always_noise(given, rng):
     for noisy in (given, given + correlated(rng, 2e-6, 2)):
-        with pytest.raises(ImageError, match="heights are depths of the gel's indentation, >= 0"):
+        with pytest.raises(ImageError, match="depths of the gel's indentation are >= 0"):
             read(noisy)
 
 
 def test_large_noise_is_read_with_a_warning(rng):
     seen = read(ball(1.2e-3) + correlated(rng, 3e-5, 0))
-    assert any(re.search(r"heights down to -1\.\de\+02 micrometres were set to 0", said) for said in seen.warnings)
+    assert any(re.search(r"depths down to -1\.\de\+02 micrometres were set to 0", said) for said in seen.warnings)
     assert not seen.contact.mask[ball(1.2e-3) == 0].any()
 
 
@@ -161,7 +161,7 @@ def test_distances_to_the_gel_are_suspected(rest, noise, rng):
     (warning,) = (said for said in read(given).warnings if "distances" in said)
     assert warning == (
         "image: the border is as deep as anything, and the inside is not, as in a map of distances to the gel; if it is one, "
-        f"give the distances at rest less these, as {given.max():.4g} - heights"
+        f"give the distances at rest less these, as {given.max():.4g} - depths"
     )
     back = read(np.maximum(given.max() - given, 0))
     assert not any("distances" in said for said in back.warnings)

@@ -204,7 +204,7 @@ def test_the_sensor_says_how_contact_is_found_and_probabilities_reach_the_locali
     first, second = (read_observation(image, each, background=background).contact for each in (plain, learned))
     assert first.probability is None and np.array_equal(first.mask, contact_mask(image, background, plain))
     assert np.array_equal(second.mask, contact_mask(image, background, plain, "learned"))
-    assert np.array_equal(second.mask, second.probability > 0.5) and second.shown is second.probability
+    assert np.array_equal(second.mask, second.probability > 0.5) and second.soft_mask is second.probability
 
 
 def test_by_itself_the_network_is_asked_where_light_is_blown_out_and_colours_tell_slopes(data_folder):

@@ -197,7 +197,7 @@ def test_unit_is_never_guessed(tmp_path):
 def test_unknown_names_and_files(tmp_path):
     refused("did you mean 'elbow_pipe'", "elbow-pipe")
     refused("did you mean 'pin'", "PIN")
-    refused("no part named 'zzz'", "zzz")
+    refused("no object named 'zzz'", "zzz")
     refused("no such file; give", tmp_path / "nothing.stl", "mm")
     save(box(), tmp_path / "part.stl")
     refused(r"prat.stl: no such file; did you mean 'part.stl'\?$", tmp_path / "prat.stl")

@@ -8,7 +8,7 @@ from scipy.special import softmax
 
 from geomtact.scoring import fitted
 from geomtact.scoring.calibration import Calibration, posterior_log_prob
-from geomtact.scoring.mixture import mixed, ways
+from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
 from geomtact.sensing.patches import patches
 
 MM = 1e-3
@@ -56,7 +56,7 @@ def test_one_patch_is_taken_as_it_is(localizer):
     dirt = left.copy()
     dirt[:2, :2] = True
     for alone in (left, right, dirt, np.zeros_like(mask), np.ones_like(mask)):
-        shares, shown = ways(alone, localizer.sensor)
+        shares, shown = contact_hypotheses(alone, localizer.sensor)
         assert shares == [1.0] and shown[0] is alone
 
 
@@ -65,7 +65,7 @@ def test_the_shares_of_several_patches_add_up_to_one(localizer):
         mask = np.zeros(localizer.sensor.image_size_px[::-1], bool)
         for i in range(number):
             mask[20:60, 30 + 50 * i : 60 + 50 * i] = True
-        shares, shown = ways(mask, localizer.sensor)
+        shares, shown = contact_hypotheses(mask, localizer.sensor)
         assert sum(shares) == pytest.approx(1, rel=1e-12) and min(shares) > 0
         assert shown[0] is mask and len(shown) == len(shares) == 1 + min(number, 3)
 
@@ -77,7 +77,7 @@ def test_the_posterior_of_a_mixture_is_the_mixture_of_the_posteriors(rng):
     log_weight = np.log(rng.dirichlet(np.ones(500)) + 1e-300).astype(np.float32)
     log_weight[:20] = -np.inf
     expected = sum(s * softmax(x / temperature + log_weight) for s, x in zip(shares, scores, strict=True))
-    score = mixed(shares, [x.copy() for x in scores], log_weight, temperature)
+    score = mix_hypotheses(shares, [x.copy() for x in scores], log_weight, temperature)
     got = posterior_log_prob(score, log_weight, Calibration(temperature, 0.0, 1.0))
     assert np.exp(got) == pytest.approx(expected, rel=1e-4, abs=1e-12)
     assert (np.exp(got)[:20] == 0).all()
@@ -99,7 +99,7 @@ def density(rows):
 def contact(localizer):
     """A contact of two patches, each of them, and the shares of the mixture."""
     mask, parts = two_patches(localizer)
-    return mask, parts, ways(mask, localizer.sensor)[0]
+    return mask, parts, contact_hypotheses(mask, localizer.sensor)[0]
 
 
 @pytest.fixture(params=[1.0, 0.3])

@@ -148,7 +148,7 @@ def test_sixteen_bit_grey_is_height_in_micrometres(tmp_path):
 
 
 def test_heights_of_less_than_a_micrometre_have_a_wrong_unit():
-    with pytest.raises(ImageError, match=r"expected heights in metres .* divided by 1000 once too often"):
+    with pytest.raises(ImageError, match=r"expected depths in metres .* divided by 1000 once too often"):
         read_observation(HEIGHT * 1e-4, MINI)
 
 
@@ -250,8 +250,8 @@ def test_a_background_for_a_mask_is_said_to_be_unused(background):
         (np.array([["a"]]), "expected numbers, got an array of <U1"),
         (np.where(MASK, np.nan, 0), "values are NaN or infinite"),
         (np.where(MASK, np.inf, 0), "values are NaN or infinite"),
-        (HEIGHT - 2e-4, "heights are depths of the gel's indentation, >= 0; the lowest is -0.0002 m"),
-        (HEIGHT * 1e3, "expected heights in metres up to about 0.002, the largest is 0.52"),
+        (HEIGHT - 2e-4, "depths of the gel's indentation are >= 0; the lowest is -0.0002 m"),
+        (HEIGHT * 1e3, "expected depths in metres up to about 0.002, the largest is 0.52"),
         (np.dstack([*np.mgrid[:240, :320], MASK]) / 1.0, "a float reading must lie in 0..1, got 0 to 319; divide by"),
     ],
 )  # fmt: skip

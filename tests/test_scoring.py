@@ -16,8 +16,8 @@ from geomtact.scoring import calibration
 from geomtact.scoring.calibration import (
     FLOORS,
     Calibration,
-    Touches,
-    calibrate,
+    CalibrationTouches,
+    fit_calibration,
     normalised,
     posterior_log_prob,
     simulate_touches,
@@ -25,7 +25,7 @@ from geomtact.scoring.calibration import (
 from geomtact.scoring.catalogue import SCORERS
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
 from geomtact.scoring.moments import Moments
-from geomtact.scoring.overlap import OVERLAPS, IoU, PixelL1, overlaps, to_grid
+from geomtact.scoring.overlap import OVERLAPS, overlaps, to_grid
 from geomtact.sensing.moments import moments, without_specks
 from geomtact.sensing.sensor import Sensor
 
@@ -65,12 +65,12 @@ def test_overlaps_of_many_poses_are_each_their_own(rng):
 
 def by_brute_force(scorer, stored, seen):
     both, either = (stored & seen).sum((1, 2)), (stored | seen).sum((1, 2))
-    if isinstance(scorer, IoU):
+    if scorer.name == "iou":
         return both / np.maximum(either, 1)
     return 1 - (either - both) / seen.size
 
 
-@pytest.mark.parametrize("scorer", [IoU(), PixelL1()], ids=lambda s: s.name)
+@pytest.mark.parametrize("scorer", list(OVERLAPS.values()), ids=lambda s: s.name)
 def test_scores_are_what_counting_pixels_gives(scorer, localizer, rng):
     index = localizer.index
     ids = rng.choice(len(index), 300, replace=False)
@@ -81,7 +81,7 @@ def test_scores_are_what_counting_pixels_gives(scorer, localizer, rng):
         assert score.ravel()[ids] == pytest.approx(by_brute_force(scorer, stored, seen), abs=1e-6)
 
 
-@pytest.mark.parametrize("scorer", [IoU(), PixelL1()], ids=lambda s: s.name)
+@pytest.mark.parametrize("scorer", list(OVERLAPS.values()), ids=lambda s: s.name)
 def test_a_stored_contact_is_most_like_itself(scorer, localizer, rng):
     index = localizer.index
     for i in rng.choice(len(index), 10):
@@ -216,7 +216,7 @@ def test_the_scores_rank_the_true_pose_high(plug, pin, curved):
         index = localizer.index
         touches = simulate_touches(index, 24, seed=8)
         for name in ("moments", "iou"):  # the thesis's own, l1, fails, as the thesis says
-            scorer = localizer.scorer.witness.moments if name == "moments" else OVERLAPS[name]
+            scorer = localizer.scorer.evidence_model.moments if name == "moments" else OVERLAPS[name]
             w = np.asarray(index.weight).ravel()
             above = []
             for mask, true in zip(touches.masks, touches.ids, strict=True):
@@ -252,11 +252,11 @@ class Oracle:
 def test_a_useless_score_is_not_trusted(ball):
     index = ball.index
     touches = simulate_touches(index, 40, seed=5)
-    useless, iou = (calibrate(s, index, touches) for s in (Useless(), IoU()))
+    useless, iou = (fit_calibration(s, index, touches) for s in (Useless(), OVERLAPS["iou"]))
     assert useless.floor == FLOORS[-1] or useless.temperature > 2
     assert abs(useless.gain) < 0.1
     assert iou.gain > 1
-    oracle = calibrate(Oracle(touches), index, touches)
+    oracle = fit_calibration(Oracle(touches), index, touches)
     w = np.asarray(index.weight).ravel()[touches.ids]
     assert oracle.floor == FLOORS[0]
     assert oracle.gain == pytest.approx(-np.log(w).mean(), abs=0.01)
@@ -266,7 +266,7 @@ def test_the_calibration_is_the_one_that_gains_most(ball):
     """The gain of every temperature and floor, worked out from the posterior that localize would give."""
     index = ball.index
     touches = simulate_touches(index, 12, seed=6)
-    found = calibrate(IoU(), index, touches)
+    found = fit_calibration(OVERLAPS["iou"], index, touches)
     log_w = index.log_weight
     gain = {}
     for t in (0.1 * found.temperature, found.temperature, 10 * found.temperature):
@@ -274,7 +274,7 @@ def test_the_calibration_is_the_one_that_gains_most(ball):
             each = []
             for mask, true in zip(touches.masks, touches.ids, strict=True):
                 trust = Calibration(t, floor, 0.0)
-                log_prob = posterior_log_prob(IoU().score(index, mask), log_w, trust)
+                log_prob = posterior_log_prob(OVERLAPS["iou"].score(index, mask), log_w, trust)
                 each.append(log_prob[true] - log_w[true])
             gain[t, floor] = np.mean(each)
     assert max(gain.values()) == pytest.approx(gain[found.temperature, found.floor])
@@ -338,7 +338,7 @@ def test_simulated_touches_are_as_often_where_a_cell_hardly_touches_as_poses_are
 def test_touches_are_kept_and_read_back(plug, tmp_path):
     touches = simulate_touches(plug.index, 5, seed=7)
     touches.save(tmp_path / "touches.npz")
-    again = Touches.load(tmp_path / "touches.npz")
+    again = CalibrationTouches.load(tmp_path / "touches.npz")
     assert (touches.ids == again.ids).all() and (np.array(touches.masks) == np.array(again.masks)).all()
 
 

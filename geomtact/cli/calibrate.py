@@ -13,7 +13,7 @@ from geomtact.errors import UsageError
 from geomtact.files import write_bytes, write_text
 
 if TYPE_CHECKING:
-    from geomtact.sensing.calibrate import Calibrated
+    from geomtact.sensing.calibrate import SensorCalibration
     from geomtact.sensing.sensor import Sensor
 
 
@@ -53,7 +53,7 @@ def calibrate(
     half a minute.
     """
     from geomtact.report.calibration_plot import draw_calibration
-    from geomtact.sensing.calibrate import calibrated
+    from geomtact.sensing.calibrate import calibrate_sensor
 
     mounting = Mounting(rotate, mirror)
     for path, suffix in ((out, ".toml"), (plot, ".png")):
@@ -93,7 +93,7 @@ def calibrate(
     if ball_mm is None:
         raise UsageError("--ball-mm: expected the ball's diameter in millimetres, got none; give it")
     mounted = _mounted(sensor, background, pitch, mounting)
-    found = calibrated(presses, 1e-3 * ball_mm, background, pitch, mounted, name or out.stem)
+    found = calibrate_sensor(presses, 1e-3 * ball_mm, background, pitch, mounted, name or out.stem)
     for why in dict.fromkeys(found.left_out.values()):
         names = [name for name, reason in found.left_out.items() if reason == why]
         tell(f"warning: left out ({why}): {', '.join(names)}")
@@ -178,13 +178,13 @@ def _of_taxim(
     return replace(base, name=name, pixel_pitch=pitch or base.pixel_pitch, colour=colour)
 
 
-def _print_membrane(found: Calibrated, ball_mm: float, folder: Path, other_mm: float, background: Path) -> None:
+def _print_membrane(found: SensorCalibration, ball_mm: float, folder: Path, other_mm: float, background: Path) -> None:
     """Print the membrane's curvature, measured with presses of another ball."""
     from geomtact.cli.frames import listed
-    from geomtact.sensing.calibrate import calibrated
+    from geomtact.sensing.calibrate import calibrate_sensor
     from geomtact.sensing.membrane import membrane_curvature
 
-    second = calibrated(sorted(listed(folder)), 1e-3 * other_mm, background, sensor=found.sensor)
+    second = calibrate_sensor(sorted(listed(folder)), 1e-3 * other_mm, background, sensor=found.sensor)
     curvature, std = membrane_curvature(found, 1e-3 * ball_mm, second, 1e-3 * other_mm)
     typer.echo(f"  membrane              curvature {1e-3 * curvature:.4f} ± {1e-3 * std:.4f} 1/mm")
     if curvature > 2 * std:
@@ -207,7 +207,7 @@ def _pitch_of(pins: Path, background: Path, spacing: float) -> tuple[float, floa
     return board.pixel_pitch
 
 
-def _print(found: Calibrated, ball_mm: float) -> None:
+def _print(found: SensorCalibration, ball_mm: float) -> None:
     import numpy as np
 
     colour, mm = found.sensor.colour, 1e3 * found.diameters

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from geomtact.contact_space import resolution as res
-from geomtact.contact_space.heightmap import CELL_PIXELS, NOTHING, Frame, HeightMap, Window, allowed
+from geomtact.contact_space.heightmap import CELL_PIXELS, NOTHING, HeightMap, Lattice, Window, allowed
 from geomtact.contact_space.index import pack
 from geomtact.contact_space.resolution import MAX_POSES, Resolution
 from geomtact.errors import MeshError
@@ -61,14 +61,14 @@ def build(
     directions = resolution.directions(mesh.symmetry, approach)
     caster = Caster(mesh.vertices, mesh.faces)
     reach = mesh.reach
-    frame = Frame.make(reach, sensor, resolution.step)
+    lattice = Lattice.make(reach, sensor, resolution.step)
     window = Window(sensor, resolution.mask_shape, resolution.penetrations)
     margin = 2.1 * float(np.hypot(*sensor.half_window)) + resolution.step
 
     def one(k: int) -> list[_Turn]:
         there = HeightMap.cast(caster, directions.vectors[k], mesh.centre, reach, margin, resolution.pixel)
         turns = np.arange(directions.turns[k]) * directions.periods[k] / directions.turns[k]
-        return [_touches(there, turn, frame, window) for turn in turns]
+        return [_touches(there, turn, lattice, window) for turn in turns]
 
     turns: list[_Turn] = []
     with ThreadPoolExecutor(_THREADS) as pool:
@@ -85,7 +85,9 @@ def build(
             f"{mesh.name}: no pose touches the sensor {sensor.name!r} as the approach and the housing allow; "
             "widen the approach or check the object's unit"
         )
-    return _join(turns, directions, frame, _blocks(turns, directions.coarser_rotations(resolution.turn_step), frame))
+    return _join(
+        turns, directions, lattice, _blocks(turns, directions.coarser_rotations(resolution.turn_step), lattice)
+    )
 
 
 def choose_resolution(
@@ -99,23 +101,23 @@ def choose_resolution(
     assert mesh.symmetry is not None
     directions = Directions.make(mesh.symmetry, approach, 1, 0.5)
     caster, reach = Caster(mesh.vertices, mesh.faces), mesh.reach
-    frame = Frame.make(reach, sensor, step=float(sensor.half_window.min()))
+    lattice = Lattice.make(reach, sensor, step=float(sensor.half_window.min()))
     area = 0.0
     for k, weight in enumerate(directions.weights):
-        there = HeightMap.cast(caster, directions.vectors[k], mesh.centre, reach, 0.0, frame.pixel / 2)
+        there = HeightMap.cast(caster, directions.vectors[k], mesh.centre, reach, 0.0, lattice.pixel / 2)
         turn = 2.4 * k  # the golden angle, in short: every direction at another turn
-        area += weight * allowed(there.turned(turn, frame), frame, sensor, [0.0]).sum() * frame.pixel**2
+        area += weight * allowed(there.turned(turn, lattice), lattice, sensor, [0.0]).sum() * lattice.pixel**2
         if progress:
             progress((k + 1) / len(directions.weights), "choosing the grid")
     return res.choose(mesh, float(area), sensor, approach, max_poses)
 
 
 def places(
-    there: HeightMap, turn: float, frame: Frame, window: Window
+    there: HeightMap, turn: float, lattice: Lattice, window: Window
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.float32]]:
     """The lattice cells (n,) of one rotation in which the object touches, a window centre (n, 2) [m] that stands for
     each, from the object's centre, and the share (P, n) of each that touches at every penetration."""
-    ok = frame.blocks(allowed(there.turned(turn, frame), frame, window.sensor, window.penetrations))
+    ok = lattice.blocks(allowed(there.turned(turn, lattice), lattice, window.sensor, window.penetrations))
     share = ok.mean(2, dtype=np.float32)
     cell = np.flatnonzero(share.any(0))
     # a place is represented by one of the pixels that touch at most depths, the nearest to their mean
@@ -124,12 +126,12 @@ def places(
     i, j = np.divmod(np.arange(CELL_PIXELS**2), CELL_PIXELS)
     n = inside.sum(1)
     far = (i - (inside @ i / n)[:, None]) ** 2 + (j - (inside @ j / n)[:, None]) ** 2
-    return cell, frame.positions(cell, np.where(inside, far, np.inf).argmin(1)), share[:, cell]
+    return cell, lattice.positions(cell, np.where(inside, far, np.inf).argmin(1)), share[:, cell]
 
 
-def _touches(there: HeightMap, turn: float, frame: Frame, window: Window) -> _Turn:
+def _touches(there: HeightMap, turn: float, lattice: Lattice, window: Window) -> _Turn:
     """All places of one rotation."""
-    cell, centres, share = places(there, turn, frame, window)
+    cell, centres, share = places(there, turn, lattice, window)
     masks, z = window.masks(there, turn, centres)
     # a sliver at the window's edge may fall between the finer pixels of the height map
     seen = z > NOTHING / 2
@@ -143,7 +145,7 @@ def _touches(there: HeightMap, turn: float, frame: Frame, window: Window) -> _Tu
     return _Turn(cell, -centres, z, share, packed, masks.sum(2), np.moveaxis(summed, 2, 0))
 
 
-def _join(turns: list[_Turn], directions: Directions, frame: Frame, block: NDArray[np.int64]) -> dict[str, NDArray]:
+def _join(turns: list[_Turn], directions: Directions, lattice: Lattice, block: NDArray[np.int64]) -> dict[str, NDArray]:
     """One array of each kind for all rotations, sorted by ``block`` (n,); the weights made a share of the whole."""
     first = np.concatenate([[0], np.cumsum([len(t.cell) for t in turns])])
     some, n = turns[0], int(first[-1])
@@ -158,7 +160,7 @@ def _join(turns: list[_Turn], directions: Directions, frame: Frame, block: NDArr
         "bits": np.zeros((p, words, n), np.uint64),
         "area": np.zeros((p, n), np.uint16),
         "moments": np.zeros((some.moments.shape[0], p, n), np.float32),
-        "table": np.zeros((len(turns), *frame.cells), np.int32),
+        "table": np.zeros((len(turns), *lattice.cells), np.int32),
         "blocks": np.concatenate([[0], np.cumsum(np.bincount(block))]).astype(np.int32),
     }
     share = np.repeat(directions.weights / directions.turns, directions.turns)
@@ -171,7 +173,7 @@ def _join(turns: list[_Turn], directions: Directions, frame: Frame, block: NDArr
         out["bits"][:, :, part] = turn.bits
         out["area"][:, part] = turn.area
         out["moments"][:, :, part] = turn.moments
-        table = np.full(frame.cells, -1)
+        table = np.full(lattice.cells, -1)
         table.flat[turn.cell] = part
         out["table"][r] = _fill(table) if len(turn.cell) else -1
     out["weight"] /= out["weight"].sum(dtype=np.float64)
@@ -182,14 +184,14 @@ def _join(turns: list[_Turn], directions: Directions, frame: Frame, block: NDArr
     return out
 
 
-def _blocks(turns: list[_Turn], parent: NDArray[np.int64], frame: Frame) -> NDArray[np.int64]:
+def _blocks(turns: list[_Turn], parent: NDArray[np.int64], lattice: Lattice) -> NDArray[np.int64]:
     """The block of the next coarser grid that holds each place (n,), counted without gaps.
 
     A block is 2 x 2 lattice cells of the rotations that have the same ``parent`` (M,) rotation.
     """
-    y, x = np.divmod(np.concatenate([t.cell for t in turns]), frame.cells[1])
+    y, x = np.divmod(np.concatenate([t.cell for t in turns]), lattice.cells[1])
     owner = np.repeat(parent, [len(t.cell) for t in turns])
-    ny, nx = (n // 2 + 1 for n in frame.cells)
+    ny, nx = (n // 2 + 1 for n in lattice.cells)
     return np.unique((owner * ny + y // 2) * nx + x // 2, return_inverse=True)[1]
 
 

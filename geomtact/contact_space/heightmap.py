@@ -53,7 +53,7 @@ class HeightMap:
         rays = (np.stack(np.meshgrid(s, band), -1).reshape(-1, 2) for band in bands)
         depth = np.concatenate([caster.ray_depths(_VERTICAL, T, some)[0] for some in rays])
         heights = np.where(np.isfinite(depth), depth, NOTHING).astype(np.float32).reshape(len(s), len(s))
-        # the deepest points of a part are its corners, which fall between the rays
+        # the deepest points of an object are its corners, which fall between the rays
         corners = (caster.vertices - centre) @ R.T
         ij = np.rint(corners[:, :2] / pixel).astype(np.int64) + half
         np.maximum.at(heights, (ij[:, 1], ij[:, 0]), -corners[:, 2].astype(np.float32))
@@ -61,13 +61,13 @@ class HeightMap:
         widest = cv2.dilate(heights, np.ones((PIXELS_PER_MASK_PIXEL,) * 2, np.uint8))
         return cls(heights, np.asarray(widest, np.float32), pixel)
 
-    def turned(self, turn: float, frame: Frame) -> NDArray[np.float32]:
-        """The heights turned by ``turn`` [rad] about the centre, on ``frame``."""
-        h, w = frame.shape
+    def turned(self, turn: float, lattice: Lattice) -> NDArray[np.float32]:
+        """The heights turned by ``turn`` [rad] about the centre, on ``lattice``."""
+        h, w = lattice.shape
         c, s = np.cos(turn), np.sin(turn)
         # the map from a pixel here to the pixel there: p_there = Rz(-turn) p_here
         A = np.zeros((2, 3))
-        A[:, :2] = np.array([[c, s], [-s, c]]) * (frame.pixel / self.pixel)
+        A[:, :2] = np.array([[c, s], [-s, c]]) * (lattice.pixel / self.pixel)
         A[:, 2] = len(self.heights) // 2 - A[:, :2] @ [w // 2, h // 2]
         turned = cv2.warpAffine(
             self.heights,
@@ -81,7 +81,7 @@ class HeightMap:
 
 
 @dataclass(frozen=True)
-class Frame:
+class Lattice:
     """The lattice of window positions over the object's centre, ``CELL_PIXELS`` squared pixels to a cell.
 
     ``cells`` (ny, nx) lattice cells, the object's centre in the middle of the middle one, are surrounded by ``pad``
@@ -93,7 +93,7 @@ class Frame:
     pad: tuple[int, int]
 
     @classmethod
-    def make(cls, reach: float, sensor: Sensor, step: float) -> Frame:
+    def make(cls, reach: float, sensor: Sensor, step: float) -> Lattice:
         half = sensor.half_window[::-1]
         cells = 2 * np.ceil((reach + half) / step - 0.5).astype(int) + 1
         pad = np.ceil(half / step * CELL_PIXELS).astype(int) + 2
@@ -119,13 +119,13 @@ class Frame:
 
 
 def allowed(
-    heights: NDArray[np.float32], frame: Frame, sensor: Sensor, penetrations: Sequence[float]
+    heights: NDArray[np.float32], lattice: Lattice, sensor: Sensor, penetrations: Sequence[float]
 ) -> NDArray[np.bool_]:
     """Window centres (P, h, w) of a turned map at which the object touches and clears the sensor's housing elsewhere."""
     deepest: dict[tuple[int, int], NDArray[np.float32]] = {}
     out = []
     for d in penetrations:
-        kw, kh = (2 * np.floor(_half_window_at(sensor, d) / frame.pixel).astype(int) + 1).tolist()
+        kw, kh = (2 * np.floor(_half_window_at(sensor, d) / lattice.pixel).astype(int) + 1).tolist()
         if (kw, kh) not in deepest:
             deepest[kw, kh] = _deepest_allowed(heights, (kw, kh), sensor.housing_depth)
         out.append(deepest[kw, kh] >= d)

@@ -26,7 +26,7 @@ from geomtact.sensing.sensor import Sensor
 
 _TURNED = 8  # rotations of a cell that stand for all of it
 _DRAWN = 30_000  # poses that stand for all
-# poses about one, in widths of a cell in tilts, turn, x and y, whose heights tell how those of its cell differ
+# poses about one, in widths of a cell in tilts, turn, x and y, whose heights show how those of its cell differ
 _AROUND = np.random.default_rng(0).uniform(-0.75, 0.75, (32, 5))
 _AROUND = np.concatenate([_AROUND, -_AROUND])
 

@@ -160,7 +160,7 @@ def _lattice_step(footprint: float, cells: float) -> float:
     """Step [m] of the square lattice of which about ``cells`` cells meet a footprint [m^2].
 
     Cells on its border meet it too: in units of the footprint's width their number was found to be 1.3 to a step, for
-    parts of many shapes.
+    objects of many shapes.
     """
     width_in_steps = 0.5 * (np.sqrt(_BORDER**2 + 4 * cells) - _BORDER)
     return float(np.sqrt(footprint) / width_in_steps)

@@ -84,7 +84,7 @@ def open_index(
     """The index of ``mesh`` on ``sensor``: from the cache, or built and cached.
 
     Two processes that want the same one build it once: the second waits for the first. ``key`` names the entry to
-    look for, where it is known.
+    look for, where it is stated.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def bound_cache(limit_bytes: int, cache_dir: str | Path | None = None, keep: str
 
 
 def remove_from_cache(names: Sequence[str], cache_dir: str | Path | None = None) -> list[CacheEntry]:
-    """Remove the indexes of parts of these ``names``, or whose keys begin so; returns what was removed.
+    """Remove the indexes of objects of these ``names``, or whose keys begin so; returns what was removed.
 
     Raises
     ------

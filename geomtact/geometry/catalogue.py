@@ -1,4 +1,4 @@
-"""The bundled parts: ``meshes/catalogue.toml`` says each one's file, unit, hash, licence and symmetry."""
+"""The bundled objects: ``meshes/catalogue.toml`` says each one's file, unit, hash, licence and symmetry."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from geomtact.se3 import Array
 
 @dataclass(frozen=True)
 class Entry:
-    """One bundled part.
+    """One bundled object.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Entry:
 
 
 def meshes_folder() -> Path | None:
-    """Folder of the bundled parts: ``meshes/`` of the source checkout, or the package's data when installed."""
+    """Folder of the bundled objects: ``meshes/`` of the source checkout, or the package's data when installed."""
     package = Path(__file__).resolve().parents[1]
     for folder in (package.parent / "meshes", package.parent / "geomtact_meshes", package / "geomtact_meshes"):
         if (folder / "catalogue.toml").is_file():
@@ -46,7 +46,7 @@ def meshes_folder() -> Path | None:
 
 @cache
 def catalogue() -> dict[str, Entry]:
-    """The bundled parts by name, sorted; empty where they are not installed."""
+    """The bundled objects by name, sorted; empty where they are not installed."""
     folder = meshes_folder()
     if folder is None:
         return {}

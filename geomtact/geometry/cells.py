@@ -186,7 +186,7 @@ class SphereCells:
             return self._of_bands(image, area, key)
         kept, cell = np.unique(key, return_inverse=True)
         # the mean of the cell's; of a disk's middle cell the disk's own, unless symmetry turns the object about it: images of a
-        # pose that differ by a turn would all have it, and which of them is the canonical one, nobody could tell
+        # pose that differ by a turn would all have it, and none of them is the canonical one
         vectors: Array = np.stack([np.bincount(cell, area * image[:, i]) for i in range(3)], -1).astype(float)
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
         disk, part = np.divmod(kept - 12 * 4**self.level, _PARTS)

@@ -1,4 +1,4 @@
-"""Plane faces that a part can be put down on: the directions about which a little tilt changes much of what is felt.
+"""Plane faces that an object can be put down on: the directions about which a little tilt changes much of what is felt.
 
 Triangles are gathered by their normals (the extended Gaussian image, Horn 1984), then by the plane in which they lie.
 """
@@ -22,7 +22,7 @@ _LEAST = 0.002  # share of the surface from which a face counts
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """One plane face of a part, or several in one plane.
+    """One plane face of an object, or several in one plane.
 
     Attributes
     ----------

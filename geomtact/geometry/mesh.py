@@ -114,7 +114,7 @@ class Mesh:
         return self.sample_surface(n, seed)[0]
 
     def with_symmetry(self, tolerance: float = 5e-5) -> Mesh:
-        """This mesh with its symmetry found (``tolerance`` in metres), or itself if it is known already."""
+        """This mesh with its symmetry found (``tolerance`` in metres), or itself if it was found already."""
         if self.symmetry is not None:
             return self
         return replace(self, symmetry=find_symmetry(self.vertices, self.faces, tolerance))

@@ -46,14 +46,14 @@ class _SensorLike(Protocol):
 
 
 def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _SensorLike | None = None) -> Mesh:
-    """Load a part by catalogue name or from an STL, OBJ, PLY, OFF, GLB or glTF file. The object frame is the file's.
+    """Load an object by catalogue name or from an STL, OBJ, PLY, OFF, GLB or glTF file. The object frame is the file's.
 
     Parameters
     ----------
     source : name in ``meshes/catalogue.toml``, path of a file, or a Mesh (checked against the sensor only)
     unit : "mm", "cm", "m" or "inch" in upper or lower case; needed for files that state none (see
-        :func:`geomtact.geometry.units.stated_unit`), not for catalogue parts and glTF (metres)
-    sensor : if given, the part's size is checked against its window
+        :func:`geomtact.geometry.units.stated_unit`), not for catalogue objects and glTF (metres)
+    sensor : if given, the object's size is checked against its window
 
     Returns
     -------
@@ -85,14 +85,14 @@ def load_mesh(source: str | Path | Mesh, unit: str | None = None, *, sensor: _Se
 
 
 def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symmetry | None]:
-    """Name, file, unit and known symmetry of a catalogue name or a path."""
+    """Name, file, unit and symmetry, where stated, of a catalogue name or a path."""
     if not isinstance(source, str | os.PathLike):
         raise MeshError(
-            f"expected a part's name, the path of a mesh file or a geomtact.Mesh, got {type(source).__name__}; make one by "
+            f"expected an object's name, the path of a mesh file or a geomtact.Mesh, got {type(source).__name__}; make one by "
             'geomtact.Mesh(vertices, faces, "name", "m")'
         )
     text = str(source)
-    parts = catalogue()
+    objects = catalogue()
     path = Path(text)
     name = _catalogue_name(text)
     if unit is not None:
@@ -100,7 +100,7 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
         if unit not in UNITS:
             raise MeshError(f"{text}: unknown unit {given!r}; give unit= (--unit) one of {', '.join(UNITS)}")
     if name is not None:
-        entry = parts[name]
+        entry = objects[name]
         if unit is not None and unit != entry.unit:
             raise MeshError(
                 f"{text}: the catalogue says {entry.unit}, but the unit {unit} was given; leave the unit out"
@@ -111,11 +111,15 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
         raise MeshError(f"{text}: not read as it is; make a mesh of it with 'python tools/prep_mesh.py {path.name}'")
     if suffix not in (*FORMATS, *PREPARED):
         if path.exists():
-            raise MeshError(f"{text}: not a mesh format known here; give one of {' '.join(FORMATS)}")
-        raise MeshError(f"no part named {text!r}{nearest_name(text, parts)}; or give a mesh file ({' '.join(FORMATS)})")
+            raise MeshError(f"{text}: not a mesh format that is read here; give one of {' '.join(FORMATS)}")
+        raise MeshError(
+            f"no object named {text!r}{nearest_name(text, objects)}; or give a mesh file ({' '.join(FORMATS)})"
+        )
     if not path.is_file():
         beside = [p.name for p in path.parent.glob("[!.]*") if p.suffix.lower() in FORMATS]
-        hint = did_you_mean(path.name, beside) or f"; give the path of a mesh, or a part: {', '.join(sorted(parts))}"
+        hint = (
+            did_you_mean(path.name, beside) or f"; give the path of a mesh, or an object: {', '.join(sorted(objects))}"
+        )
         raise MeshError(f"{text}: no such file{hint}")
     if suffix in METRE_FORMATS and unit not in (None, "m"):
         raise MeshError(
@@ -135,7 +139,7 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
 
 
 def states_unit(source: str | Path) -> bool:
-    """Whether a part needs no unit: one of the catalogue, or a file that states its own."""
+    """Whether an object needs no unit: one of the catalogue, or a file that states its own."""
     try:
         return _catalogue_name(str(source)) is not None or stated_unit(Path(source)) is not None
     except (MeshError, OSError):  # which loading the file reports
@@ -143,9 +147,9 @@ def states_unit(source: str | Path) -> bool:
 
 
 def _catalogue_name(text: str) -> str | None:
-    """The name of the part in the catalogue that a name or a path means."""
-    parts = catalogue()
-    return text if text in parts else next((n for n, e in parts.items() if e.file == Path(text).resolve()), None)
+    """The name of the object in the catalogue that a name or a path means."""
+    objects = catalogue()
+    return text if text in objects else next((n for n, e in objects.items() if e.file == Path(text).resolve()), None)
 
 
 def _read_triangles(path: Path, unit: str) -> tuple[Array, NDArray[np.int64], tuple[str, ...]]:
@@ -209,19 +213,19 @@ def _check_folds(vertices: Array, faces: NDArray[np.int32], path: Path) -> tuple
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     area, where = areas[folded].sum(), vertices[faces[folded[areas[folded].argmax()]]]
-    said = (
+    fault = (
         f"faces of {1e6 * area:.3g} mm2 are folded back onto their neighbours in one plane, one about "
         f"({place_mm(where)}) mm, as a fan of triangles does that stands for a polygon"
     )
     if area > min(_FOLDED_SHARE * areas.sum(), _FOLDED):
         raise MeshError(
-            f"{path}: {said}; export it with its polygons (OBJ, PLY, OFF), or mend it there in a mesh editor"
+            f"{path}: {fault}; export it with its polygons (OBJ, PLY, OFF), or mend it there in a mesh editor"
         )
-    return (f"{path.name}: {said}",)
+    return (f"{path.name}: {fault}",)
 
 
 def _check_scale(mesh: Mesh, sensor: _SensorLike) -> None:
-    """Refuse a part of less than ten pixels or more than fifty windows: with real parts the unit is wrong then."""
+    """Refuse an object of less than ten pixels or more than fifty windows: with real objects the unit is wrong then."""
     smallest = 10 * min(sensor.pixel_pitch)
     largest = 50 * 2 * float(np.hypot(*sensor.half_window))
     if not smallest <= mesh.diameter <= largest:

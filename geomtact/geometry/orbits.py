@@ -12,7 +12,7 @@ from geomtact.geometry.approach import FACE_TOLERANCE, Cones, allowed, facing
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array
 
-_GENERIC = np.array([0.5402, 0.2911, 0.7896])  # of no machined part's symmetry: picks one image of each orbit
+_GENERIC = np.array([0.5402, 0.2911, 0.7896])  # of no machined object's symmetry: picks one image of each orbit
 
 
 def canonical_image(a: Array, symmetry: Symmetry, cones: Cones | None) -> tuple[NDArray[np.int64], Array]:

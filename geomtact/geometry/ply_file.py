@@ -67,16 +67,16 @@ def read_ply(data: bytes) -> Polygons:
     vertices, polygons, at = np.zeros((0, 3)), [], 0
     for element in elements:
         names = [each.name for each in element.properties]
-        wanted = [name for name in _INDICES if name in names]
+        given = [name for name in _INDICES if name in names]
         columns, at = _columns(element, body, at, order)
         if element.name == "vertex":
             if not {"x", "y", "z"} <= set(names):
                 raise MeshError(f"expected vertices with x, y and z, got {', '.join(names)}; export the mesh again")
             vertices = np.stack([np.asarray(columns[name][0], float) for name in "xyz"], axis=1)
         elif element.name in ("face", "tristrips") and element.rows:
-            if not wanted:
+            if not given:
                 raise MeshError(f"expected faces with vertex_indices, got {', '.join(names)}; export the mesh again")
-            values, sizes = columns[wanted[0]]
+            values, sizes = columns[given[0]]
             corners = np.asarray(values, np.int64)
             polygons.append((corners, sizes) if element.name == "face" else _strips(corners, sizes))
     if at < len(body) and form == "ascii":

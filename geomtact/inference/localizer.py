@@ -38,7 +38,7 @@ from geomtact.scoring.calibration import Calibration, posterior_log_prob
 from geomtact.scoring.catalogue import DEFAULT_SCORER
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
 from geomtact.se3 import Array, check_pose
-from geomtact.sensing.contact import Contact, Shown
+from geomtact.sensing.contact import Contact, SoftMask
 from geomtact.sensing.reading import read_observation
 from geomtact.sensing.sensor import Sensor
 
@@ -200,7 +200,7 @@ class Localizer:
         with _timed(timing, "read"):
             observation = read_observation(image, self.sensor, kind, background)
         contact, above, warnings = observation.contact, 0.0, [*self.mesh.warnings, *observation.warnings]
-        mask: Shown = contact.shown
+        mask: SoftMask = contact.soft_mask
         if contact.height is not None and contact.height[contact.mask].any():
             # a contour line of the gel where it surely lies on the object, which reaches below it by as much
             above = contact.sure_depth
@@ -238,18 +238,18 @@ class Localizer:
         with _timed(timing, "posterior"):
             common["settings"] |= _worth(rows.by, rows.calibration)
             log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
-            witness = self.scorer.witness
-            usual, likeliest = witness.evidence(self.index, mask)
-            evidence = usual if log_prior is None else witness.evidence(self.index, mask, log_prior, above)[0]
+            model = self.scorer.evidence_model
+            usual, likeliest = model.evidence(self.index, mask)
+            evidence = usual if log_prior is None else model.evidence(self.index, mask, log_prior, above)[0]
             posterior = Posterior(self.index, rows.first, log_prob, runs=rows.runs, log_evidence=evidence, **common)
         if log_prior is not None:
-            unknown = witness.evidence(self.index, mask, self.index.log_weight, above)[0] if above else usual
+            unknown = model.evidence(self.index, mask, self.index.log_weight, above)[0] if above else usual
             if unknown - evidence > _CONTRADICTS:
                 warnings.append(
                     f"the prior and the image contradict each other, by {unknown - evidence:.0f} nats: look whether both are of "
                     "this touch and part, and at the prior's frame and units"
                 )
-        odd = witness.odd(usual, likeliest)
+        odd = model.is_outlier(usual, likeliest)
         if odd:
             warnings.append("the contact is unlike any touch of this object that was simulated: is it the right part?")
         if self.space.hollow > _HOLLOW:

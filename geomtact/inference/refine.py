@@ -66,7 +66,7 @@ class Refinery:
         if not len(cells):
             return posterior
         index, sensor = posterior.index, self.space.sensor
-        shown = cleaned(contact.shown, sensor)
+        shown = cleaned(contact.soft_mask, sensor)
         problem, mask = make_problem(shown, sensor), shown > 0.5
         start = index.poses(cells)
         candidates = [start, self._centred(posterior, mask, cells, start)]

@@ -26,7 +26,7 @@ from geomtact.registration.rim import make_problem
 from geomtact.scoring.likelihood import cast_log_likelihood, height_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array, inverse
-from geomtact.sensing.contact import Contact, Shown
+from geomtact.sensing.contact import Contact, SoftMask
 from geomtact.sensing.moments import cleaned
 
 _SHAPE = (24, 32)  # of the casts that choose among many
@@ -57,10 +57,10 @@ class View:
     T_sensor_first: Array
 
     @cached_property
-    def shown(self) -> Shown:
+    def shown(self) -> SoftMask:
         """The contact without specks, at the image's own resolution."""
         assert self.contact is not None
-        shown = self.contact.shown
+        shown = self.contact.soft_mask
         return cleaned(shown, self.refinery.space.sensor)
 
     @property

@@ -91,7 +91,7 @@ def make_filter(
     seed: int = 0,
 ) -> Filter:
     """The filter that :func:`track` puts the posteriors of single frames through, one :meth:`Filter.step` a frame."""
-    within = localizer.scorer.witness.moments.covariance
+    within = localizer.scorer.evidence_model.moments.covariance
     return Filter(Spreading(localizer.index, motion or UniformBall(), seed), within, counts, fresh, most)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.registration.protocol import Problem, Surface
 from geomtact.se3 import Array, apply, inverse, unit
-from geomtact.sensing.contact import Contact, Shown
+from geomtact.sensing.contact import Contact, SoftMask
 from geomtact.sensing.sensor import Sensor
 
 SINK, SINK_STD = 0.2e-3, 0.35e-3  # m that a gel, rigid or elastic, is taken to sink around the object, give or take
@@ -208,7 +208,7 @@ def _spaced(where: NDArray[np.bool_], pitch_xy: Array, most: int) -> tuple[Array
     return np.stack([cols, rows], 1)[:most].astype(float), float(np.sqrt((apart * pitch_xy).prod()))
 
 
-def _outline(shown: Shown, pitch_xy: Array, max_points: int) -> tuple[Array, Array, Array, float]:
+def _outline(shown: SoftMask, pitch_xy: Array, max_points: int) -> tuple[Array, Array, Array, float]:
     """Subpixel outline (n, 2) in (column, row), its outward unit normals (n, 2) in metric axes, how unsure it is along them by
     the probabilities that are ``shown`` (n,) [m], and its spacing [m].
 

@@ -11,12 +11,12 @@ from geomtact.sensing.calibrate import INNER, ball_slopes
 from geomtact.sensing.height import relief
 
 if TYPE_CHECKING:
-    from geomtact.sensing.calibrate import Calibrated
+    from geomtact.sensing.calibrate import SensorCalibration
 
 _SHOWN = 4  # presses
 
 
-def draw_calibration(found: Calibrated, ball_diameter: float) -> bytes:
+def draw_calibration(found: SensorCalibration, ball_diameter: float) -> bytes:
     """A PNG: some presses with the circles found in them, the depth through each against the ball's, and all slopes against the
     ball's.
 

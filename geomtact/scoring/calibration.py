@@ -38,8 +38,8 @@ _BATCH = 4  # poses tried at once for one that touches a sensor with a housing
 
 
 @dataclass(frozen=True)
-class Touches:
-    """Simulated touches with known poses: masks (h, w) over the window, and the pose id (n,) whose cell holds each."""
+class CalibrationTouches:
+    """Simulated touches with their poses: masks (h, w) over the window, and the pose id (n,) whose cell holds each."""
 
     masks: list[NDArray[np.bool_]]
     ids: NDArray[np.int64]
@@ -49,7 +49,7 @@ class Touches:
         np.savez(path, masks=np.packbits(masks), shape=masks.shape, ids=self.ids)
 
     @classmethod
-    def load(cls, path: Path) -> Touches:
+    def load(cls, path: Path) -> CalibrationTouches:
         with np.load(path, allow_pickle=False) as data:
             shape = tuple(data["shape"])
             masks = np.unpackbits(data["masks"], count=int(np.prod(shape))).astype(bool)
@@ -75,7 +75,7 @@ def simulate_touches(
     progress: Progress | None = None,
     elastic: bool | None = None,
     noise: Noise = CALIBRATION_NOISE,
-) -> Touches:
+) -> CalibrationTouches:
     """``n`` touches all over the contact pose space, with noise of any strength up to ``noise``; rigid and elastic in turn,
     unless ``elastic`` says which. Fewer than ``n`` where the object hardly makes a contact of any size.
 
@@ -97,7 +97,7 @@ def simulate_touches(
             ids.append(felt[1])
         if progress:
             progress((k + 1) / n, "simulating sensor noise")
-    return Touches(masks, np.array(ids, np.int64))
+    return CalibrationTouches(masks, np.array(ids, np.int64))
 
 
 def _felt(index: Index, elastic: bool, rng: np.random.Generator) -> tuple[NDArray[np.bool_], int] | None:
@@ -129,21 +129,21 @@ def _drawn(index: Index, rng: np.random.Generator) -> tuple[Array, int] | None:
     return (T[0], int(cells[0])) if found[0] else None
 
 
-def calibrate(
-    scorer: Scorer, index: Index, touches: Touches, weight: NDArray[np.floating] | None = None
+def fit_calibration(
+    scorer: Scorer, index: Index, touches: CalibrationTouches, weight: NDArray[np.floating] | None = None
 ) -> Calibration:
     """The temperature and floor under which the true poses of ``touches`` are most probable.
 
     ``weight`` is the measure of what ``scorer`` scores and ``touches.ids`` count: the cells of ``index`` by default.
     """
     weight = np.asarray(index.weight).ravel() if weight is None else weight
-    return calibrated(lambda i: scorer.score(index, touches.masks[i]).ravel(), touches.ids, weight)
+    return fit_to_scores(lambda i: scorer.score(index, touches.masks[i]).ravel(), touches.ids, weight)
 
 
-def calibrated(
+def fit_to_scores(
     score_of: Callable[[int], NDArray[np.float32]], ids: NDArray[np.int64], weight: NDArray[np.floating]
 ) -> Calibration:
-    """As :func:`calibrate`: ``score_of(i)`` gives the scores (N,) of touch i, whose true row is ``ids[i]``, and rows have
+    """As :func:`fit_calibration`: ``score_of(i)`` gives the scores (N,) of touch i, whose true row is ``ids[i]``, and rows have
     measures ``weight`` (N,)."""
     first = [score_of(i) for i in range(min(_SPREAD_TOUCHES, len(ids)))]
     spread = float(np.median([score.std() for score in first]))

@@ -1,6 +1,6 @@
 """Coarse to fine: the blocks of the nested grid are scored first, and only those that carry mass cell by cell.
 
-A block is told by the mean of its cells' vectors and by how they spread about it. Were they normally distributed, with
+A block is described by the mean of its cells' vectors and by how they spread about it. Were they normally distributed, with
 variance v_j in component j, the mean of exp(-|f - g|^2 / t) over the block would be
 
     prod_j (1 + 2 v_j / t)^(-1/2) exp(-(f - mean g)_j^2 / (t + 2 v_j)),
@@ -19,10 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index, spelled_out
-from geomtact.scoring.calibration import Calibration, Touches, best_floor, calibrate, posterior_log_prob
+from geomtact.scoring.calibration import (
+    Calibration,
+    CalibrationTouches,
+    best_floor,
+    fit_calibration,
+    posterior_log_prob,
+)
 from geomtact.scoring.encoder import EncoderScorer
-from geomtact.scoring.mixture import mixed, ways
-from geomtact.sensing.contact import Shown
+from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
+from geomtact.sensing.contact import SoftMask
 
 SHARE = 0.98  # of the mass, that is scored cell by cell
 _LEADING = 64  # blocks among whose cells the best is looked for
@@ -61,7 +67,7 @@ class BlockScorer:
         constant = 0.5 * temperature * np.log(narrow).sum(1) - (narrow * middle**2).sum(1)
         return cls(cells, _single(narrow), _single(narrow * middle), _single(constant), temperature)
 
-    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Score (P B,) of every block: under the normal model, the temperature times the log of the mean of
         exp(score / temperature) over its cells."""
         return self.trusted(index, self.cells.seen(index, mask))[0]
@@ -129,11 +135,13 @@ class Cascade:
     partly: Calibration | None
 
     @classmethod
-    def fit(cls, cells: EncoderScorer, fine: Calibration, index: Index, touches: Touches, partly: bool) -> Cascade:
+    def fit(
+        cls, cells: EncoderScorer, fine: Calibration, index: Index, touches: CalibrationTouches, partly: bool
+    ) -> Cascade:
         """Calibrated on ``touches``; ``fine`` is what the cells' scores are worth where all are scored."""
         blocks = BlockScorer.make(cells, index, fine.temperature)
         own = index.block_of(touches.ids)
-        coarse = calibrate(blocks, index, Touches(touches.masks, own), np.exp(index.log_block_weight))
+        coarse = fit_calibration(blocks, index, CalibrationTouches(touches.masks, own), np.exp(index.log_block_weight))
         if not partly:
             return cls(blocks, coarse, None)
         # what is lost where the truth lies in a block that stays whole is made good by a larger floor
@@ -158,22 +166,22 @@ class Cascade:
         partly = Calibration(**data["partly"]) if "partly" in data else None
         return cls(blocks, Calibration(**data["coarse"]), partly)
 
-    def whole(self, index: Index, mask: Shown) -> Rows:
+    def whole(self, index: Index, mask: SoftMask) -> Rows:
         """The blocks alone."""
         first, runs = index.block_runs
-        shares, shown = ways(mask, index.sensor)
-        scores = [self.blocks.score(index, each) for each in shown]
-        score = mixed(shares, scores, index.log_block_weight, self.coarse.temperature)
+        shares, masks = contact_hypotheses(mask, index.sensor)
+        scores = [self.blocks.score(index, each) for each in masks]
+        score = mix_hypotheses(shares, scores, index.log_block_weight, self.coarse.temperature)
         return _possible(Rows(first, runs, score, index.log_block_weight, self.coarse, self.blocks.name))
 
-    def expanded(self, index: Index, mask: Shown) -> Rows:
+    def expanded(self, index: Index, mask: SoftMask) -> Rows:
         """Blocks, and cell by cell those of them that hold ``SHARE`` of the mass."""
         first, counts = index.block_runs
-        shares, shown = ways(mask, index.sensor)
-        seen = [self.blocks.cells.seen(index, each) for each in shown]
+        shares, masks = contact_hypotheses(mask, index.sensor)
+        seen = [self.blocks.cells.seen(index, each) for each in masks]
         scores, trust = zip(*(self.blocks.trusted(index, each) for each in seen), strict=True)
         prior = index.log_block_weight
-        score = mixed(shares, scores, prior, self.coarse.temperature)
+        score = mix_hypotheses(shares, scores, prior, self.coarse.temperature)
         log_prob = posterior_log_prob(score, prior, replace(self.coarse, floor=0.0))
         chosen = heaviest(np.exp(log_prob), SHARE)
         length = np.where(chosen, counts, 1)
@@ -186,7 +194,7 @@ class Cascade:
         for cell_score, block_score in zip(cell_scores, scores, strict=True):
             cell_score[at] = block_score[whole]
         assert self.partly is not None
-        cell_score = mixed(shares, cell_scores, cell_prior, self.partly.temperature)
+        cell_score = mix_hypotheses(shares, cell_scores, cell_prior, self.partly.temperature)
         return _possible(Rows(ids, runs, cell_score, cell_prior, self.partly, self.blocks.cells.name))
 
 

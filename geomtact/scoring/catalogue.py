@@ -16,7 +16,7 @@ from geomtact.scoring.vectors import Descriptor, VectorScorer
 
 PIXELWISE: dict[str, Scorer] = {**OVERLAPS, "likelihood": PixelLikelihood()}
 ENCODER = "encoder"
-DEFAULT_SCORER = "best"  # of the encoder, the moments and the overlap, those that tell most on an index
+DEFAULT_SCORER = "best"  # of the encoder, the moments and the overlap, those that gain most information on an index
 SCORERS = (*PIXELWISE, *CLASSICAL, "moments", ENCODER, DEFAULT_SCORER)
 _WEIGHTS_FILE = ".safetensors"
 
@@ -51,9 +51,9 @@ def descriptor_of(name: str, index: Index) -> tuple[Descriptor, type[VectorScore
     if not name.endswith(_WEIGHTS_FILE) and vectors_name(name) != ENCODER:
         return None
     path = Path(name) if name.endswith(_WEIGHTS_FILE) else WEIGHTS
-    said = about(path)
-    _check_whose(path, said, index)
-    if said.get("architecture") == THESIS:
+    metadata = about(path)
+    _check_whose(path, metadata, index)
+    if metadata.get("architecture") == THESIS:
         from geomtact.scoring.resnet import CosineScorer, load_resnet  # it needs torch, a touch by the encoder does not
 
         return load_resnet(path), CosineScorer
@@ -61,11 +61,11 @@ def descriptor_of(name: str, index: Index) -> tuple[Descriptor, type[VectorScore
     return Tower(load_weights(path), cell_size(index.sensor, index.resolution.step, swing)), EncoderScorer
 
 
-def _check_whose(path: Path, said: dict[str, str], index: Index) -> None:
+def _check_whose(path: Path, metadata: dict[str, str], index: Index) -> None:
     for what, given in (("part", index.mesh), ("sensor", index.sensor)):
-        if said.get(f"{what}_sha256", given.sha256) != given.sha256:
+        if metadata.get(f"{what}_sha256", given.sha256) != given.sha256:
             raise InputError(
-                f"{path}: trained for the {what} {said[what]!r}, not for {given.name!r}; train weights for it, or use the "
+                f"{path}: trained for the {what} {metadata[what]!r}, not for {given.name!r}; train weights for it, or use the "
                 f"score {ENCODER!r}, which serves all"
             )
 

@@ -1,4 +1,4 @@
-"""Classical descriptors: contacts as vectors whose Euclidean distance tells how unlike they are.
+"""Classical descriptors: contacts as vectors whose Euclidean distance measures how unlike they are.
 
 Each is a library's own, brought to a grid that does not depend on the resolution of the mask. A vector of d numbers
 costs 4 d bytes per pose to store, and one multiplication and addition per number to compare; both stand in each class,
@@ -69,7 +69,7 @@ class BlurredCosine:
 class Hu:
     """Hu's seven moment invariants, as signed logarithms, from scikit-image.
 
-    Blind to place, turn and size by design: they tell what was touched, not where in the window. What lies below
+    Blind to place, turn and size by design: they describe what was touched, not where in the window. What lies below
     1e-5 counts as nothing, as in OpenCV's ``matchShapes``; so the logarithm does not jump where a moment changes its
     sign. scikit-image's takes ten times as long as OpenCV's, but knows pixels that are not square.
 

@@ -1,8 +1,8 @@
-"""The similarity network: one small encoder for all parts, so that a new part needs no training.
+"""The similarity network: one small encoder for all objects, so that a new object needs no training.
 
 Two towers that share most of their weights: one for what the sensor shows, one for what was simulated on the grid. It was
 trained so that minus the squared distance of the vectors is a log likelihood up to a constant: the cell that holds the
-touch is to get the largest posterior among all cells of its part (``training.train``). The architecture is a plain
+touch is to get the largest posterior among all cells of its object (``training.train``). The architecture is a plain
 perceptron over the pixels and the contact's moments: a million contacts take seconds, and a touch needs no torch.
 """
 
@@ -21,11 +21,11 @@ from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.scoring.contact_features import BASIS, SHAPE, moment_features
 from geomtact.scoring.vectors import VectorScorer
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
 
-WEIGHTS = Path(__file__).with_name("encoder.safetensors")  # trained once for all parts, with a card beside it
+WEIGHTS = Path(__file__).with_name("encoder.safetensors")  # trained once for all objects, with a card beside it
 ARCHITECTURE, THESIS = "encoder", "resnet50"  # as the metadata of weights name them
 _CHUNK = 1 << 13  # vectors compared at a time
 Weights = dict[str, NDArray[np.float32]]
@@ -45,7 +45,7 @@ class EncoderScorer(VectorScorer):
 
     usual: float = np.inf
 
-    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Similarity (P, n) of ``mask`` (h, w) to the mask of every pose: minus the squared distance of the vectors, as
         far as it is to be trusted."""
         out = super().score(index, mask)
@@ -69,7 +69,7 @@ class EncoderScorer(VectorScorer):
         out -= np.float32(seen @ seen)
         return out
 
-    def seen(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def seen(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""
         assert isinstance(self.descriptor, Tower)
         image = _lying(cleaned(mask, index.sensor)[None].astype(np.float32))[0]
@@ -100,7 +100,7 @@ class Tower:
 
 
 def cell_size(sensor: Sensor, step: float, swing: float) -> NDArray[np.float32]:
-    """What the network is told of a grid (2,): log of the lattice step and of the ``swing`` [m] by which the next
+    """What the network gets of a grid (2,): log of the lattice step and of the ``swing`` [m] by which the next
     rotation moves the object's surface, in units of the window's half diagonal."""
     return np.log(np.maximum([step, swing], 1e-6) / np.hypot(*sensor.half_window)).astype(np.float32)
 
@@ -118,7 +118,7 @@ def vector(
 
 
 def about(path: Path) -> dict[str, str]:
-    """What a weights file says of itself: ``architecture``, and ``part`` and ``sensor`` where it is for one alone; nothing
+    """What a weights file states: ``architecture``, and ``part`` and ``sensor`` where it is for one object alone; nothing
     of a file that cannot be read."""
     from safetensors import SafetensorError, safe_open
 

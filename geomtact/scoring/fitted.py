@@ -17,7 +17,7 @@ from geomtact.contact_space.store import lock_of
 from geomtact.errors import MeshError
 from geomtact.files import write_text, write_whole
 from geomtact.progress import Progress
-from geomtact.scoring.calibration import Calibration, Touches, calibrate, simulate_touches
+from geomtact.scoring.calibration import Calibration, CalibrationTouches, fit_calibration, simulate_touches
 from geomtact.scoring.cascade import Cascade, Rows
 from geomtact.scoring.catalogue import (
     DEFAULT_SCORER,
@@ -29,22 +29,22 @@ from geomtact.scoring.catalogue import (
     vectors_name,
 )
 from geomtact.scoring.encoder import EncoderScorer
-from geomtact.scoring.mixture import mixed, ways
+from geomtact.scoring.evidence_model import EvidenceModel
+from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.product import Comparison, Product, choose
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import describe_index
-from geomtact.scoring.witness import Witness
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 
 FORMAT = 13
 _COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
 _LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than choosing which
 _USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual
-_ODD = 0.01  # share of touches whose evidence, or best pose, is called unlike the object
-_LEAST_GAIN = 0.05  # nats that a touch has to tell in the mean
+_OUTLIERS = 0.01  # share of touches whose evidence, or best pose, counts as an outlier
+_LEAST_GAIN = 0.05  # nats that of information that a touch has to gain in the mean
 TOUCHES, SEED = 500, 20_200_531  # that scores are calibrated on
-_LEARN = 0.6  # share of them that the moments are learned from; the rest tell what they are worth
+_LEARN = 0.6  # share of them that the moments are learned from; the rest show what they are worth
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class FittedScorer:
     ----------
     name : as it was asked for
     scorer, calibration : of the cells
-    witness : tells how likely a touch of the object is at all
+    evidence_model : gives the likelihood of a touch, given the object
     cascade : of blocks and some cells, by the encoder; None for a score that has no part in it
     exact_scorer, exact_calibration : of one that counts the pixels too; None where the score goes without
     """
@@ -63,12 +63,12 @@ class FittedScorer:
     name: str
     scorer: Scorer
     calibration: Calibration
-    witness: Witness
+    evidence_model: EvidenceModel
     cascade: Cascade | None = None
     exact_scorer: Scorer | None = None
     exact_calibration: Calibration | None = None
 
-    def rows(self, index: Index, mask: Shown, resolved: str) -> Rows:
+    def rows(self, index: Index, mask: SoftMask, resolved: str) -> Rows:
         """Scores of all cells under the uniform prior.
 
         ``resolved`` says how: "blocks" alone, "cells" where the mass is and, on a large grid, blocks elsewhere, or "all"
@@ -83,7 +83,7 @@ class FittedScorer:
     def cells(
         self,
         index: Index,
-        mask: Shown,
+        mask: SoftMask,
         log_prior: NDArray[np.floating] | None,
         exact: bool,
         above: float = 0.0,
@@ -100,9 +100,9 @@ class FittedScorer:
         if log_prior is not None:
             cells = np.flatnonzero(np.isfinite(log_prior))
             prior = log_prior[cells]
-        shares, shown = ways(mask, index.sensor)
-        scores = [index.deeper(scorer.score(index, each), above).reshape(-1) for each in shown]
-        score = mixed(shares, scores, index.log_weight, calibration.temperature)
+        shares, masks = contact_hypotheses(mask, index.sensor)
+        scores = [index.deeper(scorer.score(index, each), above).reshape(-1) for each in masks]
+        score = mix_hypotheses(shares, scores, index.log_weight, calibration.temperature)
         score = score if len(cells) == len(score) else score[cells]
         return Rows(cells, None, score, prior, calibration, scorer.name)
 
@@ -124,34 +124,34 @@ def fitted_scorer(
         The object can hardly be touched, so nothing can be calibrated; or its touches are all alike.
     """
     check_name(name)
-    known: dict[str, Scorer] = dict(PIXELWISE)
+    scorers: dict[str, Scorer] = dict(PIXELWISE)
     label, found = name, descriptor_of(name, index)
     if found is not None:
         descriptor, compared = found
         label = f"{Path(name).name}-{fingerprint(descriptor)}"
         path = None if folder is None else folder / f"{descriptor.name}-{fingerprint(descriptor)}.npy"
-        known[vectors_name(name)] = compared(descriptor, describe_index(index, descriptor, path, progress))
+        scorers[vectors_name(name)] = compared(descriptor, describe_index(index, descriptor, path, progress))
     path = None if folder is None else folder / f"{label}.json"
-    fitted = _fitted_before(name, path, known, index)
+    fitted = _fitted_before(name, path, scorers, index)
     if fitted is not None:
         return fitted
     with contextlib.ExitStack() as held:  # of two processes that would fit it, the second waits for the first
         if folder is not None:
             with contextlib.suppress(OSError):  # beside a read-only cache no lock can be written
                 held.enter_context(lock_of(folder))
-        return _fitted_before(name, path, known, index) or _fitted_now(name, path, known, index, progress)
+        return _fitted_before(name, path, scorers, index) or _fitted_now(name, path, scorers, index, progress)
 
 
-def _fitted_before(name: str, path: Path | None, known: dict[str, Scorer], index: Index) -> FittedScorer | None:
+def _fitted_before(name: str, path: Path | None, scorers: dict[str, Scorer], index: Index) -> FittedScorer | None:
     """What stands in ``path``; None where nothing does, or nothing that can be used."""
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            return _from_json(name, json.loads(path.read_text("utf-8")), known, index)
+            return _from_json(name, json.loads(path.read_text("utf-8")), scorers, index)
     return None
 
 
 def _fitted_now(
-    name: str, path: Path | None, known: dict[str, Scorer], index: Index, progress: Progress | None
+    name: str, path: Path | None, scorers: dict[str, Scorer], index: Index, progress: Progress | None
 ) -> FittedScorer:
     """Fitted on simulated touches, and written to ``path``."""
     folder = None if path is None else path.parent
@@ -161,7 +161,7 @@ def _fitted_now(
             f"{index.mesh.name}: hardly any pose makes a contact that the sensor {index.sensor.name!r} can resolve; "
             "check the object's unit and the approach"
         )
-    data = _fit(name, known, index, touches)
+    data = _fit(name, scorers, index, touches)
     if progress:
         progress(1.0, "calibrating the score")
     if data["calibration"]["gain"] < _LEAST_GAIN and name in ("moments", DEFAULT_SCORER):
@@ -169,14 +169,14 @@ def _fitted_now(
     if path is not None:
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
             write_text(path, json.dumps(data))
-    return _from_json(name, data, known, index)
+    return _from_json(name, data, scorers, index)
 
 
-def _simulated(index: Index, path: Path | None, progress: Progress | None) -> Touches:
+def _simulated(index: Index, path: Path | None, progress: Progress | None) -> CalibrationTouches:
     """The touches that every score on ``index`` is fitted on, read from ``path`` where they were simulated before."""
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-            return Touches.load(path)
+            return CalibrationTouches.load(path)
     touches = simulate_touches(index, TOUCHES, SEED, progress)
     if path is not None:
         with contextlib.suppress(OSError):
@@ -184,18 +184,18 @@ def _simulated(index: Index, path: Path | None, progress: Progress | None) -> To
     return touches
 
 
-def _fit(name: str, known: dict[str, Scorer], index: Index, touches: Touches) -> dict[str, Any]:
+def _fit(name: str, scorers: dict[str, Scorer], index: Index, touches: CalibrationTouches) -> dict[str, Any]:
     """All that is fitted, as it stands in the cache."""
     n = round(_LEARN * len(touches.ids))
-    learn, judge = (Touches(touches.masks[part], touches.ids[part]) for part in (slice(n), slice(n, None)))
+    learn, judge = (CalibrationTouches(touches.masks[part], touches.ids[part]) for part in (slice(n), slice(n, None)))
     moments = Moments.fit(index, learn.masks, learn.ids)
     nearest = {
         each: float(np.quantile([-scorer.score(index, mask).max() for mask in judge.masks], _USUAL))
-        for each, scorer in known.items()
+        for each, scorer in scorers.items()
         if isinstance(scorer, EncoderScorer)
     }
-    known = {**_limited(known, nearest), "moments": moments}
-    heard = [Witness(moments).evidence(index, mask) for mask in judge.masks]
+    scorers = {**_limited(scorers, nearest), "moments": moments}
+    evidence = [EvidenceModel(moments).evidence(index, mask) for mask in judge.masks]
     data: dict[str, Any] = {
         "format": FORMAT,
         "moments": {
@@ -203,73 +203,73 @@ def _fit(name: str, known: dict[str, Scorer], index: Index, touches: Touches) ->
             "covariance": moments.covariance.tolist(),
             "freedom": moments.freedom,
         },
-        "usual": np.quantile(heard, _ODD, axis=0).tolist(),
+        "usual": np.quantile(evidence, _OUTLIERS, axis=0).tolist(),
         "nearest": nearest,
         "weights": {name: 1.0},
     }
     if name == DEFAULT_SCORER:
         comparison = Comparison(index, judge)
-        candidates = {each: known[each] for each in (ENCODER, "moments", "iou")}
+        candidates = {each: scorers[each] for each in (ENCODER, "moments", "iou")}
         # on a large grid a further score has to be worth its time
         data["weights"], _ = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
-        more = {**candidates, "likelihood": known["likelihood"]}
+        more = {**candidates, "likelihood": scorers["likelihood"]}
         data["exact_weights"], exact = choose(comparison, more, least=0.02, start=data["weights"])
         data["exact"] = asdict(exact)
     # only the moments have learned from some of the touches
     touches = judge if "moments" in data["weights"] else touches
-    calibration = calibrate(_weighed(data["weights"], known), index, touches)
+    calibration = fit_calibration(_weighed(data["weights"], scorers), index, touches)
     data["calibration"] = asdict(calibration)
     if name == DEFAULT_SCORER and data["exact_weights"] == data["weights"]:
         data["exact"] = data["calibration"]
-    vectors = known[vectors_name(name)]
+    vectors = scorers[vectors_name(name)]
     if isinstance(vectors, EncoderScorer):
         alone = list(data["weights"]) == [vectors_name(name)]
-        fine = calibration if alone else calibrate(vectors, index, touches)
+        fine = calibration if alone else fit_calibration(vectors, index, touches)
         data["cascade"] = Cascade.fit(vectors, fine, index, touches, alone and len(index) > _LARGE).to_json()
     return data
 
 
-def _from_json(name: str, data: dict[str, Any], known: dict[str, Scorer], index: Index) -> FittedScorer:
+def _from_json(name: str, data: dict[str, Any], scorers: dict[str, Scorer], index: Index) -> FittedScorer:
     if data["format"] != FORMAT:
         raise ValueError("another format")
     m = data["moments"]
     moments = Moments(np.array(m["bias"]), np.array(m["covariance"]), m["freedom"])
-    known = {**_limited(known, data["nearest"]), "moments": moments}
-    vectors = known.get(vectors_name(name))
+    scorers = {**_limited(scorers, data["nearest"]), "moments": moments}
+    vectors = scorers.get(vectors_name(name))
     cascade = None
     if isinstance(vectors, EncoderScorer):
         cascade = Cascade.from_json(data["cascade"], vectors, index)
     exact_scorer, exact_calibration = None, None
     if "exact" in data:
-        exact_scorer = _weighed(data["exact_weights"], known)
+        exact_scorer = _weighed(data["exact_weights"], scorers)
         exact_calibration = Calibration(**data["exact"])
     return FittedScorer(
         name,
-        _weighed(data["weights"], known),
+        _weighed(data["weights"], scorers),
         Calibration(**data["calibration"]),
-        Witness(moments, tuple(data["usual"])),
+        EvidenceModel(moments, tuple(data["usual"])),
         cascade,
         exact_scorer,
         exact_calibration,
     )
 
 
-def _limited(known: dict[str, Scorer], nearest: dict[str, float]) -> dict[str, Scorer]:
-    """``known`` with what is usual for the touches of an index."""
+def _limited(scorers: dict[str, Scorer], nearest: dict[str, float]) -> dict[str, Scorer]:
+    """``scorers`` with what is usual for the touches of an index."""
     return {
         name: replace(scorer, usual=nearest[name]) if isinstance(scorer, EncoderScorer) else scorer
-        for name, scorer in known.items()
+        for name, scorer in scorers.items()
     }
 
 
-def _weighed(weights: dict[str, float], known: dict[str, Scorer]) -> Scorer:
+def _weighed(weights: dict[str, float], scorers: dict[str, Scorer]) -> Scorer:
     if len(weights) == 1:
-        return known[next(iter(weights))]
-    return Product([known[name] for name in weights], list(weights.values()))
+        return scorers[next(iter(weights))]
+    return Product([scorers[name] for name in weights], list(weights.values()))
 
 
-def _all_alike(index: Index, touches: Touches, gain: float) -> str:
-    """Why the object cannot be localized, when its touches tell nothing about its pose."""
+def _all_alike(index: Index, touches: CalibrationTouches, gain: float) -> str:
+    """Why the object cannot be localized, when its touches constrain no pose."""
     filled = float(np.mean([mask.mean() > 0.95 for mask in touches.masks]))
     why = (
         f"at {100 * filled:.0f} % of its poses the contact fills the window"
@@ -278,6 +278,6 @@ def _all_alike(index: Index, touches: Touches, gain: float) -> str:
     )
     return (
         f"{index.mesh.name}: cannot be localized, because its touches on the sensor {index.sensor.name!r} are all alike: "
-        f"{why}, and a touch tells {max(gain, 0):.2f} nats; use a sensor with a larger window, or an approach to where "
+        f"{why}, and a touch gains {max(gain, 0):.2f} nats; use a sensor with a larger window, or an approach to where "
         "the object has edges"
     )

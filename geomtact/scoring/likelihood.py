@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import Index
 from geomtact.scoring.overlap import overlaps, to_grid
 from geomtact.se3 import Array
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
 
 THRESHOLDS = (0.0, 0.25, 0.5)  # of the penetration
 SOFTNESS = (0.1e-3, 0.4e-3)  # m
 _CORRELATED = 4e-6  # m^2 that are felt or not felt together
-_SCALE = 0.05  # by which all heights of a touch may be too large or too small
+_SCALE = 0.05  # by which all depths of a touch may be too large or too small
 _FAR = 0.05  # m above the membrane that are as good as infinitely many
-_ODD = 0.02  # share of pixels that say nothing: dust, glare, what no model foresees
+_OUTLIERS = 0.02  # share of pixels that say nothing: dust, glare, what no model foresees
 
 
 @dataclass(frozen=True)
 class PixelLikelihood:
     """Log likelihood of the observed pixels from the stored contacts at all penetrations.
 
-    The contacts of a place at its P penetrations are contour lines of the object's surface there: they tell the height at
+    The contacts of a place at its P penetrations are contour lines of the object's surface there: they give the height at
     every pixel to within a penetration bin. So the likelihood of all poses takes P counts of common pixels a place.
 
     The stored masks and their areas: 98 bytes per pose at 32 x 24 pixels, 386 at 64 x 48; a count of bits a word, and for
@@ -41,7 +41,7 @@ class PixelLikelihood:
 
     name: str = "likelihood"
 
-    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Log likelihood (P, n) of ``mask`` (h, w) at every pose."""
         seen = to_grid(cleaned(mask, index.sensor), index.resolution.mask_shape)
         depths = np.asarray(index.resolution.penetrations)
@@ -90,21 +90,21 @@ def height_log_likelihood(
     Parameters
     ----------
     depths : (n, h, w) how far the object lies below the undeformed membrane [m], -inf where it is not
-    height : (h, w) how deep the gel is pressed in [m]; NaN tells nothing
+    height : (h, w) how deep the gel is pressed in [m]; NaN where it was not measured
     touched : (h, w) where the object touches
     area : of a pixel [m^2]
-    noise : standard deviation of heights [m], beside a share of them
+    noise : standard deviation of depths [m], beside a share of them
     """
-    known = np.isfinite(height)
-    beside = height[known] - np.maximum(depths[:, known], -_FAR)  # of the gel's surface from the object's
-    beside = np.where(touched[known], beside, np.minimum(beside, 0))
-    off2 = beside**2 / (noise**2 + (_SCALE * height[known]) ** 2)
-    return _independent(area) * np.log((1 - _ODD) * np.exp(-0.5 * off2) + _ODD).sum(1)
+    measured = np.isfinite(height)
+    beside = height[measured] - np.maximum(depths[:, measured], -_FAR)  # of the gel's surface from the object's
+    beside = np.where(touched[measured], beside, np.minimum(beside, 0))
+    off2 = beside**2 / (noise**2 + (_SCALE * height[measured]) ** 2)
+    return _independent(area) * np.log((1 - _OUTLIERS) * np.exp(-0.5 * off2) + _OUTLIERS).sum(1)
 
 
 def _felt(below: NDArray[np.floating], softness: float) -> NDArray[np.floating]:
     """Probability that a pixel is felt at which the object is ``below`` [m] under the threshold."""
-    out: NDArray[np.floating] = _ODD / 2 + (1 - _ODD) / (1 + np.exp(np.clip(-below / softness, -30, 30)))
+    out: NDArray[np.floating] = _OUTLIERS / 2 + (1 - _OUTLIERS) / (1 + np.exp(np.clip(-below / softness, -30, 30)))
     return out
 
 

@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.scoring.calibration import chunks
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.patches import patches
 from geomtact.sensing.sensor import Sensor
 
-# Share of the mixture that the patches alone have. On 654 touches of several patches, drawn on purpose on four parts, 0.1 to 0.3
-# tell 0.06 to 0.08 nats more than none; on a gear, whose contacts have several as simulated, 0.15 costs 0.1
+# Share of the mixture that the patches alone have. On 654 touches of several patches, drawn on four objects, 0.1 to 0.3
+# gain 0.06 to 0.08 nats more than none; on a gear, whose contacts have several as simulated, 0.15 costs 0.1
 _ALONE = 0.15
 _MOST = 3  # patches, the largest, that are looked at alone
 
 
-def ways(mask: Shown, sensor: Sensor) -> tuple[list[float], list[Shown]]:
+def contact_hypotheses(mask: SoftMask, sensor: Sensor) -> tuple[list[float], list[SoftMask]]:
     """What the object's own contact may be where a sensor shows ``mask`` (h, w): contacts (h, w), and before them the share of
     the mixture that each has."""
     alone = patches(mask, sensor.pixel_area(mask.shape), _MOST)
@@ -35,7 +35,7 @@ def ways(mask: Shown, sensor: Sensor) -> tuple[list[float], list[Shown]]:
     return [1 - _ALONE] + [_ALONE / len(alone)] * len(alone), [mask, *alone]
 
 
-def mixed(
+def mix_hypotheses(
     shares: Sequence[float],
     scores: Sequence[NDArray[np.float32]],
     log_weight: NDArray[np.floating],
@@ -44,7 +44,7 @@ def mixed(
     """The scores (N,) of a mixture of likelihoods, that have ``shares`` (k,) and ``scores`` (k, N).
 
     Each likelihood, exp(score / temperature), is taken to the mean of one over the rows, whose measure has the log ``log_weight``
-    (N,): so every part tells of the pose alone, however unlike the object it is.
+    (N,): so every component concerns the pose alone, however unlike the object it is.
     """
     if len(scores) == 1:
         return scores[0]

@@ -1,6 +1,6 @@
 """Contacts compared by their moments: where the contact lies, how large it is, and how it is stretched.
 
-On a grid whose cells are larger than a contact, two touches in one cell share hardly a pixel, so overlap tells little.
+On a grid whose cells are larger than a contact, two touches in one cell share hardly a pixel, so overlap constrains little.
 Their moments still agree: centroid, area, size, elongation along and across. How far they may differ within a cell,
 through the gel's elasticity and through the sensor's noise is learned from simulated touches as the mean and the
 covariance of the difference, and a Student t makes it a likelihood that outliers do not upset.
@@ -17,7 +17,7 @@ from scipy.special import gammaln
 
 from geomtact.contact_space.index import Index
 from geomtact.se3 import Array
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import moments_of
 
 _CHUNK = 1 << 15
@@ -63,15 +63,15 @@ class Moments:
     def _whiten(self) -> Array:
         return np.linalg.cholesky(np.linalg.inv(self.covariance)).T
 
-    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Log likelihood (P, n) of the moments of ``mask``."""
         return self._of(index, mask, index.moments).reshape(index.height.shape)
 
-    def of_drawn(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def of_drawn(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """As :meth:`score`, at the poses of ``index.drawn_moments`` alone: (m,)."""
         return self._of(index, mask, index.drawn_moments)
 
-    def _of(self, index: Index, mask: Shown, stored: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _of(self, index: Index, mask: SoftMask, stored: NDArray[np.float32]) -> NDArray[np.float32]:
         seen = moments_of(mask, index.sensor) - self.bias
         W = self._whiten.astype(np.float32)
         target = (W @ seen).astype(np.float32)

@@ -2,7 +2,7 @@
 
 A reader finds the outline a little beside where it is, and errs alike along some length of it: a smooth displacement of unknown
 strength, over which it is marginalised. So what counts is how far the two outlines are apart, not how many pixels differ: a
-shape is told by details that have hardly any area.
+shape lies in details that have hardly any area.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from geomtact.sensing.sensor import Sensor
 
 STRENGTHS = (0.2e-3, 0.35e-3, 0.6e-3)  # m rms of the displacement, all as likely
 _CORRELATION = 2e-3  # m along the outline over which it is alike: to 1/e, as of ``Noise.correlation``
-_ODD = 3.0  # times the strength from which on a piece of outline says nothing: dust, or a patch that was not found
+_OUTLIER = 3.0  # times the strength from which on a piece of outline says nothing: dust, or a patch that was not found
 _STEEPEST = 1.0  # slope down to the pixels beside the contact, from which on it is a wall
 _FLATTEST = 0.05  # slope at least, in working out how far away the level is
 _POINTS = 150  # of the observed outline, at most
@@ -72,9 +72,9 @@ class OutlineLikelihood:
         from_told = self._from_points(over)
         each = []
         for strength in STRENGTHS:
-            told = np.bincount(which, _squared(from_seen, strength) * length, len(over))
+            expected = np.bincount(which, _squared(from_seen, strength) * length, len(over))
             seen = _squared(from_told, strength).mean(1) * self.length if len(self.points) else 0.0
-            each.append(-0.25 * (told + seen) - self.length * np.log(strength / STRENGTHS[0]))
+            each.append(-0.25 * (expected + seen) - self.length * np.log(strength / STRENGTHS[0]))
         out = log_mean_exp(np.stack(each, 1) / (np.sqrt(np.pi) * _CORRELATION))
         return np.where((over > 0).any((1, 2)), out, -np.inf)
 
@@ -92,7 +92,7 @@ class OutlineLikelihood:
 
 
 def _squared(distance: NDArray[np.floating], strength: float) -> Array:
-    return np.asarray(np.minimum(distance / strength, _ODD).clip(-_ODD) ** 2)
+    return np.asarray(np.minimum(distance / strength, _OUTLIER).clip(-_OUTLIER) ** 2)
 
 
 def _beside(mask: NDArray[np.bool_], pitch: float) -> NDArray[np.float32]:

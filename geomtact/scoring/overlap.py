@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index, pack
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 
 _THREADS = 2
 _CHUNK = 1 << 15  # poses a step: the words of one chunk stay in the processor's cache
@@ -38,43 +38,35 @@ def overlaps(bits: NDArray[np.uint64], mask: NDArray[np.bool_]) -> NDArray[np.in
 
 
 @dataclass(frozen=True)
-class PixelL1:
-    """Share of pixels on which two masks agree: one minus the thesis's pixel distance (its baseline that fails, Fig. 8).
+class Overlap:
+    """A score of how many pixels two masks share.
 
     The stored masks and their areas: 98 bytes per pose at 32 x 24 pixels, 386 at 64 x 48; a count of bits a word to compare.
+
+    Attributes
+    ----------
+    name : "iou" for the intersection over the union, "l1" for the share of pixels on which the masks agree, which is one minus
+        the thesis's pixel distance (its baseline that fails, Fig. 8)
     """
 
-    name: str = "l1"
+    name: str
 
-    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
+        """Similarity (P, n) of ``mask`` (h, w) to the mask of every pose, 0 to 1."""
         mask = to_grid(mask, index.resolution.mask_shape)
         shared = overlaps(index.bits, mask)
-        differing = index.area.astype(np.int32) + int(mask.sum()) - 2 * shared
-        return np.float32(1) - differing.astype(np.float32) / np.float32(mask.size)
-
-
-@dataclass(frozen=True)
-class IoU:
-    """Intersection over union.
-
-    The stored masks and their areas: 98 bytes per pose at 32 x 24 pixels, 386 at 64 x 48; a count of bits a word to compare.
-    """
-
-    name: str = "iou"
-
-    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
-        mask = to_grid(mask, index.resolution.mask_shape)
-        shared = overlaps(index.bits, mask)
-        union = index.area.astype(np.int32) + int(mask.sum()) - shared
+        both = index.area.astype(np.int32) + int(mask.sum())
+        if self.name == "l1":
+            return np.float32(1) - (both - 2 * shared).astype(np.float32) / np.float32(mask.size)
         ratio: NDArray[np.float32] = shared.astype(np.float32)
-        ratio /= np.maximum(union, 1)
+        ratio /= np.maximum(both - shared, 1)
         return ratio
 
 
-def to_grid(mask: Shown, shape: Sequence[int]) -> NDArray[np.bool_]:
+def to_grid(mask: SoftMask, shape: Sequence[int]) -> NDArray[np.bool_]:
     """``mask`` (H, W) on another grid (h, w) over the same window: contact where most of the pixel's area is."""
     small = cv2.resize(np.asarray(mask, np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
     return small >= 0.5
 
 
-OVERLAPS = {s.name: s for s in (PixelL1(), IoU())}
+OVERLAPS = {name: Overlap(name) for name in ("l1", "iou")}

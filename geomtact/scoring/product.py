@@ -1,6 +1,6 @@
 """Several scores taken together, each with the weight that it is worth on one index.
 
-On a coarse grid the network tells all there is; on a fine one, of an object known to lie on one face, moments or pixels tell
+On a coarse grid the network gains all there is; on a fine one, with a known contact face, moments or pixels add
 more than it has learned. What adds what is measured on simulated touches, so that no more is computed than the scene needs.
 """
 
@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
-from geomtact.scoring.calibration import Calibration, Touches, calibrated
+from geomtact.scoring.calibration import Calibration, CalibrationTouches, fit_to_scores
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import VectorScorer
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 
 RATIOS = (0.25, 0.5, 1.0)  # of what a further score counts, each score divided by its own temperature
 _PLACES, _TOUCHES = 15_000, 120  # that scores are compared on
@@ -34,7 +34,7 @@ class Product:
         """Such as "1 encoder + 0.25 iou"."""
         return " + ".join(f"{w:.3g} {s.name}" for w, s in zip(self.weights, self.scorers, strict=True))
 
-    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Score (P, n) of ``mask`` (h, w) at every pose."""
         out = np.float32(self.weights[0]) * self.scorers[0].score(index, mask)
         for scorer, weight in zip(self.scorers[1:], self.weights[1:], strict=True):
@@ -45,11 +45,11 @@ class Product:
 class Comparison:
     """Scores of the same touches at some places of an index, drawn at random, and at the true ones.
 
-    Each drawn place stands for many, each true one for itself: however much a score tells, it cannot gain more than the
+    Each drawn place stands for many, each true one for itself: a score gains no more information than the
     truth's own mass leaves.
     """
 
-    def __init__(self, index: Index, touches: Touches, seed: int = 0):
+    def __init__(self, index: Index, touches: CalibrationTouches, seed: int = 0):
         rng = np.random.default_rng(seed)
         some = np.sort(rng.choice(index.places, min(_PLACES, index.places), replace=False))
         level, true = np.divmod(touches.ids[:_TOUCHES], index.places)
@@ -72,7 +72,7 @@ class Comparison:
         return self._scores[scorer.name]
 
     def worth(self, scores: Sequence[NDArray[np.float32]]) -> Calibration:
-        return calibrated(lambda i: scores[i], self._true, self._weight)
+        return fit_to_scores(lambda i: scores[i], self._true, self._weight)
 
 
 def choose(

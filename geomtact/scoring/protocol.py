@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 
 
 class Scorer(Protocol):
@@ -21,7 +21,7 @@ class Scorer(Protocol):
     @property
     def name(self) -> str: ...
 
-    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Similarity (P, n) of ``mask`` (h, w), over the whole window on any grid, to the mask of every pose of ``index``.
 
         ``mask`` is bool, or the probability of contact at each pixel.

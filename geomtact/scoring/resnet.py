@@ -1,4 +1,4 @@
-"""The thesis's similarity network (6.1.4), the baseline: a ResNet-50 trained for one part, contacts compared by cosine.
+"""The thesis's similarity network (6.1.4), the baseline: a ResNet-50 trained for one object, contacts compared by cosine.
 
 The thesis does not say how the last feature map becomes 1,000 numbers, nor at which size images go in: here it is averaged
 over the image and multiplied by one matrix, and images are 224 x 224 unless the weights were trained at another size.
@@ -20,7 +20,7 @@ from geomtact.errors import InputError
 from geomtact.scoring.encoder import THESIS
 from geomtact.scoring.precision import autocast
 from geomtact.scoring.vectors import VectorScorer
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.sensor import Sensor
 
 SIDE, NUMBERS = 224, 1000
@@ -54,7 +54,7 @@ class Resnet:
 class CosineScorer(VectorScorer):
     """Cosine of the vectors, negative ones taken as 0, of touches and stored contacts."""
 
-    def score(self, index, mask: Shown) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
+    def score(self, index, mask: SoftMask) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
         """Similarity (P, n) of ``mask`` (h, w) to the mask of every pose, 0 to 1."""
         return np.maximum(self.stored @ self.seen(index, mask), 0).reshape(index.height.shape)
 

@@ -16,7 +16,7 @@ from geomtact.contact_space.index import Index
 from geomtact.files import write_whole
 from geomtact.progress import Progress
 from geomtact.scoring.overlap import to_grid
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
 
@@ -58,7 +58,7 @@ class VectorScorer:
     def _squared(self) -> NDArray[np.float32]:
         return np.asarray(np.einsum("nd,nd->n", self.stored, self.stored), np.float32)
 
-    def score(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def score(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Similarity (P, n) of ``mask`` (h, w) to the mask of every pose: minus the squared distance of the vectors."""
         seen = self.seen(index, mask)
         out = self.stored @ (2 * seen)
@@ -66,7 +66,7 @@ class VectorScorer:
         out -= np.float32(seen @ seen)
         return out.reshape(index.height.shape)
 
-    def seen(self, index: Index, mask: Shown) -> NDArray[np.float32]:
+    def seen(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""
         small = to_grid(cleaned(mask, index.sensor), index.resolution.mask_shape)
         return self.descriptor.describe(small[None], index.sensor)[0]

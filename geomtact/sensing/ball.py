@@ -82,7 +82,7 @@ class OnBall:
         out = self._diameter(slopes, seen, below)
         if not self.sensor.camera_distance:
             return out
-        for _ in range(_STEPS):  # how deep a pixel looks is told by the ball that it looks at
+        for _ in range(_STEPS):  # how deep a pixel looks follows from the ball that it looks at
             if not 0.5 * out > 1.01 * np.linalg.norm(self.xy - self.middle[:2], axis=1).max():
                 break
             out = self._diameter(slopes, *self._seen(0.5 * out))

@@ -1,8 +1,8 @@
-"""A sensor of one's own: from presses of one ball to what its colours tell of the gel's slope (photometric stereo).
+"""Calibrating a sensor's colours: from presses of one ball, the gel's slope by its colour (photometric stereo).
 
-Under the ball the gel has the ball's shape (``ball``), so the slope is known all over the contact once its centre is: that of the
+Under the ball the gel has the ball's shape (``ball``), so the slope is given all over the contact once its centre is: that of the
 circle which the contact's outline is (``press``). The outline is that of the imprint, which is wider than the contact: only the
-inner part is used, and no depth need be known, but for a near camera. The pixel pitch must be known: a ball of another size, seen
+inner part is used, and no depth is needed, but for a near camera. The pixel pitch must be given: a ball of another size, seen
 by another pitch, looks the same.
 """
 
@@ -37,7 +37,7 @@ _APART = 0.4  # by which one press may measure it otherwise than the median of t
 
 
 @dataclass(frozen=True, eq=False)
-class Calibrated:
+class SensorCalibration:
     """A calibrated sensor, and how well the presses agree with it.
 
     Attributes
@@ -64,7 +64,7 @@ def calibrate(
     sensor: Sensor | str | None = None,
     name: str | None = None,
 ) -> Sensor:
-    """A sensor whose colours tell heights, from presses of one ball. :func:`calibrated` tells how well, too.
+    """A sensor whose colours give depths, from presses of one ball; :func:`calibrate_sensor` also returns how well.
 
     Parameters
     ----------
@@ -79,23 +79,23 @@ def calibrate(
     ------
     UsageError
         Fewer than three images were given; the diameter or the pitch is not in metres; or neither a pitch nor a sensor was given:
-        presses of unknown depth do not tell the pitch. The largest possible is named.
+        presses of unknown depth do not determine the pitch. The largest possible is named.
     InputError
         Fewer than three images show the whole round imprint of a ball that may be so large; or what they show is contradictory.
     ImageError, SensorError
         An image, or the sensor, cannot be read.
     """
-    return calibrated(presses, ball_diameter, background, pixel_pitch, sensor, name).sensor
+    return calibrate_sensor(presses, ball_diameter, background, pixel_pitch, sensor, name).sensor
 
 
-def calibrated(
+def calibrate_sensor(
     presses: Sequence[Any],
     ball_diameter: float,
     background: Any,
     pixel_pitch: float | tuple[float, float] | None = None,
     sensor: Sensor | str | None = None,
     name: str | None = None,
-) -> Calibrated:
+) -> SensorCalibration:
     """As :func:`calibrate`, with what it rests on."""
     if isinstance(presses, str | Path) or len(presses) < _FEWEST:
         given = "one path" if isinstance(presses, str | Path) else f"{len(presses)}"
@@ -104,17 +104,17 @@ def calibrated(
         )
     if not (np.isfinite(ball_diameter) and 1e-4 < ball_diameter < 0.1):
         raise UsageError(f"ball_diameter: expected metres, 0.0001 to 0.1, got {ball_diameter}; 6.31 mm is 0.00631")
-    known = None if sensor is None else Sensor.load(sensor)
-    reference = named_image(background, "background", known)[1]
-    pitch = known.pixel_pitch if pixel_pitch is None and known is not None else pixel_pitch
-    found, left_out = find_presses(presses, reference, None if pitch is None else _pair(pitch), known)
+    mounted = None if sensor is None else Sensor.load(sensor)
+    reference = named_image(background, "background", mounted)[1]
+    pitch = mounted.pixel_pitch if pixel_pitch is None and mounted is not None else pixel_pitch
+    found, left_out = find_presses(presses, reference, None if pitch is None else _pair(pitch), mounted)
     radius = 0.5 * ball_diameter
     # the pitch with which no imprint is wider than the ball
     most = radius / max((press.radius for press in found), default=np.inf)
     if pitch is None:
         bound = f"; it is at most {1e3 * most:.4f} mm, the ball's radius over the largest imprint's" if found else ""
         raise UsageError(
-            "pixel_pitch: none was given (--pitch-mm, --pins or --sensor), and presses of unknown depth do not tell it: measure "
+            "pixel_pitch: none was given (--pitch-mm, --pins or --sensor), and presses of unknown depth do not give it: measure "
             f"how many pixels a known length takes on the membrane{bound}"
         )
     pitch = _pair(pitch)
@@ -127,7 +127,7 @@ def calibrated(
             f"calibrate: {_FEWEST} presses or more are needed, {len(found)} of {len(presses)} serve ({why})"
         )
     _check_rest(found)
-    base = known or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
+    base = mounted or Sensor("calibrated", reference.shape[1::-1], pitch, 0.0, 2e-3)
     check_size(reference, base, "background")
     sensor, diameters = _fitted(found, replace(base, name=name or base.name, pixel_pitch=pitch), radius)
     assert sensor.colour is not None
@@ -145,7 +145,7 @@ def calibrated(
             f"some imprints are wider than the ball, which allows a pitch of {1e3 * most:.4f} mm at most; {1e3 * pitch[0]:.4f} "
             "was given: measure it, and the ball"
         ]
-    return Calibrated(sensor, found, left_out, diameters, [*doubts, *_doubts(found, unlike, diameters, off)])
+    return SensorCalibration(sensor, found, left_out, diameters, [*doubts, *_doubts(found, unlike, diameters, off)])
 
 
 def _check_rest(presses: Sequence[Press]) -> None:
@@ -177,7 +177,7 @@ def _doubts(presses: Sequence[Press], unlike: int, diameters: Array, off: float)
     out = []
     if unlike > len(presses):
         out.append(
-            f"on {unlike} presses no ball of that size was found, on {len(presses)} it was: heights may be worthless; see why "
+            f"on {unlike} presses no ball of that size was found, on {len(presses)} it was: depths may be worthless; see why "
             "each is left out, and press one ball in a dozen times, not deeper than to its middle, wholly within the window"
         )
     window = np.array(presses[0].mask.shape[::-1])
@@ -185,7 +185,7 @@ def _doubts(presses: Sequence[Press], unlike: int, diameters: Array, off: float)
     if spans.min() < _SPAN:
         out.append(
             f"the presses lie within {100 * spans[0]:.0f} % of the window's width and {100 * spans[1]:.0f} % of its height: "
-            "elsewhere heights may be far off; press the ball in all over"
+            "elsewhere depths may be far off; press the ball in all over"
         )
     if abs(off) > _AGREES:
         out.append(
@@ -194,9 +194,9 @@ def _doubts(presses: Sequence[Press], unlike: int, diameters: Array, off: float)
             "all over the window"
         )
     like_most = np.abs(diameters / np.nanmedian(diameters) - 1) <= _APART
-    odd = [press.name for press, fits in zip(presses, like_most, strict=True) if not fits]
-    if odd:
-        named = ", ".join(odd[:3]) + (f" and {len(odd) - 3} more" if len(odd) > 3 else "")
+    outliers = [press.name for press, fits in zip(presses, like_most, strict=True) if not fits]
+    if outliers:
+        named = ", ".join(outliers[:3]) + (f" and {len(outliers) - 3} more" if len(outliers) > 3 else "")
         out.append(
             f"on {named} no ball is seen, or one more than {100 * _APART:.0f} % larger or smaller than on most presses: look "
             "whether the contact is whole and of the same ball, and leave out what is not"
@@ -231,37 +231,37 @@ def weights_of(samples: Sequence[tuple[Array, Array]]) -> Array:
 def _left_one_out(
     presses: Sequence[Press], samples: Sequence[tuple[Array, Array]], sensor: Sensor, radius: float
 ) -> tuple[Array, float, float]:
-    """By what the others tell: the ball's diameter (n,) [m] on each press, and how far off slopes (rms) and heights [m] (median
+    """By the others' colours: the ball's diameter (n,) [m] on each press, and how far off slopes (rms) and depths [m] (median
     of the presses' rms, their offset aside) are on a ball of ``radius`` [m]."""
     diameters, squares, beside = np.zeros(len(presses)), [], []
     for i, press in enumerate(presses):
         weights = weights_of([s for k, s in enumerate(samples) if k != i])
         x, y = (tuple(map(float, row)) for row in weights)
         on = OnBall.within(press, sensor, INNER)
-        told = relief(press.change, press.felt, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)
-        beside.append(float((told[on.at] - on.height(radius)).std()))
+        depths = relief(press.change, press.felt, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)
+        beside.append(float((depths[on.at] - on.height(radius)).std()))
         features, true = samples[i]
         sloping = true.any(1)
         squares.append(((features[sloping] @ weights.T - true[sloping]) ** 2).mean())
-        diameters[i] = told_diameter(press, sensor, weights)
+        diameters[i] = diameter_from_colours(press, sensor, weights)
     return diameters, float(np.sqrt(np.mean(squares))), float(np.median(beside))
 
 
 def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Array, Array]:
-    """Slopes (n, 2) that the colours of a calibrated sensor tell on the inner part of a press, and those of the ball."""
+    """Slopes (n, 2) that the colours of a calibrated sensor give on the inner part of a press, and those of the ball."""
     assert sensor.colour is not None
     on = OnBall.within(press, sensor, INNER)
     return on.features @ np.asarray(sensor.colour.weights).T, on.slopes(0.5 * ball_diameter)
 
 
 def measured_diameter(press: Press, sensor: Sensor) -> float:
-    """Diameter [m] of the ball of a press, as the colours of a calibrated sensor tell it."""
+    """Diameter [m] of the ball of a press, by the colours of a calibrated sensor."""
     assert sensor.colour is not None
-    return told_diameter(press, sensor, np.asarray(sensor.colour.weights))
+    return diameter_from_colours(press, sensor, np.asarray(sensor.colour.weights))
 
 
-def told_diameter(press: Press, sensor: Sensor, weights: Array) -> float:
-    """Diameter [m] of the ball of a press, as ``weights`` (2, ``TERMS``) of colours tell it."""
+def diameter_from_colours(press: Press, sensor: Sensor, weights: Array) -> float:
+    """Diameter [m] of the ball of a press, as ``weights`` (2, ``TERMS``) of colours give it."""
     on = OnBall.within(press, sensor, _MEASURED)
     return on.diameter(on.features @ weights.T)
 

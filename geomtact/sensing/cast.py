@@ -169,7 +169,7 @@ class Caster:
         if not sensor.camera_distance:
             return np.zeros(len(T), bool)
         camera = apply(inverse(T), np.array([[0.0, 0.0, -sensor.camera_distance]]))[:, 0] - self._centre
-        # an odd direction, so that no ray runs along a face of a machined part
+        # an odd direction, so that no ray runs along a face of a machined object
         direction = np.broadcast_to(np.array([0.41, 0.33, 0.85], np.float32), camera.shape)
         hit = self._scene.hits(camera.astype(np.float32), np.ascontiguousarray(direction))
         return np.asarray(((hit.normal * direction).sum(1) > 0) & (hit.face >= 0))

@@ -1,4 +1,4 @@
-"""What has changed in a reading since its background: colours, where that is felt, and images that cannot be compared."""
+"""What has changed in a tactile image since its background: colours, where that is felt, and images that do not compare."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
     height, width = array.shape[:2]
     if (width, height) == sensor.image_size_px:
         return
-    wanted, given = "{} x {} px".format(*sensor.image_size_px), f"{width} x {height} px"
+    expected, given = "{} x {} px".format(*sensor.image_size_px), f"{width} x {height} px"
     if (height, width) == sensor.image_size_px and sensor.camera_rotation_deg in (90, 270):
         hint = (
             f"it was turned by {sensor.camera_rotation_deg} degrees, and image_size_px is that after it: write it so into a "
@@ -159,8 +159,8 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
         rows, columns = sensor.cut(array.shape)
         hint = (
             f"of the camera's whole frame give image[{rows.start}:{rows.stop}, {columns.start}:{columns.stop}] scaled to "
-            f"{wanted}, for the sensor's images are without {100 * sensor.border_fraction:.0f} % of it at each side; if it "
-            f"is cut already, scale it to {wanted}"
+            f"{expected}, for the sensor's images are without {100 * sensor.border_fraction:.0f} % of it at each side; if it "
+            f"is cut already, scale it to {expected}"
         )
     elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
         hint = "the shape agrees: scale a mask to that, or describe this resolution in a sensor file of its own"
@@ -169,7 +169,7 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
             "name the sensor that took it; crop or scale nothing: give the image as the camera made it, "
             "or a sensor file of its resolution"
         )
-    raise ImageError(f"{name}: expected {wanted} for sensor {sensor.name} (width x height), got {given}; {hint}")
+    raise ImageError(f"{name}: expected {expected} for sensor {sensor.name} (width x height), got {given}; {hint}")
 
 
 def background_of(background: Any, image: Array) -> Array:

@@ -1,4 +1,4 @@
-"""How a gel's colour tells its slope: photometric stereo, learned from presses of a ball.
+"""A gel's slope by its colour: photometric stereo, learned from presses of a ball.
 
 Each component of the slope is a polynomial of second degree in the changes of the three channels from the background, and its
 weights vary over the image as polynomials of second degree too, because lamps are near. Where the colour has not changed the gel
@@ -30,8 +30,8 @@ class ColourTable:
     weights : 2 x ``TERMS``, of the slope along x and along y
     slope_rms : by how much slopes, which have no unit, were off where the table was not fitted: under other presses of the ball,
         or of another's table in its other half
-    height_rms : by how much heights are off where nothing touches, before they are set to 0 there [m]; 0 where no press told
-    contact_depth : how deep the gel is pressed in at the border of what counts as contact [m]; 0 where no press told
+    height_rms : by how much depths are off where nothing touches, before they are set to 0 there [m]; 0 where no press gave it
+    contact_depth : how deep the gel is pressed in at the border of what counts as contact [m]; 0 where no press gave it
     background : h rows of w times R, G, B, 0..1: the untouched gel as it was then, coarsely; None where that was not kept
     """
 

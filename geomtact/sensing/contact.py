@@ -1,4 +1,4 @@
-"""What one touch tells: where the object presses, and how deep where that is known."""
+"""What one touch measures: where the object presses, and how deep where the image shows it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BORDER = 2  # px
 _SHALLOW = 0.22
 FAINT = 0.01  # share of the deepest that is no indentation
 
-Shown = NDArray[np.bool_] | NDArray[np.float32]  # (H, W) whether each pixel is in contact, or how probably
+SoftMask = NDArray[np.bool_] | NDArray[np.float32]  # (H, W) whether each pixel is in contact, or how probably
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class Contact:
     Attributes
     ----------
     mask : (H, W) bool, True where the object touches (the thesis's local shape)
-    height : (H, W) float32, how deep the gel is pressed in [m], >= 0, beside an elastic contact too; None where only the mask is
-        known
+    height : (H, W) float32, how deep the gel is pressed in [m], >= 0, beside an elastic contact too; None where there is
+        only the mask
     share : of the deepest, from which on the gel surely lies on the object, within the mask: ``HALF`` where the mask is the
-        contact already, ``SURE`` where it is guessed from heights that fade away
-    probability : (H, W) float32 that each pixel is in contact, more than half within the mask; None where that is not known
+        contact already, ``SURE`` where it is guessed from depths that fade away
+    probability : (H, W) float32 that each pixel is in contact, more than half within the mask; None where there is none
     """
 
     mask: NDArray[np.bool_]
@@ -42,8 +42,8 @@ class Contact:
     probability: NDArray[np.float32] | None = None
 
     @property
-    def shown(self) -> Shown:
-        """What scores and registration take: the probabilities where they are known, else the mask."""
+    def soft_mask(self) -> SoftMask:
+        """What scores and registration take: the probabilities where there are any, else the mask."""
         return self.mask if self.probability is None else self.probability
 
     @classmethod

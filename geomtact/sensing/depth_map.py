@@ -20,7 +20,7 @@ _STEEP, _AREA = 3.0, 1e-6
 _MOST = (
     0.75  # share that most of the values of noise have: half of it is negative, 0.9 and more less than half the largest
 )
-_BORDER, _NEAR_HIGHEST = 0.8, 0.1  # share of the border, and of the range of heights, by which distances are suspected
+_BORDER, _NEAR_HIGHEST = 0.8, 0.1  # share of the border, and of the range of depths, by which distances are suspected
 
 
 def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str]) -> NDArray[np.float32]:
@@ -32,30 +32,30 @@ def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str
         It is in colour, of another type, negative, of distances from the camera, or surely in another unit.
     """
     if array.ndim == 3:
-        raise ImageError(f"{name}: a height map has one channel, got a colour image; give --kind reading")
+        raise ImageError(f"{name}: a depth map has one channel, got a colour image; give --kind reading")
     if array.dtype != np.uint16 and array.dtype.kind != "f":
         raise ImageError(
-            f"{name}: heights must be float (metres) or 16-bit (micrometres), got {array.dtype}; convert them: what one step "
+            f"{name}: depths must be float (metres) or 16-bit (micrometres), got {array.dtype}; convert them: what one step "
             "of grey is, its maker says"
         )
     height = array * (1e-6 if array.dtype == np.uint16 else 1.0)
     lowest, highest = float(height.min()), float(height.max())
     most = sensor.max_penetration
-    expected = f"{name}: expected heights in metres up to about {most:g}"
+    expected = f"{name}: expected depths in metres up to about {most:g}"
     if lowest < -1e-6 and _all_noise(height, sensor):
         warnings.append(
-            f"{name}: heights of {1e6 * lowest:.2g} to {1e6 * highest:.2g} micrometres are noise about 0: taken as no contact"
+            f"{name}: depths of {1e6 * lowest:.2g} to {1e6 * highest:.2g} micrometres are noise about 0: taken as no contact"
         )
         return np.zeros(height.shape, np.float32)
     if lowest < -1e-6 and not _noise_below(height, sensor):
         deepest = max(-lowest, highest)
         raise ImageError(
-            f"{name}: heights are depths of the gel's indentation, >= 0; the lowest is {lowest:.4g} m: where contact is negative "
-            "negate them, and set the gel at rest to 0; clip noise that is left below it, numpy.maximum(heights, 0)"
+            f"{name}: depths of the gel's indentation are >= 0; the lowest is {lowest:.4g} m: where contact is negative "
+            "negate them, and set the gel at rest to 0; clip noise that is left below it, numpy.maximum(depths, 0)"
             + (f"; {_units(deepest, sensor)}" if deepest > _DEEPEST * most else "")
         )
     if -lowest > sensor.height_noise:
-        warnings.append(f"{name}: heights down to {lowest * 1e6:.2g} micrometres were set to 0")
+        warnings.append(f"{name}: depths down to {lowest * 1e6:.2g} micrometres were set to 0")
     if highest > _DEEPEST * most and lowest > highest / 2:
         raise ImageError(
             f"{expected}, 0 where the gel is at rest, got {lowest:.4g} to {highest:.4g}, as distances from the camera are: take "
@@ -74,12 +74,12 @@ def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str
     if _like_distances(height, sensor):
         warnings.append(
             f"{name}: the border is as deep as anything, and the inside is not, as in a map of distances to the gel; if it is "
-            f"one, give the distances at rest less these, as {highest:.4g} - heights"
+            f"one, give the distances at rest less these, as {highest:.4g} - depths"
         )
     as_pixels = f"if they are pixels times 0.001, multiply by {1e3 * sensor.pixel_pitch[0]:.4g}, pixel_pitch_mm"
     if highest > _DEEPEST * most:
         warnings.append(
-            f"{name}: heights up to {1e3 * highest:.2f} mm exceed the sensor's max_penetration_mm, {1e3 * most:g}; {as_pixels}"
+            f"{name}: depths up to {1e3 * highest:.2f} mm exceed the sensor's max_penetration_mm, {1e3 * most:g}; {as_pixels}"
             f"{', or else ' + units if (units := _likely_units(highest, sensor)) else ''}"
         )
     elif _too_steep(height, sensor):
@@ -88,19 +88,19 @@ def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str
         )
     elif 0 < highest < _SHALLOWEST * most:
         warnings.append(
-            f"{name}: heights up to {1e6 * highest:.2g} micrometres only; are they in metres, or 16-bit micrometres?"
+            f"{name}: depths up to {1e6 * highest:.2g} micrometres only; are they in metres, or 16-bit micrometres?"
         )
     return np.maximum(height, 0).astype(np.float32)
 
 
 def _units(highest: float, sensor: Sensor) -> str:
-    """How to make metres of heights up to ``highest``."""
+    """How to make metres of depths up to ``highest``."""
     likely = _likely_units(highest, sensor)
     return f"multiply {likely}" if likely else "no usual unit makes a touch of them: give metres"
 
 
 def _likely_units(highest: float, sensor: Sensor) -> str:
-    """The units in which heights up to ``highest`` are a touch, with what makes metres of them."""
+    """The units in which depths up to ``highest`` are a touch, with what makes metres of them."""
     units = {
         "millimetres": 1e-3,
         "centimetres": 1e-2,
@@ -114,7 +114,7 @@ def _likely_units(highest: float, sensor: Sensor) -> str:
 
 
 def _noise_below(height: NDArray[np.floating], sensor: Sensor) -> bool:
-    """Whether what is negative in heights (H, W) [m] is noise of the gel at rest, about 0.
+    """Whether what is negative in depths (H, W) [m] is noise of the gel at rest, about 0.
 
     Then it is no lower than the sensor's noise makes any of as many pixels; its like above 0 is no contact; and what is as
     near to 0 as it is not mostly negative, as the gel at rest is that lies lower.
@@ -126,7 +126,7 @@ def _noise_below(height: NDArray[np.floating], sensor: Sensor) -> bool:
 
 
 def _all_noise(height: NDArray[np.floating], sensor: Sensor) -> bool:
-    """Whether heights (H, W) [m] are noise about 0 and nothing else: about as large above as below, mostly less than half of
+    """Whether depths (H, W) [m] are noise about 0 and nothing else: about as large above as below, mostly less than half of
     that, and nowhere larger than noise of their own root mean square makes any of the square of as many pixels."""
     below, above = -float(height.min()), float(height.max())
     least, most = min(below, above), max(below, above)
@@ -137,12 +137,12 @@ def _all_noise(height: NDArray[np.floating], sensor: Sensor) -> bool:
 
 
 def _extreme_noise(height: NDArray[np.floating], sensor: Sensor) -> float:
-    """The largest [m] of as many normally distributed heights (H, W) as these, as the sensor's noise makes them."""
+    """The largest [m] of as many normally distributed depths (H, W) as these, as the sensor's noise makes them."""
     return sensor.height_noise * float(np.sqrt(2 * np.log(height.size)))
 
 
 def _like_distances(height: NDArray[np.floating], sensor: Sensor) -> bool:
-    """Whether most of the border of heights (H, W) [m] is about as high as any, and something inside is lower by a touch."""
+    """Whether most of the border of depths (H, W) [m] is about as high as any, and something inside is lower by a touch."""
     lowest, highest = float(height.min()), float(height.max())
     high = border_of(height) >= highest - (highest - lowest) * _NEAR_HIGHEST
     return highest - lowest > _SHALLOWEST * sensor.max_penetration and float(high.mean()) >= _BORDER

@@ -85,9 +85,9 @@ def _pressure(depth: Array32, pitch: tuple[float, float], thickness: float = np.
     may_touch = target > 0
     spectrum, inverse = _spectrum(target.shape, pitch, thickness), _inverse(target.shape, pitch, thickness)
 
-    wanted = np.where(may_touch, target, 0)
-    pressure = np.where(may_touch, np.maximum(_displacement(wanted, inverse), 0), 0)
-    pressure *= np.vdot(pressure, wanted) / np.vdot(pressure, _displacement(pressure, spectrum))
+    allowed = np.where(may_touch, target, 0)
+    pressure = np.where(may_touch, np.maximum(_displacement(allowed, inverse), 0), 0)
+    pressure *= np.vdot(pressure, allowed) / np.vdot(pressure, _displacement(pressure, spectrum))
     direction = np.zeros_like(pressure)
     previous = 0.0  # squared residual of the last step; 0 restarts the conjugate directions
     for _ in range(_MAX_ITERATIONS):

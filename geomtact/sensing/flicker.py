@@ -14,7 +14,7 @@ from geomtact.sensing.pixels import median_of
 _STRIPS, _IN_STRIP = 5, 5  # of the image across its rows, and places in each at which rows are compared
 _LEAST = 0.004  # rms of the stripes' brightness, relative: two thirds of a grey level at most where it matters
 # By which a typical pixel's change from the background shrinks without the stripes: in all of the image, in four of five strips,
-# and in each colour. Of 220 real readings 1.06 at most, a board of pins 1.21, but 0.84 in its strips; of readings with stripes
+# and in each colour. Of 220 real images 1.06 at most, a board of pins 1.21, but 0.84 in its strips; of images with stripes
 # of 5 % 1.18 at least
 _LESS, _LESS_IN_STRIP, _LESS_IN_COLOUR = 1.1, 1.0, 0.95
 _DARKEST, _BRIGHTEST = 1 / 255, 0.98  # brightness between which a camera counts light
@@ -22,7 +22,7 @@ _MOST = 0.15  # rms that is evened out: of stripes of 20 %
 # How far a typical place's colour is off the image's own, rms of its logs. White light: 0.009 on the 9DTact; coloured lamps: 0.08
 # (a GelSight) to 0.37 in six sets. Under the bound a contact may be as grey as stripes are
 _COLOURED = 0.05
-# By which one colour's stripes may differ from those of all. Of stripes of 5 % on 34 real readings of coloured gels 32 differ by
+# By which one colour's stripes may differ from those of all. Of stripes of 5 % on 34 real images of coloured gels 32 differ by
 # less, half by 0.05; of 2,100 simulated rods, bars and ribs across gels between three lamps none that could be stripes does
 _GREY = 0.2
 

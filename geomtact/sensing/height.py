@@ -1,4 +1,4 @@
-"""How deep the gel is pressed in at each pixel of an RGB reading, for a sensor whose colours are calibrated."""
+"""How deep the gel is pressed in at each pixel of an RGB image, for a sensor whose colours are calibrated."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.sensor import Sensor
 from geomtact.sensing.slope import integrate
 
-_SOME = 0.02  # share of the image in which the gel must rest, to tell where it rests
+_SOME = 0.02  # share of the image in which the gel must rest, to find where it rests
 
 
 def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray[np.float32]:
-    """Depth of the gel's indentation in an RGB reading, by photometric stereo.
+    """Depth of the gel's indentation in an RGB image, by photometric stereo.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
     sensor = Sensor.load(sensor)
     if sensor.colour is None:
         raise SensorError(
-            f"sensor {sensor.name}: its colours are not calibrated, so a reading has no heights; press a ball of known "
+            f"sensor {sensor.name}: its colours are not calibrated, so a tactile image has no depth map; press a ball of known "
             "diameter and run 'geomtact calibrate', or use contact_mask"
         )
     image = sensor.upright(as_unit_rgb(image, "image"))

@@ -44,7 +44,7 @@ def _read_npy(data: bytes, path: Path) -> NDArray[Any]:
         )
     try:
         return np.load(io.BytesIO(data), allow_pickle=False)
-    except Exception as error:  # noqa: BLE001 -- the header is parsed as Python, which fails in more ways than are told
+    except Exception as error:  # noqa: BLE001 -- the header is parsed as Python, which fails in more ways than are documented
         raise ImageError(
             f"{path}: not a whole .npy array of numbers ({error}); save it again with numpy.save"
         ) from None

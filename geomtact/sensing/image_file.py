@@ -62,7 +62,7 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
 
 
 def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] | None = None) -> None:
-    """Write a PNG: a mask as 0/255, a height map [m] as 16-bit micrometres, an RGB image (uint8) as it is.
+    """Write a PNG: a mask as 0/255, a depth map [m] as 16-bit micrometres, an RGB image (uint8) as it is.
 
     ``metadata``: ``object``, ``unit``, ``sensor``, ``T_sensor_object`` (4, 4), with or without the prefix ``geomtact:`` that they
     carry in the file.
@@ -75,13 +75,13 @@ def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] 
     elif array.dtype.kind == "f" and array.ndim == 2:
         if not np.isfinite(array).all() or array.min(initial=0) < 0 or array.max(initial=0) > 0.0655:
             raise ImageError(
-                f"heights to write: expected 0 to 0.0655 m, got {array.min():g} to {array.max():g}; give metres"
+                f"depths to write: expected 0 to 0.0655 m, got {array.min():g} to {array.max():g}; give metres"
             )
         pixels = np.round(array * 1e6).astype(np.uint16)
     elif array.dtype == np.uint8 and array.ndim in (2, 3):
         pixels = array
     else:
-        raise ImageError(f"cannot write {array.dtype} {array.shape}: give a bool mask, float heights [m] or uint8 RGB")
+        raise ImageError(f"cannot write {array.dtype} {array.shape}: give a bool mask, float depths [m] or uint8 RGB")
     info = PngImagePlugin.PngInfo()
     for key, value in (metadata or {}).items():
         text = value if isinstance(value, str) else json.dumps(np.asarray(value).tolist())

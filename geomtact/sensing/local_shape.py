@@ -1,4 +1,4 @@
-"""From an RGB reading to the contact mask (the thesis's local shape), without a calibration of the lights.
+"""From an RGB image to the contact mask (the thesis's local shape), without a calibration of the lights.
 
 The difference from the background is taken as a linear image of the gel's slope. Its two strongest colour directions
 span the slope; the 2x2 map that is left unknown is the one that makes the slope field a gradient (free of curl). Its
@@ -27,7 +27,9 @@ from geomtact.sensing.slope import integrate, of_gradient, slope_field
 BySlope = Callable[[Array, Mask, Mask, float, Array], tuple[Array, Mask]]  # slope, felt, strong, sigma, pitch
 
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
-_PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated readings of many gels and lamps
+_PRESSED = (
+    0.3  # of the largest pressure, that counts as contact: the best in simulated tactile images of many gels and lamps
+)
 _ONE_COLOUR = 0.03  # power of the second colour over that of the first, under which there is but one: a white gel's
 _EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse, from which on slopes are seen
 _HARDLY_LESS = 0.1  # of the fastest fall, by which others fall less fast that count too
@@ -39,7 +41,7 @@ _NEARLY_WHITE, _UNTOLD = 0.95, 0.01
 
 class _Colours(NamedTuple):
     """Powers (3,), ascending, and directions (3, 3) in columns of the colours along which an image changes; and whether it is but
-    one, as of a white gel, which tells no slope."""
+    one, as of a white gel, which gives no slope."""
 
     power: Array
     directions: Array
@@ -47,12 +49,12 @@ class _Colours(NamedTuple):
 
 
 class FoundContact(NamedTuple):
-    """A contact as found in a reading.
+    """A contact as found in a tactile image.
 
     Attributes
     ----------
     mask : (H, W) bool, where the object touches
-    probability : (H, W) float32 that each pixel is in contact; None where ``method`` does not tell it
+    probability : (H, W) float32 that each pixel is in contact; None where ``method`` does not give it
     method : by which it was found, one of ``CONTACT_METHODS`` but "auto"; "classical" where all change is along one colour
     """
 
@@ -64,7 +66,7 @@ class FoundContact(NamedTuple):
 def contact_mask(
     image: Any, background: Any = None, sensor: Sensor | str | None = None, method: str | None = None
 ) -> Mask:
-    """Where the object touches, in an RGB reading.
+    """Where the object touches, in an RGB image.
 
     Parameters
     ----------
@@ -73,8 +75,8 @@ def contact_mask(
         which serves for contacts much smaller than the window
     sensor : gives the pixel pitch where columns and rows differ, the size to check, and how the camera is mounted; None: square
         pixels
-    method : "classical": within the rim where the gel is steepest, by its slope, which colours tell up to a factor; "pressure":
-        where, by that slope, a thick elastic gel is pressed on; "learned": by a network trained on simulated readings alone;
+    method : "classical": within the rim where the gel is steepest, by its slope, which colours give up to a factor; "pressure":
+        where, by that slope, a thick elastic gel is pressed on; "learned": by a network trained on simulated images alone;
         or "auto": learned where more than a hundredth of what changes is blown out, else classical. On a white gel, all of
         whose change is along one colour, each takes what changes more than half as much as anywhere. None: as the sensor
         says, "auto" without one
@@ -104,7 +106,7 @@ def contact_mask(
 def find_contact(
     image: Any, background: Any = None, sensor: Sensor | str | None = None, method: str | None = None
 ) -> FoundContact:
-    """As :func:`contact_mask`, of images in the sensor frame and without flickering light, with what else is known of how it was
+    """As :func:`contact_mask`, of images in the sensor frame and without flickering light, with how it was
     found."""
     if method is not None and method not in CONTACT_METHODS:
         raise UsageError(f"contact_mask: no method named {method!r}{nearest_name(str(method), CONTACT_METHODS)}")
@@ -155,7 +157,7 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
 
 
 def on_grid(image: Array) -> Array:
-    """``image`` (H, W, 3) on ``GRID`` pixels along its shorter side: finer ones tell nothing that smoothing leaves."""
+    """``image`` (H, W, 3) on ``GRID`` pixels along its shorter side: smoothing leaves nothing of finer ones."""
     share = min(1.0, GRID / min(image.shape[:2]))
     size = [round(share * n) for n in image.shape[1::-1]]
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
@@ -177,7 +179,7 @@ def _colours(change: Array, felt: Mask) -> _Colours:
 def _by_colour(
     change: Array, colours: _Colours, felt: Mask, strong: Mask, sigma: float, pitch: Array, by_slope: BySlope
 ) -> tuple[Array, Mask]:
-    """How much the gel is pressed in (H, W), up to a factor, and the contact: by its slope, where colours tell that."""
+    """How much the gel is pressed in (H, W), up to a factor, and the contact: by its slope, where colours give that."""
     if colours.one:
         return _half_as_large(_one_way(change @ colours.directions[:, 2], felt), felt)
     plane = transformed(change, (colours.directions[:, 1:] / np.sqrt(colours.power[1:])).T)

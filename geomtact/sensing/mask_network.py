@@ -1,7 +1,7 @@
-"""The network that tells the contact from a change of colour: a small U-Net, trained on simulated readings alone.
+"""The network that finds the contact in a change of colour: a small U-Net, trained on simulated tactile images alone.
 
-Where a channel is as bright as it can be, its change tells no slope; near a lamp the same slope changes it more than far off. So
-it is said, too, how much of each pixel is blown out, and how the gel is lit at rest.
+Where a channel is as bright as it can be, its change gives no slope; near a lamp the same slope changes it more than far off. So
+its input also holds how much of each pixel is blown out, and how the gel is lit at rest.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How a membrane bulges: what presses of two balls of different size tell of it, and one ball alone does not."""
+"""How a membrane bulges: what presses of two balls of different size determine, and those of one ball do not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geomtact.errors import InputError
 from geomtact.se3 import Array
-from geomtact.sensing.calibrate import Calibrated, samples_on, told_diameter, weights_of
+from geomtact.sensing.calibrate import SensorCalibration, diameter_from_colours, samples_on, weights_of
 from geomtact.sensing.press import Press
 from geomtact.sensing.sensor import Sensor
 
@@ -23,12 +23,12 @@ _RESAMPLED = 400
 
 
 def membrane_curvature(
-    first: Calibrated, first_ball: float, second: Calibrated, second_ball: float
+    first: SensorCalibration, first_ball: float, second: SensorCalibration, second_ball: float
 ) -> tuple[float, float]:
     """How a membrane bulges, from presses of two balls of different size: its curvature [1/m], and the standard deviation.
 
     Taken for flat, a membrane that bulges takes so much off the curvature of every ball, which one ball alone leaves unnoticed:
-    its colours are fitted to what they are said to show. Of two balls each is then measured wrongly by the other's colours, the
+    its colours are fitted to what they are stated to show. Of two balls each is then measured wrongly by the other's colours, the
     larger one as too large. The curvature sought is that with which neither is.
 
     Parameters
@@ -39,11 +39,11 @@ def membrane_curvature(
     Raises
     ------
     InputError
-        The balls are of nearly one size, which tells nothing; or tell a bulge that no window of this size has, or a hollow.
+        The balls are of nearly one size, which determines nothing; or give a bulge that no window of this size has, or a hollow.
     """
     if max(first_ball, second_ball) < _UNLIKE * min(first_ball, second_ball):
         raise InputError(
-            f"balls of {1e3 * first_ball:g} and {1e3 * second_ball:g} mm tell nothing of the membrane: one should be "
+            f"balls of {1e3 * first_ball:g} and {1e3 * second_ball:g} mm determine nothing of the membrane: one should be "
             f"{_UNLIKE:g} times as large as the other, or larger"
         )
     balls = ((first.presses, 0.5 * first_ball), (second.presses, 0.5 * second_ball))
@@ -58,7 +58,7 @@ def membrane_curvature(
     for _ in range(_STEPS):
         bent = _told_by_the_other(balls, replace(first.sensor, membrane_radius=bend))
         a, b = (there - here for here, there in zip(flat, bent, strict=True))
-        # by what is told of the larger ball, for a curvature of one
+        # by the diameter of the larger ball, for a curvature of one
         gained = float(np.nanmedian(b) - np.nanmedian(a)) * bend
         bend = 1 / max(curvature(every), 1 / bend / _STEPS)
         if not bend > _LEAST_BEND * half_diagonal:
@@ -78,9 +78,9 @@ def membrane_curvature(
 
 
 def _told_by_the_other(balls: Sequence[tuple[Sequence[Press], float]], sensor: Sensor) -> list[Array]:
-    """For either ball the log of its diameter on each press, as the colours tell that the other's presses give, over its own."""
+    """For either ball the log of its diameter on each press, by the colours fitted to the other's presses, over its own."""
     weights = [weights_of([samples_on(press, sensor, radius) for press in presses]) for presses, radius in balls]
     return [
-        np.log([told_diameter(press, sensor, other) / (2 * radius) for press in presses])
+        np.log([diameter_from_colours(press, sensor, other) / (2 * radius) for press in presses])
         for (presses, radius), other in zip(balls, reversed(weights), strict=True)
     ]

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 
 _LEAST = 0.3e-6  # m^2 that a patch has to have to count
 
 
-def patches(mask: Shown, pixel_area: float, most: int | None = None) -> list[Shown]:
+def patches(mask: SoftMask, pixel_area: float, most: int | None = None) -> list[SoftMask]:
     """``mask`` (h, w), of pixels of ``pixel_area`` [m^2], with one of its patches of 0.3 mm^2 or more alone; the largest first,
     ``most`` of them.
 

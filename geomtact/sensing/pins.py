@@ -1,4 +1,4 @@
-"""The pixel pitch of a sensor from one image of a board of pins a known way apart, pressed into the gel."""
+"""The pixel pitch of a sensor from one image of a board of pins a given distance apart, pressed into the gel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SPACINGS = 1e-4, 2e-2  # m that pins may be apart
 
 @dataclass(frozen=True, eq=False)
 class PinBoard:
-    """What an image of a pin board tells.
+    """What an image of a pin board measures.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ def pixel_pitch_of_pins(image: Any, background: Any, spacing: float) -> PinBoard
     """The pitch in the middle of the image, from a square board of pins whose rows run along the image's, to some degrees.
 
     Where each pin is in the image is a polynomial of where it is on the board, which takes up the lens's distortion; its slope in
-    the middle tells the pitch.
+    the middle is the pitch.
 
     Parameters
     ----------
@@ -125,14 +125,14 @@ def _in_grid(peaks: Array, middle: Array) -> tuple[NDArray[np.int64], NDArray[np
         return none
     start = int(np.linalg.norm(peaks - middle, axis=1).argmin())
     off = peaks - peaks[start]
-    ways = []
+    sides = []
     for direction in np.eye(2):  # the nearest peak that lies mainly along this way
         along = off @ direction
         ahead = np.flatnonzero(along > 0.9 * np.linalg.norm(off, axis=1) + 1e-9)
         if not len(ahead):
             return none
-        ways.append(off[ahead[along[ahead].argmin()]])
-    place, steps, todo = {start: (0, 0)}, {start: np.array(ways)}, [start]
+        sides.append(off[ahead[along[ahead].argmin()]])
+    place, steps, todo = {start: (0, 0)}, {start: np.array(sides)}, [start]
     while todo:
         here = todo.pop(0)
         for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
@@ -150,7 +150,7 @@ def _in_grid(peaks: Array, middle: Array) -> tuple[NDArray[np.int64], NDArray[np
 
 
 def _powers(n: int) -> NDArray[np.int64]:
-    """Powers (m, 2) of x and y in the polynomial that ``n`` pins can tell."""
+    """Powers (m, 2) of x and y in the polynomial that ``n`` pins determine."""
     degree = 5 if n >= _MANY else 3
     return np.array([(i, k - i) for k in range(degree + 1) for i in range(k, -1, -1)])
 
@@ -162,9 +162,9 @@ def _terms(at: Array, powers: NDArray[np.int64]) -> Array:
 
 def _slopes(solved: Array, at: Array, powers: NDArray[np.int64]) -> Array:
     """Slopes (2, 2) of a polynomial (m, 2) at (2,): d (column, row) by d (along x, along y) of the board."""
-    ways = []
+    slopes = []
     for axis in (0, 1):
         less = powers.copy()
         less[:, axis] = np.maximum(less[:, axis] - 1, 0)
-        ways.append((powers[:, axis] * _terms(at[None], less)[0]) @ solved)
-    return np.stack(ways, 1)
+        slopes.append((powers[:, axis] * _terms(at[None], less)[0]) @ solved)
+    return np.stack(slopes, 1)

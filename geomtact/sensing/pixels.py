@@ -29,14 +29,14 @@ def size_of(change: Array) -> Array:
 
 
 def median_of(values: NDArray[Any]) -> float:
-    """The median of ``values`` (n,), none of them NaN, as ``np.median`` tells it in several times the time."""
+    """The median of ``values`` (n,), none of them NaN, in a fraction of ``np.median``'s time."""
     below = (len(values) - 1) // 2
     parted = np.partition(values, below)
     return float(parted[below] if len(values) % 2 else np.mean([parted[below], parted[below + 1 :].min()]))
 
 
 def pixels_apart(sigma: float) -> int:
-    """Pixels from one to the next that tells something else, where all are smoothed by ``sigma``; an odd number."""
+    """Pixels from one to the next that is independent, where all are smoothed by ``sigma``; an odd number."""
     return 2 * round(0.75 * sigma) + 1
 
 

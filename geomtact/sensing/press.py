@@ -1,4 +1,4 @@
-"""Presses of a ball: where in a reading its imprint lies, and why some readings show none."""
+"""Presses of a ball: where in a tactile image its imprint lies, and why some tactile images show none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one image of the sensor says: a mask, a height map or an RGB reading becomes a contact."""
+"""What one image of the sensor says: a mask, a depth map or an RGB image becomes a contact."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import ImageError, UsageError, nearest_name
 from geomtact.sensing.change import as_unit_rgb, check_size, smooth_background
-from geomtact.sensing.checks import faults, unlike_calibrated
 from geomtact.sensing.contact import FAINT, Contact, border_of
 from geomtact.sensing.depth_map import depths_of
 from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
 from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.height import height_of
+from geomtact.sensing.image_faults import faults, unlike_calibrated
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 from geomtact.sensing.local_shape import contact_mask, find_contact, on_grid
 from geomtact.sensing.sensor import Sensor
@@ -25,7 +25,7 @@ from geomtact.sensing.sensor import Sensor
 __all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observation", "write_image"]
 
 KINDS = ("auto", "mask", "height", "reading")
-_DUST = 0.1e-6  # m^2 of contact, under which a touch tells nothing (docs/stability.md)
+_DUST = 0.1e-6  # m^2 of contact, under which a touch constrains nothing (docs/stability.md)
 _SPECKS = 100  # pieces and holes no larger than dust, that a mask of one touch has at most
 # share in contact of a mask that may be a negative, if all of its border is, or most of it
 _NEGATIVE, _NEGATIVE_MOST, _BORDER = 0.5, 0.85, 0.8
@@ -42,7 +42,7 @@ class Observation:
     kind : "mask", "height" or "reading", as given or as decided
     warnings : what was assumed on the way, one line each
     image : the array as read: (H, W) or (H, W, 3), alpha dropped
-    method : by which the contact was found in a reading, one of ``CONTACT_METHODS`` but "auto"; None for other kinds
+    method : by which the contact was found in a tactile image, one of ``CONTACT_METHODS`` but "auto"; None for other kinds
     """
 
     contact: Contact
@@ -63,15 +63,15 @@ def read_observation(
     Parameters
     ----------
     image : path or array. ``auto`` takes bool or two-valued as a mask; float (H, W) as a height [m]; 16-bit grey as a
-        height in micrometres; three channels, RGB, uint8 or float 0..1, as a reading; other grey as a reading
+        height in micrometres; three channels, RGB, uint8 or float 0..1, as a tactile image; other grey as a tactile image
     sensor : whose image it is; another size is an error
     kind : "auto", "mask", "height" or "reading"
-    background : for a reading, the same sensor without contact
+    background : for a tactile image, the same sensor without contact
 
     Raises
     ------
     ImageError
-        Unreadable, of another size, not finite, negative heights, heights in another unit.
+        Unreadable, of another size, not finite, negative depths, depths in another unit.
     SensorError, UsageError
         No such sensor; no such ``kind``.
     """
@@ -98,7 +98,7 @@ def read_observation(
         contact = Contact.of_height(height)
         if not np.array_equal(contact.mask, height > FAINT * height.max()):
             warnings.append(
-                f"{name}: the heights fade away, as beside a contact; what is over half as deep counts as contact"
+                f"{name}: the depths fade away, as beside a contact; what is over half as deep counts as contact"
             )
     else:
         contact, method = _reading(array, name, sensor, background, warnings)
@@ -107,14 +107,14 @@ def read_observation(
         warnings.append(f"{name}: every pixel is in contact: the contact fills the image, so its outline is not seen")
     elif kind == "mask" and (specks := _specks(contact.mask, sensor)) > _SPECKS:
         warnings.append(
-            f"{name}: the mask has {specks} specks and holes as small as dust, as noise has; smooth it, or give the reading"
+            f"{name}: the mask has {specks} specks and holes as small as dust, as noise has; smooth it, or give the tactile image"
         )
     elif kind == "mask" and _perhaps_negative(contact.mask, share):
         warnings.append(
             f"{name}: {100 * share:.0f} % of the mask is contact; if that is where nothing touches, invert it"
         )
     elif 0 < area < _DUST:
-        warnings.append(f"{name}: the contact covers {1e6 * area:.2g} mm2, as dust does: it tells next to nothing")
+        warnings.append(f"{name}: the contact covers {1e6 * area:.2g} mm2, as dust does: it hardly constrains the pose")
     return Observation(contact, kind, warnings, array, method)
 
 
@@ -256,16 +256,16 @@ def _mask(array: NDArray[Any], name: str, warnings: list[str]) -> NDArray[np.boo
 def _reading(
     array: NDArray[Any], name: str, sensor: Sensor, background: Any, warnings: list[str]
 ) -> tuple[Contact, str]:
-    """The contact in a reading, and the method by which it was found."""
+    """The contact in a tactile image, and the method by which it was found."""
     reference = None
     _check_light(array, name)
     if background is None:
-        untold = "" if sensor.colour is None else ", and heights are not told without one"
-        warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself{untold}")
+        no_depths = "" if sensor.colour is None else ", and there is no depth map without one"
+        warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself{no_depths}")
     else:
         label, reference = _load(background, "background", warnings)
         reference = _in_sensor_frame(reference, background, label, "reading", sensor, warnings)
-        check_size(reference, sensor, label, "take it with the camera settings of the reading")
+        check_size(reference, sensor, label, "take it with the camera settings of the image")
         _check_light(reference, label)
         reference = _rgb(reference, label)
     seen = _rgb(array, name)
@@ -286,13 +286,13 @@ def _reading(
     touch = find_contact(seen, reference, sensor)
     if touch.method != sensor.contact_method != "auto":
         warnings.append(
-            f"{name}: all change is along one colour, which tells no slope, so the {sensor.contact_method} way cannot be taken; "
+            f"{name}: all change is along one colour, which gives no slope, so {sensor.contact_method} cannot be used; "
             "what changes more than half as much as anywhere counts as contact"
         )
     height = None
     if sensor.colour is not None and reference is not None:
         if grey:
-            warnings.append(f"{name}: the image is grey, so the sensor's colours tell no heights: give it in colour")
+            warnings.append(f"{name}: the image is grey, so the sensor's colours give no depth map: give it in colour")
         else:
             height = height_of(seen, reference, sensor)
             warnings.extend(f"{name}: {fault}" for fault in unlike_calibrated(reference, sensor.colour))
@@ -315,7 +315,7 @@ def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:
         if array.min() < 0 or array.max() > 255:
             raise ImageError(
                 f"{name}: a reading of {array.dtype} must lie in 0..255, got {array.min()} to {array.max()}; give uint8 or "
-                "uint16, or heights as uint16 (micrometres) with --kind height"
+                "uint16, or depths as uint16 (micrometres) with --kind height"
             )
         array = array.astype(np.uint8)
     elif array.dtype == bool:

@@ -24,7 +24,12 @@ from geomtact.sensing.sensor_file import toml_text, toml_values
 
 _FOREIGN = (".yaml", ".yml", ".json")  # of files that other makers' programs read
 HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
-CONTACT_METHODS = ("auto", "classical", "pressure", "learned")  # of finding the contact in a reading, the default first
+CONTACT_METHODS = (
+    "auto",
+    "classical",
+    "pressure",
+    "learned",
+)  # of finding the contact in a tactile image, the default first
 
 
 _ALIKE = 0.02  # by which a camera's frame may be wider or narrower than the image that is cut out of it
@@ -44,8 +49,8 @@ class Sensor:
     max_penetration : how far an object can press into the gel
     membrane_radius : 0 means flat; otherwise the gel bulges towards the object with this radius
     housing_depth : how far the object may reach below z = 0 outside the window; None rules nothing out
-    height_noise : standard deviation of its heights, beside a twentieth of each
-    contact_method : one of ``CONTACT_METHODS``, which finds the contact in its readings
+    height_noise : standard deviation of its depths, beside a twentieth of each
+    contact_method : one of ``CONTACT_METHODS``, which finds the contact in its tactile images
     camera_rotation_deg : counter-clockwise rotation from the camera's image to the sensor's: 0, 90, 180 or 270; image_size_px is
         the size after it
     camera_mirrored : whether it is mirrored left to right before that
@@ -53,7 +58,7 @@ class Sensor:
     driver_rotation_deg : by which the maker's driver turns what the camera delivers; images with width and height exchanged are
         taken to come straight from the camera, and are turned so before all else
     note : where the figures come from
-    colour : how its colours tell the gel's slope; None where that is not calibrated
+    colour : the gel's slope by its colours; None where that is not calibrated
     border_fraction : share of the camera's frame that is cut off at each side before it is scaled to the image
     """
 
@@ -181,7 +186,7 @@ class Sensor:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the geometry (not of the note, nor of how its readings are read)."""
+        """Hash of the geometry (not of the note, nor of how its tactile images are read)."""
         geometry = [getattr(self, f.name) for f in fields(self) if f.compare]
         return hashlib.sha256(repr(geometry).encode()).hexdigest()
 

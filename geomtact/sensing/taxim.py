@@ -2,7 +2,7 @@
 
 A table says by how much each channel gets brighter for a slope of the gel, in bins of its steepness (0 to 90 degrees) and its
 direction (-180 to 180, from along the columns towards along the rows), as a polynomial of second degree in the pixel's column
-and row. That is the other way round than :class:`ColourTable` tells it, which is fitted to what the table shows.
+and row. That is the other way round than that of :class:`ColourTable`, which is fitted to what the table shows.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def read_table(path: str | Path) -> Array:
 
 
 def change_of(table: Array, slope: Array, u: NDArray, v: NDArray) -> Array:
-    """The change of colour (n, 3), 0..1, that a table tells of slopes (n, 2), of depth along columns and along rows, at columns
+    """The change of colour (n, 3), 0..1, that a table gives for slopes (n, 2), of depth along columns and along rows, at columns
     ``u`` (n,) and rows ``v`` (n,)."""
     last = len(table) - 1
     steep = np.arctan(np.hypot(*slope.T)) / (0.5 * np.pi) * last
@@ -68,7 +68,7 @@ def colours_of_taxim(path: str | Path, shape: tuple[int, int]) -> ColourTable:
     u, v = rng.uniform(0, w, _PLACES), rng.uniform(0, h, _PLACES)
     steep, towards = np.tan(rng.uniform(0, _STEEPEST, _PLACES)), rng.uniform(-np.pi, np.pi, _PLACES)
     slope = steep[:, None] * np.stack([np.cos(towards), np.sin(towards)], 1)
-    # what is no slope in a reading has the background's colour, and so has it here
+    # what is no slope in a tactile image has the background's colour, and so has it here
     change = change_of(table, slope, u, v) - change_of(table, 0 * slope, u, v)
     features, fitted = terms(change, u, v, shape), np.arange(_PLACES) % 2 == 0
     weights = fit_weights(features[fitted], slope[fitted])

@@ -15,7 +15,7 @@ from geomtact.files import write_text, write_whole
 from geomtact.scoring.encoder import ARCHITECTURE
 from geomtact.scoring.network import Encoder
 from geomtact.training.augment import AUGMENTATIONS
-from geomtact.training.scenes import Scene
+from geomtact.training.scenes import TrainingScene
 from geomtact.training.train import Curve, Settings
 from geomtact.versions import versions
 
@@ -23,14 +23,19 @@ SCHEMA = "geomtact/encoder/1"
 
 
 def write_encoder(
-    path: Path, network: Encoder, curve: Curve, settings: Settings, scenes: Sequence[Scene], data: dict[str, Any]
+    path: Path,
+    network: Encoder,
+    curve: Curve,
+    settings: Settings,
+    scenes: Sequence[TrainingScene],
+    data: dict[str, Any],
 ) -> None:
     """Write ``path`` (safetensors, half precision), and beside it the card (.json) and the curves (.png).
 
     ``data`` says where the scenes come from; weights for one ``part`` on one ``sensor`` say so in their metadata too.
     """
-    known = ("part", "part_sha256", "sensor", "sensor_sha256")
-    meta = {"architecture": ARCHITECTURE} | {key: str(data[key]) for key in known if key in data}
+    keys = ("part", "part_sha256", "sensor", "sensor_sha256")
+    meta = {"architecture": ARCHITECTURE} | {key: str(data[key]) for key in keys if key in data}
     card = {
         "data": data
         | {

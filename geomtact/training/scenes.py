@@ -1,7 +1,7 @@
-"""What a network learns from: touches of a part beside the stored contacts of the cells that hold them.
+"""What a network learns from: touches of an object beside the stored contacts of the cells that hold them.
 
-A scene is one part on one sensor with the grid that a localizer would choose, but for the disks about its faces: what is told
-apart in a wide cell is in a narrow one, too. Of its rotations a few are drawn. Their
+A scene is one object on one sensor with the grid that a localizer would choose, but for the disks about its faces: what is
+distinguished in a wide cell is in a narrow one, too. Of its rotations a few are drawn. Their
 stored contacts are what the network has to tell apart; the touches are drawn within the cells, tilted, turned, shifted
 and pressed by up to half a grid step, rigid and elastic.
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from geomtact.contact_space.build import choose_resolution, places
-from geomtact.contact_space.heightmap import NOTHING, Frame, HeightMap, Window
+from geomtact.contact_space.heightmap import NOTHING, HeightMap, Lattice, Window
 from geomtact.contact_space.index import pack
 from geomtact.contact_space.resolution import Resolution
 from geomtact.contact_space.touch import LEAST_CONTACT, MARGIN, elastic_in_window
@@ -28,15 +28,15 @@ from geomtact.se3 import Array
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
 
-DIRECTIONS, TURNS, TILTS = 12, 4, 4  # drawn of a part; turns and tilted views of each direction
+DIRECTIONS, TURNS, TILTS = 12, 4, 4  # drawn of an object; turns and tilted views of each direction
 TOUCHES = 6  # of each tilted view
 _PLACES = 120  # of a rotation at most
 KEY_SHAPE, TOUCH_SHAPE = (24, 32), (48, 64)
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Contacts of a part, masks packed into words and, for tall windows, mirrored about the diagonal to lie.
+class TrainingScene:
+    """Contacts of an object, masks packed into words and, for tall windows, mirrored about the diagonal to lie.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Scene:
     cell: NDArray[np.float32]
 
 
-def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Generator) -> Scene:
+def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Generator) -> TrainingScene:
     """A scene of ``mesh`` on ``sensor``, with a grid of the level and the step that ``max_poses`` affords."""
     symmetry = Symmetry("none", np.eye(4)[None], None, np.zeros(3))
     mesh = replace(mesh, symmetry=symmetry)
@@ -76,7 +76,7 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
         n_turns = int(directions.turns[k])
         for j in rng.choice(n_turns, TURNS, replace=False):
             turn = 2 * np.pi * j / n_turns
-            cell, centres, share = places(there, turn, view.frame, view.window)
+            cell, centres, share = places(there, turn, view.lattice, view.window)
             some = np.sort(rng.permutation(len(cell))[:_PLACES])
             if not len(some):
                 continue
@@ -100,7 +100,7 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
                 t = (t + 1) % TILTS
             total += share.size
     mass = np.concatenate(weight).astype(np.float64)
-    return Scene(
+    return TrainingScene(
         np.concatenate(stored),
         (mass / mass.sum()).astype(np.float32),
         np.array(touches, np.uint64),
@@ -118,7 +118,7 @@ class _View:
         self.mesh, self.sensor, self.resolution = mesh, sensor, resolution
         self.caster = Caster(mesh.vertices, mesh.faces)
         self.reach = mesh.reach
-        self.frame = Frame.make(self.reach, sensor, resolution.step)
+        self.lattice = Lattice.make(self.reach, sensor, resolution.step)
         self.window = Window(sensor, resolution.mask_shape, resolution.penetrations)
         self.margin = 2.1 * float(np.hypot(*sensor.half_window)) * (1 + 2 * MARGIN) + 2 * resolution.step
         h, w = sensor.along(TOUCH_SHAPE)
@@ -144,7 +144,7 @@ class _View:
         self, there: HeightMap, R: Array, psi: float, cell: int, level: int, rng: np.random.Generator
     ) -> Array | None:
         """How deep (h, w) [m] the object presses somewhere in a cell, beyond the window too; None without contact."""
-        ny, nx = self.frame.cells
+        ny, nx = self.lattice.cells
         step = self.resolution.step
         centre = (np.array([cell % nx - nx // 2, cell // nx - ny // 2]) + rng.uniform(-0.5, 0.5, 2)) * step
         # the object stands turned by psi from R, and the map by what facing() makes of its direction

@@ -26,7 +26,7 @@ _FREE = ("rate",)  # a setting that a resumed run may change
 
 
 def whose(mesh: Mesh, sensor: Sensor) -> dict[str, str]:
-    """What weights for one part on one sensor say of themselves."""
+    """What weights for one object on one sensor say of themselves."""
     return {
         "part": mesh.name,
         "part_sha256": mesh.sha256,
@@ -43,17 +43,17 @@ def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
     InputError
         It holds another training.
     """
-    path, wanted = folder / _RECIPE, json.loads(json.dumps(recipe))
+    path, expected = folder / _RECIPE, json.loads(json.dumps(recipe))
     if path.exists():
         held = json.loads(path.read_text("utf-8"))
-        if held != wanted:
-            other = ", ".join(key for key in wanted if held.get(key) != wanted[key]) or "what it learns from"
+        if held != expected:
+            other = ", ".join(key for key in expected if held.get(key) != expected[key]) or "what it learns from"
             raise InputError(
                 f"{folder}: holds another training ({other} differs); give another folder with --work, or remove this one"
             )
         return
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps(wanted, indent=1) + "\n")
+    write_text(path, json.dumps(expected, indent=1) + "\n")
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:

@@ -1,10 +1,10 @@
-"""Trains the shared encoder: the cell that holds a touch is to get the largest posterior among all cells of its part.
+"""Trains the shared encoder: the cell that holds a touch is to get the largest posterior among all cells of its object.
 
 The loss is minus the information gained about the true cell, in nats,
 
     loss = -( s_true - log sum_j w_j exp(s_j) ),    s_j = -|f(touch) - g(stored_j)|^2,
 
-with the stored contacts j of the same part and the uniform measure w_j of their cells: noise-contrastive estimation with
+with the stored contacts j of the same object and the uniform measure w_j of their cells: noise-contrastive estimation with
 the prior as noise (van den Oord et al. 2018). Its minimum is the true log likelihood, so what is learned is the score
 that a posterior needs, for contacts that differ by as much as a grid cell lets them.
 """
@@ -28,7 +28,7 @@ from geomtact.scoring.precision import autocast
 from geomtact.sensing.moments import without_specks
 from geomtact.training.augment import augmented
 from geomtact.training.loop import descend, steps
-from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, Scene
+from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, TrainingScene
 from geomtact.training.state import begin_with, resume, save_state
 
 
@@ -39,7 +39,7 @@ class Settings:
     steps: int = 4000
     scenes_a_step: int = 3
     touches: int = 160  # of a scene, at most; half of them felt by an elastic gel
-    stored: int = 3000  # contacts of a scene that each touch is told from, at most
+    stored: int = 3000  # contacts of a scene that each touch is compared with, at most
     rate: float = 2e-3
     weight_decay: float = 1e-3
     width: int = 512
@@ -58,7 +58,7 @@ class Curve:
 
 
 def train(
-    scenes: list[Scene],
+    scenes: list[TrainingScene],
     settings: Settings,
     folder: Path,
     progress: Progress | None = None,
@@ -106,12 +106,12 @@ def train(
             gains = []
             save_state(folder, network, optimizer, asdict(settings), step + 1, asdict(curve))
         if progress:
-            known = f", {curve.validation[-1]:.2f} nats on unseen scenes" if curve.validation else ""
-            progress((step + 1) / settings.steps, f"training the encoder{known}")
+            validated = f", {curve.validation[-1]:.2f} nats on unseen scenes" if curve.validation else ""
+            progress((step + 1) / settings.steps, f"training the encoder{validated}")
     return network.eval(), curve
 
 
-def validate(network: Encoder, scenes: list[Scene], settings: Settings) -> float:
+def validate(network: Encoder, scenes: list[TrainingScene], settings: Settings) -> float:
     """Mean gain [nats] on ``scenes``; the same touches and noise every time."""
     network.eval()
     rng = np.random.default_rng([settings.seed, 1 << 40])
@@ -120,7 +120,7 @@ def validate(network: Encoder, scenes: list[Scene], settings: Settings) -> float
 
 
 def scene_gain(
-    network: Encoder, scene: Scene, settings: Settings, rng: np.random.Generator, flipped: bool = True
+    network: Encoder, scene: TrainingScene, settings: Settings, rng: np.random.Generator, flipped: bool = True
 ) -> torch.Tensor:
     """Information gained (t,) [nats] about the true cells of some touches of a scene."""
     touches, stored, true, log_w = _batch(scene, settings, rng, flipped)
@@ -134,7 +134,7 @@ def scene_gain(
 
 
 def _batch(
-    scene: Scene, settings: Settings, rng: np.random.Generator, flipped: bool
+    scene: TrainingScene, settings: Settings, rng: np.random.Generator, flipped: bool
 ) -> tuple[torch.Tensor, torch.Tensor, NDArray[np.int64], torch.Tensor]:
     """Touches (t, 24, 32), their own stored contacts and others (t + n, 24, 32), the former's ids, the latter's log weights."""
     kinds = [np.flatnonzero(scene.elastic == elastic) for elastic in (False, True)]
@@ -147,7 +147,7 @@ def _batch(
     true = scene.true[some]
     others = rng.choice(len(scene.weight), min(settings.stored, len(scene.weight)), replace=False)
     stored = _unpacked(scene.stored[np.concatenate([true, others])], KEY_SHAPE)
-    for axis in (-1, -2):  # a mirrored part is a part
+    for axis in (-1, -2):  # a mirrored object is an object
         if flipped and rng.random() < 0.5:
             touches, stored = touches.flip(axis), stored.flip(axis)
     weight = scene.weight[others]

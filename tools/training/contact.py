@@ -100,19 +100,19 @@ def train_mask(
             losses = []
             save_state(folder, network, optimizer, asdict(settings), step + 1, curve)
         if progress:
-            known = f", IoU {curve['validation'][-1]:.2f} on unseen parts" if curve["validation"] else ""
-            progress((step + 1) / settings.steps, f"training the mask network{known}")
+            overlap = f", IoU {curve['validation'][-1]:.2f} on unseen parts" if curve["validation"] else ""
+            progress((step + 1) / settings.steps, f"training the mask network{overlap}")
     return network.eval(), curve
 
 
 def validate(network: MaskNetwork, seen: torch.Tensor, contact: torch.Tensor) -> float:
-    """Median IoU of what is likelier in contact than not, unsmoothed, with what is, over the first reading of each press."""
+    """Median IoU of what is likelier in contact than not, unsmoothed, with what is, over the first image of each press."""
     network.eval()
     with torch.inference_mode():
-        said = torch.cat([network(seen[i : i + 64, 0].float()) > 0 for i in range(0, len(seen), 64)])
+        found = torch.cat([network(seen[i : i + 64, 0].float()) > 0 for i in range(0, len(seen), 64)])
     true = contact > 0.5
-    either = (said | true).sum((1, 2)).clamp(min=1)
-    return float(((said & true).sum((1, 2)) / either).median())
+    either = (found | true).sum((1, 2)).clamp(min=1)
+    return float(((found & true).sum((1, 2)) / either).median())
 
 
 def write_mask_network(

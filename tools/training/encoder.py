@@ -12,7 +12,7 @@ from geomtact.scoring.encoder import ARCHITECTURE
 from geomtact.sensing.sensor import Sensor
 from geomtact.training.card import write_encoder
 from geomtact.training.dataset import make_scenes
-from geomtact.training.scenes import Scene, make_scene
+from geomtact.training.scenes import TrainingScene, make_scene
 from geomtact.training.state import claim, read_weights, sha256_of
 from geomtact.training.train import Settings, train
 from tools.training.procedural import random_object
@@ -41,7 +41,7 @@ def train_encoder(
     return curve.validation[-1]
 
 
-def procedural_scene(i: int, seed: int) -> Scene:
+def procedural_scene(i: int, seed: int) -> TrainingScene:
     """Scene number ``i``: an object, a size and a number of grid poses drawn for it, on a sensor in turn."""
     rng = np.random.default_rng([seed, i])
     sensor = Sensor.load(SENSORS[i % len(SENSORS)])

@@ -1,4 +1,4 @@
-"""What the mask network learns from: random parts pressed into gels of any thickness, with the contact known."""
+"""What the mask network learns from: random objects pressed into gels of any thickness, with the contact known."""
 
 from __future__ import annotations
 
@@ -26,13 +26,16 @@ from tools.training.tactile_images import random_sight
 SHAPE = (120, 160)  # of what the camera shows
 READINGS = 4  # of each press
 PITCH = 0.125e-3  # m
-PRESSES = 12  # of each part
-SIZES = (0.5, 4.0)  # longest side of a part, in long sides of the window
-BALLS, RADII = 0.3, (1.5e-3, 12e-3)  # share of balls among the parts, and their radius [m]
+PRESSES = 12  # of each object
+SIZES = (0.5, 4.0)  # longest side of an object, in long sides of the window
+BALLS, RADII = 0.3, (1.5e-3, 12e-3)  # share of balls among the objects, and their radius [m]
 FLAT, TILT = 0.45, 0.05  # share of presses that lie on a face, and by how much that is tilted [rad]
 DEPTHS = (0.3e-3, 3.5e-3)  # m
-THICKNESS = (0.5e-3, 30e-3)  # of the gel [m]; a thin one hardly sinks beside the part
-CURVED, BULGES = 0.5, (25e-3, 120e-3)  # share of gels that bulge towards the part, and the radius of their membrane [m]
+THICKNESS = (0.5e-3, 30e-3)  # of the gel [m]; a thin one hardly sinks beside the object
+CURVED, BULGES = (
+    0.5,
+    (25e-3, 120e-3),
+)  # share of gels that bulge towards the object, and the radius of their membrane [m]
 _AROUND = 30  # px beyond what is shown, in which a part goes on
 _TRIES = 6
 _LEAST = 60  # px of contact
@@ -40,11 +43,11 @@ _LEAST = 60  # px of contact
 
 @dataclass(frozen=True)
 class Presses:
-    """Presses of one part.
+    """Presses of one object.
 
     Attributes
     ----------
-    seen : (n, ``READINGS``, ``CHANNELS``, h, w) float16, what the network sees of readings under different lamps
+    seen : (n, ``READINGS``, ``CHANNELS``, h, w) float16, what the network sees of tactile images under different lamps
     contact : (n, h, w) float16, share of each pixel in contact
     """
 
@@ -61,7 +64,7 @@ def make_presses(
 
 
 def press_part(i: int, seed: int) -> Presses:
-    """Presses of the part number ``i``: turned any way, anywhere in the window, log-uniform in depth, in the gel's thickness
+    """Presses of the object number ``i``: turned any way, anywhere in the window, log-uniform in depth, in the gel's thickness
     and in the radius of those that bulge; those that lamps do not show are left out."""
     rng = np.random.default_rng([seed, 31, i])
     h, w = (n + 2 * _AROUND for n in SHAPE)
@@ -98,7 +101,7 @@ def press_part(i: int, seed: int) -> Presses:
 
 
 def _turned(part: Mesh, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A rotation (3, 3): any, or with a face of the part nearly flat on the membrane."""
+    """A rotation (3, 3): any, or with a face of the object nearly flat on the membrane."""
     any_way = Rotation.random(random_state=int(rng.integers(1 << 31)))
     if rng.random() > FLAT:
         return any_way.as_matrix()
@@ -112,7 +115,7 @@ def _turned(part: Mesh, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _part(rng: np.random.Generator, window: float) -> Mesh:
-    """A ball, or a random part, of a size that suits a window so long [m]."""
+    """A ball, or a random object, of a size that suits a window so long [m]."""
     if rng.random() < BALLS:
         ball = trimesh.creation.icosphere(subdivisions=5, radius=np.exp(rng.uniform(*np.log(RADII))))
         return Mesh(ball.vertices, ball.faces, "ball", "m")

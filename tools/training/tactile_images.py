@@ -22,7 +22,7 @@ Image = NDArray[np.float32]
 SKIN = 2.0  # px over which the gel's coating rounds it off, at most
 ELEVATION = (6.0, 45.0)  # deg of lamps above the gel
 AMBIENT = 1.5  # of what lamps make of the untouched gel, at most
-BRIGHT = 0.35  # share of readings of which one channel is so bright that it may be blown out
+BRIGHT = 0.35  # share of tactile images of which one channel is so bright that it may be blown out
 NOISE = (0.3 / 255, 6 / 255)
 _DRAWS = 4
 
@@ -40,7 +40,7 @@ def random_reading(
     light = np.stack([lit(flat + bent, lamps), lit(flat, lamps)])
     light[0] = _dusty(np.maximum(_scattered(light[0] - light[1], rng) + light[1], 0), rng)
     shown = _photographed(light * _paint(bent, rng)[..., None], rng)
-    # each with noise of its own, the reading under light that has drifted; what is brighter than a camera tells is cut off last
+    # each with its own noise, the pressed one under light that has drifted; what is blown out is cut off last
     drift = rng.choice([0.3, 1.0, 3.0])
     shown[0] = shown[0] * rng.normal(1, 0.01 * drift, 3) + rng.normal(0, 0.005 * drift, 3) + _uneven((h, w), rng)
     noise = np.exp(rng.uniform(*np.log(NOISE)))

@@ -24,7 +24,7 @@ from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.effort import EFFORTS, Effort
 from geomtact.inference.localizer import Localizer
 from geomtact.progress import Progress
-from geomtact.scoring.calibration import calibrate, simulate_touches
+from geomtact.scoring.calibration import fit_calibration, simulate_touches
 from geomtact.scoring.catalogue import DEFAULT_SCORER, SCORERS
 from geomtact.scoring.encoder import THESIS, about
 from geomtact.scoring.fitted import SEED, TOUCHES
@@ -182,7 +182,7 @@ def prepare(
     if (way.noise, way.elastic) != (CALIBRATION_NOISE, None):
         fitted = localizer.scorer
         touches = simulate_touches(localizer.index, TOUCHES, SEED, progress, way.elastic, way.noise)
-        calibration = calibrate(fitted.scorer, localizer.index, touches)
+        calibration = fit_calibration(fitted.scorer, localizer.index, touches)
         localizer = replace(localizer, scorer=replace(fitted, calibration=calibration, cascade=None))
     known = [s for s in seconds.values() if s is not None]
     return localizer, sum(known) if len(known) == len(seconds) else None

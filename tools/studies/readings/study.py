@@ -21,7 +21,7 @@ from geomtact.errors import InputError
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.localizer import Localizer
 from geomtact.se3 import Array
-from geomtact.sensing.calibrate import Calibrated, calibrated, measured_diameter
+from geomtact.sensing.calibrate import SensorCalibration, calibrate_sensor, measured_diameter
 from geomtact.sensing.image_file import read_image
 from geomtact.sensing.local_shape import contact_mask
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
@@ -222,18 +222,18 @@ def cameras() -> dict[str, Sensor]:
     }
 
 
-def calibrations(folder: Path, sensor: Sensor) -> dict[float, Calibrated]:
+def calibrations(folder: Path, sensor: Sensor) -> dict[float, SensorCalibration]:
     """``sensor`` calibrated with the presses of each ball [mm]."""
     presses = _presses(folder)
     return {
-        ball: calibrated(
+        ball: calibrate_sensor(
             sorted((presses / f"{ball:.3f}mm").glob("*.png")), ball * MM, presses / "background.png", sensor=sensor
         )
         for ball in BALLS
     }
 
 
-def measure_balls(found: Mapping[float, Calibrated]) -> list[dict[str, float]]:
+def measure_balls(found: Mapping[float, SensorCalibration]) -> list[dict[str, float]]:
     """Each ball's diameter [mm] by its own calibration and by the other's: median, and share by which it is off."""
     out = []
     sensors = {ball: each.sensor for ball, each in found.items()}

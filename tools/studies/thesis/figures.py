@@ -18,7 +18,7 @@ from geomtact import Localizer, Sensor, load_mesh
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touches import each_touch
 from geomtact.geometry.distance import PoseDistance
-from geomtact.scoring.overlap import PixelL1, to_grid
+from geomtact.scoring.overlap import OVERLAPS, to_grid
 from geomtact.se3 import apply, exp, inverse, transform, unit
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.noise import MODERATE
@@ -42,7 +42,7 @@ def pixel_distance():
     index, distance = localizer.index, PoseDistance(mesh)
     for number, touch in enumerate(each_touch(localizer.space, 60, 2, True, MODERATE), 1):
         seen = to_grid(touch.mask, index.resolution.mask_shape)
-        differ = 1 - PixelL1().score(index, seen).reshape(-1)
+        differ = 1 - OVERLAPS["l1"].score(index, seen).reshape(-1)
         apart = -localizer.scorer.scorer.score(index, touch.mask).reshape(-1)
         first = [int(some.argmin()) for some in (differ, apart)]
         off = 1e3 * distance.mean(touch.T_sensor_object, index.poses(first))

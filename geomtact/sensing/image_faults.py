@@ -1,4 +1,4 @@
-"""What may be wrong with a reading or its background, found by holding the two against each other, coarsely."""
+"""What may be wrong with a tactile image or its background, found by holding the two against each other, coarsely."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from geomtact.sensing.colour import ColourTable, coarse
 _COARSE = 48  # pixels along the shorter side
 _DARK, _DARK_SHARE = 0.02, 0.5  # all channels below this, in more than this share of the pixels
 _BRIGHT, _BRIGHT_SHARE = 0.995, 0.4  # any channel above this
-# of colour (0..1), by which half of the pixels are off at most, but for a gain and one offset a channel: of 103 real readings
+# of colour (0..1), by which half of the pixels are off at most, but for a gain and one offset a channel: of 103 real images
 # with their own backgrounds 0.062, with those of other sensors 0.109 or more
 _UNLIKE = 0.085
-_BETTER = 0.5  # of what a reading is off as it is, that it is off otherwise, where it was meant to be so
+_BETTER = 0.5  # of what a tactile image is off as it is, that it is off otherwise, where it was meant to be so
 _LEAST = 0.02  # off by less, it says nothing
 # widths [px] of structure, fine and less so (moved markers are fine alone, a board of pins is neither), and the share of the
 # change in it that the background may bring: with the own one 0.19 at most, with another press in its place half
 _STRUCTURE, _BRINGS = ((0.0, 3.0), (2.0, 5.0)), 0.27
 _DRIFT = 0.2  # change of brightness since the background
-# brightness over the median around of a hole (in 103 real readings it is 0.55 at least), all channels of a glare where they are
+# brightness over the median around of a hole (in 103 real images it is 0.55 at least), all channels of a glare where they are
 # not so bright around, and the share of an image that is so
 _AROUND, _HOLE, _WHITE, _GREY, _TORN_SHARE = 29, 0.4, 0.9, 0.7, 0.002
 
@@ -35,7 +35,7 @@ _WAYS = {
 
 
 def faults(image: Array, background: Array | None) -> list[str]:
-    """What seems wrong with a reading (H, W, 3) of 0..1 and its background: one line each, none where nothing does."""
+    """What seems wrong with a tactile image (H, W, 3) of 0..1 and its background: one line each, none where nothing does."""
     out = exposure(image, "the image")
     if background is not None:
         out += exposure(background, "the background")
@@ -44,7 +44,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
         return out
     if np.array_equal(image, background):
         return [
-            "the image and its background are the same, pixel for pixel, so no contact can be seen: give a reading, and "
+            "the image and its background are the same, pixel for pixel, so no contact can be seen: give one of the touch, and "
             "beside it one of the untouched gel"
         ]
     seen, rest = _coarse(image), _coarse(background)
@@ -66,7 +66,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
 
 
 def unlike_calibrated(background: Array, colour: ColourTable) -> list[str]:
-    """What seems wrong with readings of a calibrated sensor whose background is (H, W, 3), 0..1, in the sensor frame: it is held
+    """What seems wrong with images of a calibrated sensor whose background is (H, W, 3), 0..1, in the sensor frame: it is held
     against the one that the ``colour`` was fitted with, where that was kept."""
     if colour.rest is None:
         return []
@@ -91,7 +91,7 @@ def unlike_calibrated(background: Array, colour: ColourTable) -> list[str]:
         return []
     way = "brighter" if gain > 1 else "darker"
     return [
-        f"image and background are {100 * abs(gain - 1):.0f} % {way} than when the sensor was calibrated: heights are scaled for "
+        f"image and background are {100 * abs(gain - 1):.0f} % {way} than when the sensor was calibrated: depths are scaled for "
         "that; better set the light and the exposure as they were"
     ]
 

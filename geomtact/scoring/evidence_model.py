@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.scoring.moments import Moments
-from geomtact.sensing.contact import Shown
+from geomtact.sensing.contact import SoftMask
 
 _SMALL = 60_000  # poses up to which the mean is over all of them
 
 
 @dataclass(frozen=True, eq=False)
-class Witness:
+class EvidenceModel:
     """The moments' likelihood under the uniform distribution, or under a prior.
 
     Attributes
@@ -32,7 +32,7 @@ class Witness:
     usual: tuple[float, float] = (-np.inf, -np.inf)
 
     def evidence(
-        self, index: Index, mask: Shown, log_prior: NDArray[np.floating] | None = None, above: float = 0.0
+        self, index: Index, mask: SoftMask, log_prior: NDArray[np.floating] | None = None, above: float = 0.0
     ) -> tuple[float, float]:
         """Log evidence of ``mask`` (h, w), and the log likelihood of the best pose.
 
@@ -49,7 +49,7 @@ class Witness:
             log_mass = log_prior
         return float(np.logaddexp.reduce(likelihood + log_mass)), float(likelihood.max())
 
-    def odd(self, evidence: float, best: float) -> bool:
+    def is_outlier(self, evidence: float, best: float) -> bool:
         """Whether hardly any touch of the object is so unlikely under the uniform distribution: as a whole, or at its best
         pose."""
         return evidence < self.usual[0] or best < self.usual[1]

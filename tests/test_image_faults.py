@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geomtact.sensing.checks import faults
+from geomtact.sensing.image_faults import faults
 from geomtact.sensing.image_file import read_image
 from geomtact.sensing.reading import read_observation
 
