@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import secrets
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 
 def read_text(path: Path) -> str:
@@ -15,14 +13,6 @@ def read_text(path: Path) -> str:
         return path.read_text("utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError("not saved as UTF-8") from None
-
-
-def read_json(path: Path) -> Any:
-    """What a JSON file holds; OSError, or ValueError where it is none."""
-    try:
-        return json.loads(read_text(path))
-    except RecursionError:
-        raise ValueError("lists within lists, hundreds deep") from None
 
 
 def write_text(path: Path, text: str) -> None:

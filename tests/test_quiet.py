@@ -13,7 +13,7 @@ import trimesh
 from PIL import Image
 
 from geomtact.geometry.mesh_file import load_mesh
-from geomtact.report.result import plain, to_text
+from geomtact.json_values import plain, to_text
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -21,8 +21,9 @@ from geomtact import se3
 from geomtact.contact_space.touches import random_touches
 from geomtact.files import write_whole
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.json_values import plain, to_text
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
-from geomtact.report.result import plain, result, to_text
+from geomtact.report.result import result
 from geomtact.report.sensor_image import SensorImage, sensor_images
 from geomtact.report.summary import (
     MOTIONS,

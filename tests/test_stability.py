@@ -15,7 +15,7 @@ from geomtact.contact_space.contact_class import CLASSES, contact_class
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touches import penetrations
 from geomtact.errors import NoPoseAgreesError
-from geomtact.report.result import plain
+from geomtact.json_values import plain
 from geomtact.se3 import inverse
 from geomtact.sensing.noise import CLEAN, MODERATE
 from tools.studies.__main__ import app as studies

@@ -102,7 +102,7 @@ def main(
             _draw_ambiguity(result, out, sensor)
         typer.echo(f"{file}: {_said(result)}", err=True)
     if as_json:
-        from geomtact.report.result import plain
+        from geomtact.json_values import plain
 
         typer.echo(json.dumps({"schema": SCHEMA, "meshes": plain(results)}, indent=1))
     else:

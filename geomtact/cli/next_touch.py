@@ -53,7 +53,7 @@ def next_touch(
     if out is not None:
         _write(out, known, ranked, content, seed)
     if as_json:
-        from geomtact.report.result import to_text
+        from geomtact.json_values import to_text
 
         typer.echo(to_text(content), nl=False)
         return
@@ -74,7 +74,7 @@ def read_actions(path: Path) -> list[Touch | Probe]:
     InputError
         It cannot be read, is no such JSON, or holds an impossible action, which is named by its number from 1.
     """
-    from geomtact.files import read_json
+    from geomtact.json_values import read_json
 
     try:
         entries = read_json(path)["actions"]
@@ -122,7 +122,7 @@ def _content(
     posterior: Posterior, ranked: Sequence[Action], note: str | None, settings: Mapping[str, Any]
 ) -> dict[str, Any]:
     """What goes into ``next_touch.json``."""
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
     from geomtact.versions import versions
 
     return plain(
@@ -154,8 +154,8 @@ def _content(
 
 def _write(out: Path, posterior: Posterior, ranked: Sequence[Action], content: Mapping[str, Any], seed: int) -> None:
     from geomtact.files import write_bytes, write_text
+    from geomtact.json_values import to_text
     from geomtact.report.next_touch_plot import draw_next_touch
-    from geomtact.report.result import to_text
 
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "next_touch.json", to_text(content))

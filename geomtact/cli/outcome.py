@@ -31,7 +31,8 @@ def give(
     as_json: bool,
 ) -> None:
     """Print what was found, after indexes ``took`` so long [ms], and write it into ``out``."""
-    from geomtact.report.result import result, to_text
+    from geomtact.json_values import to_text
+    from geomtact.report.result import result
 
     posterior = found.posterior
     began = time.perf_counter()

@@ -11,8 +11,8 @@ import numpy as np
 from geomtact.cli.project import is_bundled
 from geomtact.contact_space.carry import RigStd
 from geomtact.errors import InputError, nearest_name
-from geomtact.files import read_json
 from geomtact.inference.rig import check_rig
+from geomtact.json_values import is_number, read_json
 from geomtact.se3 import Array, check_transforms
 
 _KEYS = ("T_world_sensor", "sensor", "std_mm", "std_deg")
@@ -77,7 +77,7 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
         raise InputError(f"--sensor-poses {path}: sensor must list a name or TOML file for each of {images}, got {got}")
     std = {key: content.get(key, 0.0) for key in ("std_mm", "std_deg")}
     for key, value in std.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < np.inf:
+        if not (is_number(value) and value >= 0):
             raise InputError(f"--sensor-poses {path}: {key} must be a finite number >= 0, got {value!r}")
     name = f"--sensor-poses {path}: T_world_sensor"
     T = check_transforms(T, name)

@@ -130,7 +130,7 @@ def read_pose(path: Path) -> Array:
     InputError
         No JSON, or no such entry; PoseError if the matrix is no rigid transform.
     """
-    from geomtact.files import read_json
+    from geomtact.json_values import read_json
     from geomtact.se3 import check_transforms
 
     try:
@@ -156,7 +156,7 @@ def _touch_at(space: ContactSpace, T: Array, seed: int, elastic: bool, noise: No
 def _write(stem: Path, mask: Any, truth: dict, metadata: dict) -> None:
     """Write STEM.png, with ``metadata`` as text entries, and STEM.json."""
     from geomtact.files import write_text
-    from geomtact.report.result import plain, to_text
+    from geomtact.json_values import plain, to_text
     from geomtact.sensing.image_file import write_image
 
     metadata = {**metadata, "T_sensor_object": truth["T_sensor_object"]}

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.errors import MeshError
-from geomtact.files import read_json
+from geomtact.json_values import read_json
 from geomtact.se3 import Array
 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

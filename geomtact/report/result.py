@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geomtact.files import printable
+from geomtact.json_values import plain
 from geomtact.se3 import quat_xyzw
 from geomtact.versions import versions
 
@@ -86,24 +86,3 @@ def frame_line(n: int, posterior: Posterior) -> dict[str, Any]:
 def to_line(content: Mapping[str, Any]) -> str:
     """JSON text without a line break."""
     return json.dumps(plain(content), allow_nan=False)
-
-
-def to_text(content: Mapping[str, Any]) -> str:
-    """JSON text, one key of the outermost level a line."""
-    lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
-    return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def plain(value: Any) -> Any:
-    """``value`` of JSON's own types: arrays become lists, numbers that are not finite null, anything unknown its text."""
-    if isinstance(value, Mapping):
-        return {printable(str(k)): plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    if value is None or isinstance(value, bool | int):
-        return value
-    return printable(str(value))

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.json_values import plain
 from geomtact.report.canvas import OBSERVED, SIMULATED, displayable, png_of, rgb
 from geomtact.report.page import STYLE
-from geomtact.report.result import plain
 from geomtact.report.summary import percent
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from geomtact.files import write_bytes, write_text
+from geomtact.json_values import to_text
 from geomtact.report.figure import draw
 from geomtact.report.page import page
-from geomtact.report.result import result, to_text
+from geomtact.report.result import result
 from geomtact.report.sensor_image import SensorImage
 from geomtact.report.summary import caution, facts, summaries_of, table
 from geomtact.report.turnable import turnable

@@ -9,6 +9,7 @@ from dataclasses import MISSING, Field
 from typing import Any
 
 from geomtact.errors import SensorError, nearest_name
+from geomtact.json_values import is_number
 from geomtact.sensing.colour import ColourTable
 
 _LENGTHS = (
@@ -105,7 +106,7 @@ def _value(key: str, name: str, value: Any) -> Any:
             raise SensorError(f'{key} must be text, such as {key} = "mine", got {value!r}')
         return value
     if name in _PAIRS:
-        if not (isinstance(value, list) and len(value) == 2 and all(_number(v) for v in value)):
+        if not (isinstance(value, list) and len(value) == 2 and all(is_number(v) for v in value)):
             raise SensorError(f"{key} must be two numbers (along x, along y), got {value!r}")
         if name == "pixel_pitch" and max(value) > 10:
             raise SensorError(f"{key} {value} is over a centimetre; give millimetres a pixel")
@@ -118,7 +119,7 @@ def _value(key: str, name: str, value: Any) -> Any:
         if not isinstance(value, bool):
             raise SensorError(f"{key} must be true or false, got {value!r}")
         return value
-    if not _number(value):
+    if not is_number(value):
         raise SensorError(f"{key} must be a number, such as 20.0, got {value!r}")
     if name in _WHOLE:
         return int(value) if value == int(value) else value
@@ -136,7 +137,7 @@ def _colour(data: dict[str, Any]) -> ColourTable:
     numbers = [data[key] for key in _COLOUR_KEYS[1:]]
     rows = _rows(data["weights"])
     background = _rows(data.get(_BACKGROUND, []))
-    if rows is None or len(rows) != 2 or background is None or not all(map(_number, numbers)):
+    if rows is None or len(rows) != 2 or background is None or not all(map(is_number, numbers)):
         raise SensorError(
             "[colour] must hold numbers, weights two lists of them, and background lists of them; calibrate the sensor again"
         )
@@ -146,16 +147,9 @@ def _colour(data: dict[str, Any]) -> ColourTable:
 
 def _rows(value: Any) -> tuple[tuple[float, ...], ...] | None:
     """Lists of numbers; None where it is no such thing."""
-    if not isinstance(value, list) or not all(isinstance(row, list) and all(map(_number, row)) for row in value):
+    if not isinstance(value, list) or not all(isinstance(row, list) and all(map(is_number, row)) for row in value):
         return None
     return tuple(tuple(map(float, row)) for row in value)
-
-
-def _number(value: Any) -> bool:
-    """Whether it is a number that a float can hold."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return bool(abs(value) < 1e300)
 
 
 def _mm(metres: float) -> float:

@@ -21,7 +21,7 @@ from geomtact.files import write_bytes
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.geometry.units import UNITS, unit_comment
-from geomtact.report.result import plain
+from geomtact.json_values import plain
 from geomtact.versions import versions
 
 

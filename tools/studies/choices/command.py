@@ -57,7 +57,7 @@ def judge_choices(
     preparing is known too. Prints tables, and writes all answers to --out.
     """
     from geomtact.contact_space.store import FORMAT
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
     from geomtact.sensing.sensor import Sensor
     from tools.studies.choices import study as choices
     from tools.studies.common import study

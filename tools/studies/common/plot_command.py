@@ -24,7 +24,7 @@ def plot_study(
 ) -> None:
     """Draw the picture of a study from its JSON alone."""
     from geomtact.errors import InputError
-    from geomtact.files import read_json
+    from geomtact.json_values import read_json
 
     try:
         content = read_json(study)

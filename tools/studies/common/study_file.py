@@ -17,7 +17,7 @@ _LOGS = ("gain", "gains", "log_probability")  # fields of outcomes that are logs
 def load(out: Path | None, schema: str) -> dict[str, Any]:
     """What the file holds, or an empty study."""
     from geomtact.errors import InputError
-    from geomtact.files import read_json
+    from geomtact.json_values import read_json
 
     if out is None or not out.exists():
         return {"schema": schema, "parts": {}}
@@ -51,7 +51,7 @@ def begun(entry: dict[str, Any] | None, settings: dict[str, Any]) -> bool:
     import json
 
     from geomtact.errors import InputError
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
 
     if entry is None:
         return False
@@ -142,7 +142,7 @@ def _flat(outcome: Any) -> Any:
 
 def keep(out: Path | None, content: dict[str, Any], part: str, **entry: Any) -> None:
     """Put what is known of a part into ``content``, and that into the file."""
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
 
     content["parts"][part] = plain(entry)
     save(out, content)
@@ -151,7 +151,7 @@ def keep(out: Path | None, content: dict[str, Any], part: str, **entry: Any) -> 
 def save(out: Path | None, content: dict[str, Any]) -> None:
     """Write ``content``, with the versions of what made it, if there is a file to write."""
     from geomtact.files import write_text
-    from geomtact.report.result import to_text
+    from geomtact.json_values import to_text
     from geomtact.versions import versions
 
     content["versions"] = versions()

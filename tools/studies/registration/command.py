@@ -50,8 +50,8 @@ def judge_registration(
     from geomtact.contact_space.space import ContactSpace
     from geomtact.contact_space.touches import FELT, random_touches
     from geomtact.inference.refine import Refinery
+    from geomtact.json_values import plain
     from geomtact.registration.observability import Spread
-    from geomtact.report.result import plain
     from geomtact.sensing.sensor import Sensor
     from geomtact.versions import versions
     from tools.studies.common import study

@@ -114,7 +114,7 @@ def judge_scores(
     Prints gain, coverage, pose errors and times of each, and writes them and every outcome to --out.
     """
     from geomtact.contact_space.resolution import MAX_POSES
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
     from geomtact.sensing.sensor import Sensor
 
     chosen, names = sort_words(parts or [], scores or [])
@@ -173,7 +173,7 @@ def _judge(
     """Judge one score on one part, from where the file ends."""
     from geomtact.contact_space.touches import FELT
     from geomtact.inference.effort import EFFORTS
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
     from geomtact.scoring.catalogue import DEFAULT_SCORER
     from tools.studies.common import study
     from tools.studies.scores import study as scores
@@ -212,7 +212,7 @@ def _judge(
 
 def _compare(part: dict[str, Any], n: int) -> None:
     """Write the figures of those of a part's scores that have all ``n`` touches, beside their outcomes."""
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
     from tools.studies.scores import study as scores
 
     outcomes = {name: study_file.outcomes(entry, scores.Scored) for name, entry in part["scores"].items()}

@@ -51,7 +51,7 @@ def judge_stability(
     Prints for each level what is known, how often the answer is wrong, and how often nothing says so; and writes all to --out.
     """
     from geomtact.errors import UsageError, nearest_name
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
     from tools.studies.common import study
     from tools.studies.stability import study as stability
 

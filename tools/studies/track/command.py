@@ -32,7 +32,7 @@ def judge_track(
 
     Prints gain, coverage and how often each loses the part, and writes them and every trajectory to --out.
     """
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
     from tools.studies.common import study
     from tools.studies.track import study as track_study
 

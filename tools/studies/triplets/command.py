@@ -28,7 +28,7 @@ def judge_triplets(
 
     Prints position errors, gain and coverage for each number of touches, and writes them and every outcome to --out.
     """
-    from geomtact.report.result import plain
+    from geomtact.json_values import plain
     from tools.studies.common import study
     from tools.studies.triplets import study as triplets
 
