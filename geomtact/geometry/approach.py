@@ -67,7 +67,7 @@ def check_approach(approach: Approach | None) -> list[tuple[Array, float]] | Non
 
 
 def to_json(approach: Approach | None) -> list[tuple[list[float], float]] | None:
-    """An approach as it stands in JSON: directions and half angles [rad]."""
+    """An approach as JSON: directions and half angles [rad]."""
     return None if approach is None else [(np.asarray(v, float).tolist(), float(angle)) for v, angle in approach]
 
 

@@ -27,7 +27,7 @@ _MOST = 1 << 16  # and a cone at most, where they are to lie as close together a
 
 
 def within_any(a: Array, disks: Cones, tolerance: float = _SAME) -> bool:
-    """Whether one of some directions ``a`` (n, 3) is that of one of the disks, give or take ``tolerance`` [rad]."""
+    """Whether one of some directions ``a`` (n, 3) is that of one of the disks, within ``tolerance`` [rad]."""
     return any((np.linalg.norm(a - middle, axis=-1) < tolerance).any() for middle, _ in disks)
 
 

@@ -121,7 +121,7 @@ class Mesh:
 
 
 def coarser(mesh: Mesh, faces: int) -> Mesh:
-    """The mesh with no more than so many ``faces``, by quadric decimation; itself where it has no more."""
+    """The mesh with ``faces`` faces at most, by quadric decimation; itself where it has no more."""
     if len(mesh.faces) <= faces:
         return mesh
     import open3d as o3d

@@ -44,7 +44,7 @@ from geomtact.geometry.symmetry import Symmetry, about
 from geomtact.se3 import Array, hat, random_rotations, transform
 
 _TIE = 1e-9  # of a turn's step: halfway between two turns the first is taken, whatever the last digit that a processor computes
-_BATCH = 2**16  # directions proposed at once; after 16 times as many, a cell is taken for one without area
+_BATCH = 2**16  # directions proposed at once; after 16 times as many, a cell counts as one without area
 
 
 def level_turns(level: int) -> int:

@@ -143,7 +143,7 @@ def fitted_scorer(
 
 
 def _fitted_before(name: str, path: Path | None, scorers: dict[str, Scorer], index: Index) -> FittedScorer | None:
-    """What stands in ``path``; None where nothing does, or nothing that can be used."""
+    """The fit in ``path``; None where nothing does, or nothing that can be used."""
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             return _from_json(name, json.loads(path.read_text("utf-8")), scorers, index)
@@ -185,7 +185,7 @@ def _simulated(index: Index, path: Path | None, progress: Progress | None) -> Ca
 
 
 def _fit(name: str, scorers: dict[str, Scorer], index: Index, touches: CalibrationTouches) -> dict[str, Any]:
-    """All that is fitted, as it stands in the cache."""
+    """All that is fitted, as the cache holds it."""
     n = round(_LEARN * len(touches.ids))
     learn, judge = (CalibrationTouches(touches.masks[part], touches.ids[part]) for part in (slice(n), slice(n, None)))
     moments = Moments.fit(index, learn.masks, learn.ids)

@@ -25,7 +25,7 @@ SOFTNESS = (0.1e-3, 0.4e-3)  # m
 _CORRELATED = 4e-6  # m^2 that are felt or not felt together
 _SCALE = 0.05  # by which all depths of a touch may be too large or too small
 _FAR = 0.05  # m above the membrane that are as good as infinitely many
-_OUTLIERS = 0.02  # share of pixels that say nothing: dust, glare, what no model foresees
+_OUTLIERS = 0.02  # share of pixels that are outliers: dust, glare, what no model foresees
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def height_log_likelihood(
     """Log likelihood (n,) of the gel's indentation, given how far the object lies below the membrane, up to a constant that no
     pose or object changes.
 
-    Where it is touched the gel lies on the object; elsewhere the object is not in the gel. Some pixels say nothing.
+    Where it is touched the gel lies on the object; elsewhere the object is not in the gel. Some pixels are outliers.
 
     Parameters
     ----------

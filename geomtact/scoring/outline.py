@@ -19,7 +19,7 @@ from geomtact.sensing.sensor import Sensor
 
 STRENGTHS = (0.2e-3, 0.35e-3, 0.6e-3)  # m rms of the displacement, all as likely
 _CORRELATION = 2e-3  # m along the outline over which it is alike: to 1/e, as of ``Noise.correlation``
-_OUTLIER = 3.0  # times the strength from which on a piece of outline says nothing: dust, or a patch that was not found
+_OUTLIER = 3.0  # times the strength from which on a piece of outline is an outlier: dust, or a patch that was not found
 _STEEPEST = 1.0  # slope down to the pixels beside the contact, from which on it is a wall
 _FLATTEST = 0.05  # slope at least, in working out how far away the level is
 _POINTS = 150  # of the observed outline, at most

@@ -19,7 +19,7 @@ from geomtact.sensing.scene import MISSED, scene_of
 from geomtact.sensing.sensor import Sensor
 
 _RAYS_PER_CALL = 1 << 18
-_OFF = 1e-6  # m from a surface, where a ray begins that shall not meet it
+_OFF = 1e-6  # m from a surface, where a ray begins that must not meet it
 
 
 class Caster:

@@ -30,7 +30,7 @@ _KINDS = (
 def foreign_values(text: str, origin: str, base: Values) -> Values:
     """The fields of the sensor in the YAML file of gs_sdk or TACTO, or the JSON file of gsrobotics, named ``origin``.
 
-    ``ppmm`` of gs_sdk is millimetres per pixel. TACTO's gel, if curved, is taken for a sphere that falls by ``curvatureMax`` to
+    ``ppmm`` of gs_sdk is millimetres per pixel. TACTO's gel, if curved, is read as a sphere that falls by ``curvatureMax`` to
     the gel's corners, seen from the camera's ``position`` with ``yfov``; its picture has 240 x 320 px. gsrobotics' sensor is a
     GelSight Mini, whose fields are ``base``, and ``border_fraction`` of its frame is cut off at each side.
 

@@ -131,7 +131,7 @@ def _read_coded(data: bytes, path: Path) -> NDArray[Any]:
     try:
         with Image.open(io.BytesIO(data)) as header:
             _check_pixels(path, *header.size)
-            # OpenCV fills what is missing of a truncated file with grey and says nothing
+            # OpenCV fills what is missing of a truncated file with grey, without a warning
             header.load()
             if (n_frames := getattr(header, "n_frames", 1)) > 1:
                 raise ImageError(f"{path}: expected one image, got {n_frames} frames; save one frame")

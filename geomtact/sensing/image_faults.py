@@ -1,4 +1,4 @@
-"""What may be wrong with a tactile image or its background, found by holding the two against each other, coarsely."""
+"""What may be wrong with a tactile image or its background, found by comparing the two, coarsely."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BRIGHT, _BRIGHT_SHARE = 0.995, 0.4  # any channel above this
 # with their own backgrounds 0.062, with those of other sensors 0.109 or more
 _UNLIKE = 0.085
 _BETTER = 0.5  # of what a tactile image is off as it is, that it is off otherwise, where it was meant to be so
-_LEAST = 0.02  # off by less, it says nothing
+_LEAST = 0.02  # off by less is no fault
 # widths [px] of structure, fine and less so (moved markers are fine alone, a board of pins is neither), and the share of the
 # change in it that the background may bring: with the own one 0.19 at most, with another press in its place half
 _STRUCTURE, _BRINGS = ((0.0, 3.0), (2.0, 5.0)), 0.27
@@ -25,7 +25,7 @@ _DRIFT = 0.2  # change of brightness since the background
 _AROUND, _HOLE, _WHITE, _GREY, _TORN_SHARE = 29, 0.4, 0.9, 0.7, 0.002
 
 _CHANNELS = "channels"
-_WAYS = {
+_TURNS = {
     "half": "turned by 180 degrees",
     "mirror": "mirrored left to right",
     "upside": "mirrored top to bottom",
@@ -56,7 +56,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
             "red and blue seem to be exchanged: the image's channels fit the background's in the order BGR; give RGB"
         ]
     if other:
-        return [f"the image fits the background {_WAYS[other]}; give both as the camera made them"]
+        return [f"the image fits the background {_TURNS[other]}; give both as the camera made them"]
     if off > _UNLIKE:
         return [
             f"the background seems to be of another sensor or light: half of the image is off by more than {100 * off:.0f} % of "
@@ -66,8 +66,8 @@ def faults(image: Array, background: Array | None) -> list[str]:
 
 
 def unlike_calibrated(background: Array, colour: ColourTable) -> list[str]:
-    """What seems wrong with images of a calibrated sensor whose background is (H, W, 3), 0..1, in the sensor frame: it is held
-    against the one that the ``colour`` was fitted with, where that was kept."""
+    """What seems wrong with images of a calibrated sensor whose background is (H, W, 3), 0..1, in the sensor frame: it is
+    compared with the one that the ``colour`` was fitted with, where that was kept."""
     if colour.rest is None:
         return []
     gain = colour.brighter(background)
@@ -79,7 +79,7 @@ def unlike_calibrated(background: Array, colour: ColourTable) -> list[str]:
         ]
     if other:
         return [
-            f"image and background seem to be {_WAYS[other]} since the sensor was calibrated: give them as the presses were, or "
+            f"image and background seem to be {_TURNS[other]} since the sensor was calibrated: give them as the presses were, or "
             "say how the camera is mounted (--rotate, --mirror, or camera_rotation_deg in the sensor's file)"
         ]
     if off > _UNLIKE:

@@ -3,7 +3,7 @@
 The difference from the background is taken as a linear image of the gel's slope. Its two strongest colour directions
 span the slope; the 2x2 map that is left unknown is the one that makes the slope field a gradient (free of curl). Its
 integral is the gel's indentation up to a factor; the rim of the contact is where, on the way up, the gel is steepest
-(``registration/rim.py`` makes of a rim what a pose is held against). Or the pressure that bends an elastic gel so is worked
+(``registration/rim.py`` makes of a rim what a pose is compared with). Or the pressure that bends an elastic gel so is worked
 out, and the contact is where there is any. A network needs no linear image: it is asked where light is blown out.
 """
 
@@ -27,16 +27,14 @@ from geomtact.sensing.slope import integrate, of_gradient, slope_field
 BySlope = Callable[[Array, Mask, Mask, float, Array], tuple[Array, Mask]]  # slope, felt, strong, sigma, pitch
 
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
-_PRESSED = (
-    0.3  # of the largest pressure, that counts as contact: the best in simulated tactile images of many gels and lamps
-)
+_PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated images of many gels and lamps
 _ONE_COLOUR = 0.03  # power of the second colour over that of the first, under which there is but one: a white gel's
 _EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse, from which on slopes are seen
 _HARDLY_LESS = 0.1  # of the fastest fall, by which others fall less fast that count too
 _SURELY = 0.501  # probability of what counts as contact, at least
-# Brightness from which on a camera tells no more, or less than elsewhere; and the share of what is felt that is so bright, more
+# Brightness from which on a camera shows no change, or less than elsewhere; and the share of what is felt that is so bright, more
 # than a glint, from which on colours are no linear image of slopes
-_NEARLY_WHITE, _UNTOLD = 0.95, 0.01
+_NEARLY_WHITE, _BLOWN_OUT = 0.95, 0.01
 
 
 class _Colours(NamedTuple):
@@ -138,7 +136,7 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
     if not felt.any():
         return FoundContact(np.zeros(size[::-1], bool), None, "classical" if method == "auto" else method)
     if method == "auto":
-        method = "learned" if _blown_out(felt, image, reference) > _UNTOLD else "classical"
+        method = "learned" if _blown_out(felt, image, reference) > _BLOWN_OUT else "classical"
     colours = _colours(change, felt)
     if colours.one:
         method = "classical"

@@ -72,7 +72,7 @@ def membrane_curvature(
     if found < -_HOLLOW * std:
         raise InputError(
             f"the balls contradict each other: they would have the membrane be hollow, with a curvature of {1e-3 * found:.3f} "
-            f"1/mm, give or take {1e-3 * std:.3f}; check that the two diameters are not exchanged"
+            f"1/mm, standard deviation {1e-3 * std:.3f}; check that the two diameters are not exchanged"
         )
     return found, std
 

@@ -23,7 +23,7 @@ from geomtact.sensing.colour import ColourTable
 from geomtact.sensing.sensor_file import toml_text, toml_values
 
 _FOREIGN = (".yaml", ".yml", ".json")  # of files that other makers' programs read
-HEIGHT_NOISE = 0.1e-3  # m, of a sensor that says nothing of it
+HEIGHT_NOISE = 0.1e-3  # m, of a sensor whose file does not state it
 CONTACT_METHODS = (
     "auto",
     "classical",

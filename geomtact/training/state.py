@@ -36,7 +36,7 @@ def whose(mesh: Mesh, sensor: Sensor) -> dict[str, str]:
 
 
 def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
-    """Keep ``folder`` for the training that ``recipe`` describes, so that nothing of another one is taken for it.
+    """Keep ``folder`` for the training that ``recipe`` describes, so that it never reads another's.
 
     Raises
     ------

@@ -31,7 +31,7 @@ _PURPOSE = 6_1_4  # beside the seed: an evaluation with the same seed draws othe
 
 @dataclass(frozen=True)
 class Settings:
-    """The thesis's own, but for ``side`` [px], of which it says nothing."""
+    """The thesis's own, but for ``side`` [px], which it does not state."""
 
     pairs: int = 100_000
     batch: int = 32

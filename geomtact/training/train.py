@@ -95,7 +95,7 @@ def train(
         network.train()
         for i in rng.integers(len(learned), size=settings.scenes_a_step):
             gain = scene_gain(network, learned[i], settings, rng)
-            # one hopeless touch shall not steer the step
+            # one hopeless touch must not steer the step
             (-gain.clamp(min=-8).mean() / settings.scenes_a_step).backward()
             gains.append(float(gain.detach().mean()))
         descend(network, optimizer, -sum(gains[-settings.scenes_a_step :]), folder, step)
