@@ -1,4 +1,4 @@
-"""Laws of the pages: every link leads somewhere, and every command that they show is one that geomtact has."""
+"""Laws of the pages: every link leads somewhere, and every command that they show is one that geomtact or a checkout has."""
 
 import re
 import shlex
@@ -8,10 +8,13 @@ import pytest
 import typer
 
 from geomtact.cli import app
+from tools.studies.__main__ import app as studies
+from tools.training.__main__ import app as training
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMANDS = typer.main.get_command(app)
+PROGRAMS = {"geomtact": app, "tools.studies": studies, "tools.training": training}
+COMMANDS = {name: typer.main.get_command(program) for name, program in PROGRAMS.items()}
 
 
 def anchors(page: Path) -> set[str]:
@@ -32,16 +35,16 @@ def test_every_link_leads_somewhere(page):
 
 
 def shown(page: Path) -> list[list[str]]:
-    """The geomtact commands that a page shows, in words, each up to a pipe or a comment."""
+    """The commands of ``PROGRAMS`` that a page shows, in words, each up to a pipe or a comment."""
     text = re.sub(r"\\\n\s*", " ", page.read_text("utf-8"))
-    lines = re.findall(r"^(?:    |\$ )?(geomtact [^\n]*)$", text, re.MULTILINE)
+    lines = re.findall(r"^(?:    |\$ )?(?:python -m )?((?:geomtact|tools\.\w+) [^\n]*)$", text, re.MULTILINE)
     return [shlex.split(re.split(r"\s[|>&]|\s\d>", line)[0], comments=True) for line in lines]
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if shown(page)], ids=lambda page: page.name)
 def test_every_command_shown_is_there_with_its_options(page):
     for words in shown(page):
-        command, words = COMMANDS, words[1:]
+        command, words = COMMANDS[words[0]], words[1:]
         while hasattr(command, "commands"):
             known = command.commands
             assert words and (words[0] in known or words[0].startswith("-")), f"{page.name}: {words}"
