@@ -1,20 +1,22 @@
-"""The state of a training that goes on after a kill, and whose it is."""
+"""The state of a training that goes on after a kill, whose it is, and what all trainings share from step to step."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import nn
 from torch.optim import Optimizer
 
-from geomtact.errors import InputError
+from geomtact.errors import GeomtactError, InputError
 from geomtact.files import write_text, write_whole
 from geomtact.geometry.mesh import Mesh
 from geomtact.sensing.sensor import Sensor
@@ -146,3 +148,34 @@ def _meta(path: Path) -> dict[str, str] | None:
             return dict(file.metadata())
     except (OSError, SafetensorError):
         return None
+
+
+def steps(
+    optimizer: Optimizer, first: int, n: int, rate: float, seed: int
+) -> Iterator[tuple[int, np.random.Generator]]:
+    """The steps from ``first`` on, of ``n`` in all, gradients at zero and the ``rate`` as it is there. Each has a seed of its
+    own, so that a resumed run draws what an uninterrupted one does."""
+    for step in range(first, n):
+        for group in optimizer.param_groups:
+            group["lr"] = rate * schedule(step, n)
+        optimizer.zero_grad()
+        yield step, np.random.default_rng([seed, step])
+
+
+def schedule(step: int, n: int) -> float:
+    """Share of the learning rate at a step of ``n``: a short rise, then half a cosine."""
+    return min(1.0, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / n))
+
+
+def descend(network: nn.Module, optimizer: Optimizer, loss: float, folder: Path, step: int) -> None:
+    """Go down the gradients that ``network`` holds, cut to a norm of 1.
+
+    Raises
+    ------
+    GeomtactError
+        The ``loss`` or a gradient is not a number; the last good state stays in ``folder``.
+    """
+    norm = float(torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0))
+    if not (math.isfinite(norm) and math.isfinite(loss)):
+        raise GeomtactError(not_a_number(folder, step))
+    optimizer.step()

@@ -27,9 +27,8 @@ from geomtact.scoring.network import Encoder
 from geomtact.scoring.precision import autocast
 from geomtact.sensing.moments import without_specks
 from geomtact.training.augment import augmented
-from geomtact.training.loop import descend, steps
 from geomtact.training.scenes import KEY_SHAPE, TOUCH_SHAPE, TrainingScene
-from geomtact.training.state import begin_with, resume, save_state
+from geomtact.training.state import begin_with, descend, resume, save_state, steps
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from geomtact.errors import InputError
 from geomtact.progress import Progress
 from geomtact.sensing.mask_network import CHANNELS, MaskNetwork
 from geomtact.training.card import write_network
-from geomtact.training.loop import descend, steps
-from geomtact.training.state import begin_with, claim, read_weights, resume, save_state, sha256_of
+from geomtact.training.state import begin_with, claim, descend, read_weights, resume, save_state, sha256_of, steps
 from tools.training import presses, tactile_images
 from tools.training.presses import Presses, make_presses
 

@@ -19,7 +19,7 @@ from geomtact.sensing.cast import Caster
 from geomtact.sensing.elastic import elastic_contact
 from geomtact.sensing.mask_network import CHANNELS, side_shape, to_side
 from geomtact.sensing.sensor import Sensor
-from geomtact.training.numbered import made_once
+from geomtact.training.dataset import made_once
 from tools.training.procedural import random_object
 from tools.training.tactile_images import random_sight
 
