@@ -4,7 +4,6 @@ import re
 import shlex
 from pathlib import Path
 
-import pytest
 import typer
 
 from geomtact.cli import app
@@ -23,15 +22,17 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_link_leads_somewhere(page):
-    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8")):
-        if re.match(r"[a-z]+:", target):  # to other sites
-            continue
-        path, _, anchor = target.partition("#")
-        there = (page.parent / path).resolve() if path else page
-        assert there.exists(), f"{page.name}: {target}"
-        assert not anchor or anchor in anchors(there), f"{page.name}: {target}"
+def test_every_link_leads_somewhere():
+    lost = []
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8")):
+            if re.match(r"[a-z]+:", target):  # to other sites
+                continue
+            path, _, anchor = target.partition("#")
+            there = (page.parent / path).resolve() if path else page
+            if not there.exists() or (anchor and anchor not in anchors(there)):
+                lost.append(f"{page.name}: {target}")
+    assert not lost, "\n".join(lost)
 
 
 def shown(page: Path) -> list[list[str]]:
@@ -41,21 +42,23 @@ def shown(page: Path) -> list[list[str]]:
     return [shlex.split(re.split(r"\s[|>&]|\s\d>", line)[0], comments=True) for line in lines]
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if shown(page)], ids=lambda page: page.name)
-def test_every_command_shown_is_there_with_its_options(page):
-    for words in shown(page):
-        command, words = COMMANDS[words[0]], words[1:]
-        while hasattr(command, "commands"):
-            known = command.commands
-            assert words and (words[0] in known or words[0].startswith("-")), f"{page.name}: {words}"
-            if words[0].startswith("-"):
-                break
-            command, words = known[words[0]], words[1:]
-        options = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
-        for word in words:
-            name = word.partition("=")[0]
-            assert not re.match(r"--?[a-z]", name) or name in {*options, "--help"}, f"{page.name}: {words}"
+def unknown_words(words: list[str]) -> list[str]:
+    """Those words of a command that name a command or an option which geomtact has not."""
+    command, words = COMMANDS[words[0]], words[1:]
+    while hasattr(command, "commands"):
+        known = command.commands
+        if not words or not (words[0] in known or words[0].startswith("-")):
+            return words[:1] or ["no command"]
+        if words[0].startswith("-"):
+            break
+        command, words = known[words[0]], words[1:]
+    options = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
+    names = [word.partition("=")[0] for word in words]
+    return [name for name in names if re.match(r"--?[a-z]", name) and name not in {*options, "--help"}]
 
 
-def test_there_are_commands_to_check():
-    assert sum(len(shown(page)) for page in PAGES) > 40
+def test_every_command_shown_is_there_with_its_options():
+    commands = [(page, words) for page in PAGES for words in shown(page)]
+    assert len(commands) > 40
+    wrong = [f"{page.name}: {' '.join(words)}: {found}" for page, words in commands if (found := unknown_words(words))]
+    assert not wrong, "\n".join(wrong)

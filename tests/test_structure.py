@@ -7,6 +7,8 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -44,10 +46,20 @@ def stage(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
+@cache
+def parsed(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text("utf-8"))))
+
+
+def nodes(paths: list[Path]) -> Iterator[tuple[Path, ast.AST]]:
+    """Every node of every file's syntax tree, with the file."""
+    return ((path, node) for path in paths for node in parsed(path))
+
+
 def imports(path: Path) -> list[tuple[str, int]]:
     """Every module named by an import anywhere in a file, and its line; ``from geomtact import x`` names geomtact.x."""
     found = []
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for _, node in nodes([path]):
         if isinstance(node, ast.Import):
             found += [(alias.name, node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -58,46 +70,55 @@ def imports(path: Path) -> list[tuple[str, int]]:
     return found
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports_go_one_way(path):
-    own = stage(path)
-    for name, line in imports(path):
-        parts = name.split(".")
-        assert parts[0] not in FORBIDDEN, f"{path}:{line} imports {name}"
-        if parts[0] != "geomtact" or len(parts) == 1 or own in ("__init__", "__main__"):
-            continue
-        assert parts[1] in HEIGHT, f"{path}:{line}: {name} is in no stage; add its folder to STAGES"
-        allowed = parts[1] == own or HEIGHT[parts[1]] < HEIGHT[own]
-        assert allowed or {own, parts[1]} == {"errors", "se3"}, (
-            f"{path}:{line}: {own} imports from {parts[1]}, a later stage"
-        )
+def test_imports_go_one_way():
+    offences = []
+    for path in MODULES:
+        own = stage(path)
+        for name, line in imports(path):
+            parts = name.split(".")
+            if parts[0] in FORBIDDEN:
+                offences.append(f"{path}:{line} imports {name}")
+            if parts[0] != "geomtact" or len(parts) == 1 or own in ("__init__", "__main__"):
+                continue
+            if parts[1] not in HEIGHT:
+                offences.append(f"{path}:{line}: {name} is in no stage; add its folder to STAGES")
+            elif not (parts[1] == own or HEIGHT[parts[1]] < HEIGHT[own] or {own, parts[1]} == {"errors", "se3"}):
+                offences.append(f"{path}:{line}: {own} imports from {parts[1]}, a later stage")
+    assert not offences, "\n".join(offences)
 
 
-@pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: str(p.relative_to(ROOT)))
-def test_what_scripts_import_is_there(path):
+def test_what_scripts_import_is_there():
     """Inside functions, too: most scripts run for too long to be run here."""
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    offences = []
+    for path, node in nodes(SCRIPTS):
         if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in ("geomtact", "tools"):
             module = importlib.import_module(node.module)
-            for alias in node.names:
-                there = hasattr(module, alias.name) or importlib.util.find_spec(f"{node.module}.{alias.name}")
-                assert there, f"{path}:{node.lineno}: no {alias.name} in {node.module}"
+            offences += [
+                f"{path}:{node.lineno}: no {alias.name} in {node.module}"
+                for alias in node.names
+                if not (hasattr(module, alias.name) or importlib.util.find_spec(f"{node.module}.{alias.name}"))
+            ]
+    assert not offences, "\n".join(offences)
 
 
-@pytest.mark.parametrize("path", [*MODULES, *STUDIES], ids=lambda p: str(p.relative_to(ROOT)))
-def test_library_does_not_print(path):
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        printed = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
-        assert not printed, f"{path}:{node.lineno} prints; return it, or say it in geomtact/cli"
+def test_library_does_not_print():
+    offences = [
+        f"{path}:{node.lineno} prints; return it, or say it in geomtact/cli"
+        for path, node in nodes([*MODULES, *STUDIES])
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    ]
+    assert not offences, "\n".join(offences)
 
 
-@pytest.mark.parametrize("path", [*MODULES, *STUDIES], ids=lambda p: str(p.relative_to(ROOT)))
-def test_files_are_written_whole_or_not_at_all(path):
+def test_files_are_written_whole_or_not_at_all():
     """Under a temporary name (``geomtact.files``), or within a folder that is renamed as a whole."""
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    offences = []
+    for path, node in nodes([*MODULES, *STUDIES]):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in WRITERS:
             into = ast.unparse(node.args[0] if node.func.attr == "savefig" else node.func.value)
-            assert into.split(" ")[0] in ("temporary", "building"), f"{path}:{node.lineno} writes {into} in place"
+            if into.split(" ")[0] not in ("temporary", "building"):
+                offences.append(f"{path}:{node.lineno} writes {into} in place")
+    assert not offences, "\n".join(offences)
 
 
 def test_committed_results_are_of_studies_as_they_are_now():
