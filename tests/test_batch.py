@@ -67,6 +67,7 @@ def alone(tmp_path_factory):
     return written(folder)
 
 
+@pytest.mark.slow
 def test_two_processes_write_the_same_bytes_as_one(alone, tmp_path):
     assert sorted(run_all(prepare_part, tasks(tmp_path), 2)) == [(0, None), (1, None)]
     assert written(tmp_path) == alone and len(alone) > 3 * len(PARTS)
@@ -102,6 +103,7 @@ def test_a_task_that_kills_every_process_is_given_up_alone(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
 
 
+@pytest.mark.studies
 def test_a_study_of_parts_apart_finds_what_it_finds_of_one_after_the_other(few_touches, tmp_path, cache_dir):
     """Also where some are judged already."""
 
@@ -118,6 +120,7 @@ def test_a_study_of_parts_apart_finds_what_it_finds_of_one_after_the_other(few_t
     assert {path.name for path in tmp_path.iterdir()} == {"apart.json", "one.json"}
 
 
+@pytest.mark.studies
 def test_scores_of_parts_apart_are_those_of_one_after_the_other(few_touches, tmp_path, cache_dir):
     """With the score that the command line names among the parts."""
 
@@ -138,6 +141,7 @@ def test_scores_of_parts_apart_are_those_of_one_after_the_other(few_touches, tmp
     assert found == judge(tmp_path / "one.json") and len(found[0]) == 2 * 2 * 3
 
 
+@pytest.mark.studies
 def test_every_study_by_part_names_the_part_that_it_cannot_judge(tmp_path):
     judged_apart = [name for name, study in COMMANDS.items() if "ray" in inspect.signature(study).parameters]
     assert len(judged_apart) >= 10
@@ -147,6 +151,7 @@ def test_every_study_by_part_names_the_part_that_it_cannot_judge(tmp_path):
         assert done.exit_code == 3 and "pim: not judged" in done.output, (study, done.output)
 
 
+@pytest.mark.studies
 def test_a_study_apart_keeps_what_it_could_judge_and_names_the_rest(few_touches, tmp_path, cache_dir):
     out = tmp_path / "study.json"
     words = ["stability", PARTS[0], "pim", "--touches", "1", "--sweep", "noise", "--max-poses", "3000"]
@@ -162,6 +167,7 @@ def test_a_study_apart_keeps_what_it_could_judge_and_names_the_rest(few_touches,
     assert without.exit_code == 2 and "--out" in without.output
 
 
+@pytest.mark.slow
 def test_two_nodes_of_which_one_is_killed_write_the_same_bytes_as_one_process(alone, tmp_path):
     ray = pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
@@ -219,6 +225,7 @@ def test_the_command_prepares_several_parts_and_names_those_that_it_cannot(few_t
     assert "1 of 3 objects are not prepared" in done.output
 
 
+@pytest.mark.slow
 def test_several_parts_are_trained_for_each_into_a_folder(tmp_path):
     words = ["train", "--object", "ball,hex_nut", "--architecture", "resnet50", "--pairs", "32", "--side", "32"]
     done = CliRunner().invoke(app, [*words, "--jobs", "1", "--out", str(tmp_path / "weights")])
@@ -226,6 +233,10 @@ def test_several_parts_are_trained_for_each_into_a_folder(tmp_path):
     assert {path.name for path in (tmp_path / "weights").glob("*.safetensors")} == {
         f"{name}.safetensors" for name in PARTS
     }
+
+
+def test_options_of_training_that_do_not_go_together_are_refused():
+    words = ["train", "--object", "ball,hex_nut", "--architecture", "resnet50", "--pairs", "32", "--side", "32"]
     for wrong, said in (
         ([*words, "--out", "one.safetensors"], "--out one.safetensors: expected a folder for the weights of 2 parts"),
         ([*words[:1], "--object", "ball", *words[3:], "--jobs", "2"], "--jobs and --ray train for several objects"),

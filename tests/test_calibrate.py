@@ -303,6 +303,7 @@ def test_the_command_writes_a_sensor_and_a_picture(tmp_path):
 
 
 @pytest.mark.parametrize(("used", "judged"), [(6.310, 9.500), (9.500, 6.310)])
+@pytest.mark.slow
 def test_real_presses_of_one_ball_measure_the_other(data_folder, used, judged):
     folder = data_folder / "gelslam_gsmini_balls"
     own, other = (sorted((folder / f"{d:.3f}mm").glob("*.png")) for d in (used, judged))

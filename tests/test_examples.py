@@ -33,6 +33,7 @@ def example(tmp_path, cache_dir, few_touches, monkeypatch, capsys):
     return run
 
 
+@pytest.mark.slow
 def test_touch_until_sure(example):
     last = [line for line in example("docs/examples/touch_until_sure.py").splitlines() if "mm off the truth" in line][
         -1
@@ -41,6 +42,7 @@ def test_touch_until_sure(example):
     assert held >= 90 and off < 5
 
 
+@pytest.mark.slow
 def test_the_pencils_ends_tell_most(example, tmp_path):
     """A touch of its middle tells nothing of which way round it lies; one of its ends does."""
     said = example("docs/examples/pencil.py").splitlines()
@@ -49,12 +51,14 @@ def test_the_pencils_ends_tell_most(example, tmp_path):
     assert (tmp_path / "out" / "pencil" / "next_touch.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_gripper_that_reads_its_width(example):
     said = example("docs/examples/gripper.py", "--part", "connector_plug", "--max-poses", "60000")
     assert float(re.search(r"the truth: (\S+) nats", said)[1]) > 0
     assert re.search(r"the jaw is \d+\.\d mm open", said)
 
 
+@pytest.mark.slow
 def test_a_face_put_down_flat_is_told_whether_the_side_is_known_or_not(example):
     said = example("docs/examples/face_on.py", "--max-poses", "20000", "--touches", "6", "--tilt", "1").splitlines()
     assert len(said) == 2 and "any side" in said[0] and "that side" in said[1]
@@ -62,6 +66,7 @@ def test_a_face_put_down_flat_is_told_whether_the_side_is_known_or_not(example):
         assert float(re.search(r"(\S+) nats told", line)[1]) > 2 and " 0 % outside the 99 % region" in line
 
 
+@pytest.mark.studies
 def test_kitting_places_nothing_that_it_is_not_sure_of(example, tmp_path):
     """One touch of a plug leaves more than a millimetre open."""
     said = example(
@@ -72,6 +77,7 @@ def test_kitting_places_nothing_that_it_is_not_sure_of(example, tmp_path):
         assert film.n_frames > 5
 
 
+@pytest.mark.studies
 def test_a_figure_of_the_thesis_shows_the_distances_that_it_names(example, tmp_path):
     example("tools/studies/thesis/figures.py", "10")
     figure = json.loads((tmp_path / "out" / "thesis" / "thesis_figures.json").read_text())["10"]

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from speed import slow_but
 from typer.testing import CliRunner
 
 from geomtact import GaussianPrior, Localizer, Mesh, Sensor, contact_mask
@@ -78,7 +79,7 @@ def test_sensors_of_one_kind_keep_their_own_calibration(tmp_path):
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=BALL)
     pair = [replace(SENSOR, height_noise=n * MM) for n in (0.02, 0.2)]
     both = Localizer.prepare(
-        Mesh(mesh.vertices, mesh.faces, "ball", "m"), sensor=pair, max_poses=5_000, cache_dir=tmp_path
+        Mesh(mesh.vertices, mesh.faces, "ball", "m"), sensor=pair, max_poses=2_000, cache_dir=tmp_path
     )
     assert [each.sensor.height_noise for each in (both, *both.others)] == pytest.approx([0.02 * MM, 0.2 * MM])
 
@@ -157,9 +158,10 @@ def test_a_rendered_reading_gives_its_contact_back(rng):
         assert not contact_mask(background, background, SENSOR, method).any()
 
 
-def test_a_prior_that_tells_the_depth_is_held_against_the_whole_press(ball, rng):
+@pytest.mark.parametrize("n", slow_but((2, 6), 2))
+def test_a_prior_that_tells_the_depth_is_held_against_the_whole_press(ball, rng, n):
     """A height map is compared by a contour some way up; how deep the ball lies is not told by that contour's size."""
-    for T in ball.space.sample(6, rng, (1.3 * MM, 1.6 * MM))[0]:
+    for T in ball.space.sample(n, rng, (1.3 * MM, 1.6 * MM))[0]:
         height = ball.simulate(T).height
         told = []
         for off in (0.0, 0.75 * MM):  # as deep as it is, and as deep as the contour looks
@@ -180,6 +182,7 @@ def test_simulated_readings_are_localized_as_they_come(tmp_path):
     assert read_observation(image, "gelsight-mini", background=background).contact.mask.any()
 
 
+@pytest.mark.slow
 def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp_path, cache_dir, few_touches):
     """Every sixth press that lies wholly in the window; the calibration saw presses of the other ball alone."""
     folder = data_folder / "gelslam_gsmini_balls"

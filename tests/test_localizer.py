@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
+from speed import slow_but
 
 from geomtact import InputError, Localizer, PoseError, Sensor, UsageError
 from geomtact.contact_space.store import open_index
@@ -53,18 +54,19 @@ def test_the_nut_on_its_flat_is_found_by_its_hole(flat_nut, uniform_poses):
     assert np.median(error) < 0.5 * MM
 
 
-def test_the_first_modes_predict_the_contact_that_is_seen(curved, flat_nut, ball, uniform_poses):
+@pytest.mark.parametrize("name", slow_but(("curved", "flat_nut", "ball"), "flat_nut", "ball"))
+def test_the_first_modes_predict_the_contact_that_is_seen(name, request, uniform_poses):
     """At a mode, the contact is where the object lies deeper than a gel of either kind is taken to sink around it."""
-    for localizer in (curved, flat_nut, ball):
-        T, _ = uniform_poses(localizer)
-        iou = []
-        for pose in T[:7]:
-            seen = pressed(localizer, pose)
-            modes = np.array([mode.T for mode in localizer.localize(seen).modes(5)])
-            predicted = localizer.space.caster.depths(localizer.sensor, modes, seen.shape) > SINK
-            iou.append([(seen & p).sum() / (seen | p).sum() for p in predicted])
-        first, best = np.median([i[0] for i in iou]), np.median([max(i) for i in iou])
-        assert first > 0.75 and best > 0.8
+    localizer = request.getfixturevalue(name)
+    T, _ = uniform_poses(localizer)
+    iou = []
+    for pose in T[:7]:
+        seen = pressed(localizer, pose)
+        modes = np.array([mode.T for mode in localizer.localize(seen).modes(5)])
+        predicted = localizer.space.caster.depths(localizer.sensor, modes, seen.shape) > SINK
+        iou.append([(seen & p).sum() / (seen | p).sum() for p in predicted])
+    first, best = np.median([i[0] for i in iou]), np.median([max(i) for i in iou])
+    assert first > 0.75 and best > 0.8
 
 
 def test_what_was_assumed_in_reading_the_mesh_comes_with_every_posterior(ball, a_touch):
@@ -86,17 +88,19 @@ def test_the_same_seed_gives_the_same_result(localizer, a_touch):
     assert (third.log_prob == one.log_prob).all() and third.credible_level(T) != one.credible_level(T)
 
 
-def test_efforts_differ_in_resolution_and_in_what_is_refined(curved, a_touch):
-    T, mask = a_touch(curved)
-    fast, balanced, exact = (curved.localize(mask, effort=e) for e in ("fast", "balanced", "exact"))
-    held = curved.index.mass(*curved.index.block_runs) > 0  # some blocks are ruled out as a whole
+@pytest.mark.parametrize("name", slow_but(("curved", "flat_nut"), "flat_nut"))
+def test_efforts_differ_in_resolution_and_in_what_is_refined(name, request, a_touch):
+    localizer = request.getfixturevalue(name)
+    T, mask = a_touch(localizer)
+    fast, balanced, exact = (localizer.localize(mask, effort=e) for e in ("fast", "balanced", "exact"))
+    held = localizer.index.mass(*localizer.index.block_runs) > 0  # some blocks are ruled out as a whole
     assert len(fast.cells) == held.sum() < len(balanced.cells) == len(exact.cells)
     assert abs(balanced.log_density(T) - exact.log_density(T)) < 2
     assert len(fast.refined) == 0 < len(balanced.refined) <= 5 <= len(exact.refined) <= 5 * 25
-    likelihood = [curved.refinery.log_likelihood(mask, p.modes(1)[0].T[None])[0] for p in (fast, balanced)]
+    likelihood = [localizer.refinery.log_likelihood(mask, p.modes(1)[0].T[None])[0] for p in (fast, balanced)]
     assert likelihood[1] >= likelihood[0] - 1e-9, "a refinement that does not raise the likelihood is dropped"
     with pytest.raises(UsageError, match="no effort named 'quick'"):
-        curved.localize(mask, effort="quick")
+        localizer.localize(mask, effort="quick")
 
 
 def test_settings_and_times_say_how_it_came_about(plug, a_touch):
@@ -114,6 +118,7 @@ def test_a_contact_unlike_any_touch_is_warned_of(ball):
     assert any("unlike any touch" in w for w in ball.localize(mask).warnings)
 
 
+@pytest.mark.slow
 def test_a_hollow_that_the_sensor_fits_into_is_warned_of(cache_dir, monkeypatch):
     monkeypatch.setattr(fitted, "TOUCHES", 60)
     made = trimesh.creation.annulus(0.045, 0.055, 0.04, sections=32)
@@ -237,10 +242,11 @@ def test_a_gaussian_prior_is_where_it_says(localizer, uniform_poses):
     assert again == pytest.approx(mass, abs=0.06)  # four deviations of a share of a thousand draws
 
 
-@pytest.mark.parametrize(("std", "apart"), [(0.02, 0.1), (0.1, 0.2), (0.5, 1.0)])
-def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_poses, std, apart):
+@pytest.mark.parametrize("std", slow_but((0.02, 0.1, 0.5), 0.1))
+def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_poses, std):
     """Of what touches, by the exact caster; from narrower than a cell, where heights within it differ by more, to far wider.
-    ``apart`` bounds the total variation, draws included."""
+    The total variation is bounded, draws included."""
+    apart = {0.02: 0.1, 0.1: 0.2, 0.5: 1.0}[std]
     index, T = plug.index, uniform_poses(plug)[0][:2]
     spread = np.r_[[std] * 3, [std * 20 * MM] * 3]
     for true in T:
@@ -255,7 +261,7 @@ def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_po
         assert 0.5 * np.abs(mass - own).sum() < apart
 
 
-@pytest.mark.parametrize("name", ["curved", "flat_nut"])
+@pytest.mark.parametrize("name", slow_but(["curved", "flat_nut"], "flat_nut"))
 def test_a_prior_outlives_a_sensor_that_feels_nothing_whichever_image_it_names(name, request, uniform_poses):
     """A sensor far away feels nothing: what it tells is the prior, the same of every image of a pose, and as a prior for another
     sensor it says what the prior itself says there."""
@@ -514,24 +520,25 @@ def test_prepare_reads_what_it_wrote(ball, cache_dir, monkeypatch):
     assert isinstance(again.localize(np.zeros((240, 320), bool)), Posterior)
 
 
-def test_a_prior_about_any_symmetric_image_says_the_same(flat_nut, curved, a_touch):
+@pytest.mark.parametrize("name", slow_but(["curved", "flat_nut"], "flat_nut"))
+def test_a_prior_about_any_symmetric_image_says_the_same(name, request, a_touch):
     """Twelve turns of a nut are one pose: a camera that reports any of them knows as much."""
-    for localizer in (flat_nut, curved):
-        T_true, mask = a_touch(localizer)
-        seen = []
-        for S in localizer.mesh.symmetry.elements:
-            about = T_true @ S
-            if not localizer.space.approaches(about[None])[0]:
-                continue
+    localizer = request.getfixturevalue(name)
+    T_true, mask = a_touch(localizer)
+    seen = []
+    for S in localizer.mesh.symmetry.elements:
+        about = T_true @ S
+        if not localizer.space.approaches(about[None])[0]:
+            continue
 
-            def near(T, about=about):
-                angle = Rotation.from_matrix(np.swapaxes(T[:, :3, :3], 1, 2) @ about[:3, :3]).magnitude()
-                return -0.5 * (angle / 0.4) ** 2 - 0.5 * (((T - about)[:, :3, 3] / (4 * MM)) ** 2).sum(1)
+        def near(T, about=about):
+            angle = Rotation.from_matrix(np.swapaxes(T[:, :3, :3], 1, 2) @ about[:3, :3]).magnitude()
+            return -0.5 * (angle / 0.4) ** 2 - 0.5 * (((T - about)[:, :3, 3] / (4 * MM)) ** 2).sum(1)
 
-            posterior = localizer.localize(mask, prior=near, effort="fast")
-            seen.append((posterior.log_density(T_true), posterior.log_evidence, posterior.entropy_nats))
-        assert len(seen) >= 6
-        assert np.ptp(np.array(seen), axis=0).max() < 1e-3
+        posterior = localizer.localize(mask, prior=near, effort="fast")
+        seen.append((posterior.log_density(T_true), posterior.log_evidence, posterior.entropy_nats))
+    assert len(seen) >= 6
+    assert np.ptp(np.array(seen), axis=0).max() < 1e-3
 
 
 def test_a_constant_in_the_prior_means_nothing_and_a_small_density_is_not_none(plug, a_touch, uniform_poses):

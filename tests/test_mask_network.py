@@ -73,6 +73,7 @@ def test_a_gel_that_bulges_is_touched_by_a_plate_as_hertz_has_it(monkeypatch):
         assert middle == pytest.approx((np.array(contact.shape) - 1) / 2, abs=0.3)
 
 
+@pytest.mark.slow
 def test_presses_are_made_once(tmp_path, monkeypatch):
     monkeypatch.setattr(presses, "PRESSES", 2)
     first = make_presses(tmp_path, 1, 7, processes=1)
@@ -102,6 +103,7 @@ def test_a_stopped_run_goes_on_to_the_same_weights(parts, tmp_path):
         train_mask(parts, replace(settings, validation=3), tmp_path / "few")
 
 
+@pytest.mark.slow
 def test_a_step_of_training_lowers_the_loss(parts, tmp_path):
     _, curve = train_mask(parts, Settings(steps=30, batch=8, validation=1), tmp_path, check_every=10)
     assert curve["training"][-1] < 0.8 * curve["training"][0]
@@ -142,6 +144,7 @@ def test_what_is_written_says_what_it_was_made_of(tmp_path):
     assert path.stat().st_size < 5e6
 
 
+@pytest.mark.slow
 def test_the_network_that_comes_along_knows_presses_it_never_saw():
     """Its own parts have other seeds; of simulated readings it is right about most of the contact."""
     from geomtact.sensing.mask_network import _network

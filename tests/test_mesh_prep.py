@@ -71,6 +71,13 @@ def command():
     return lambda *args: CliRunner().invoke(app, [str(arg) for arg in args])
 
 
+@pytest.fixture
+def here(command, monkeypatch):
+    """The command, which prepares meshes in this process: starting another takes a second each."""
+    monkeypatch.setattr(prep_mesh, "_bounded", lambda *each: prep_mesh.prepare(*each) | {"seconds": 0.0})
+    return command
+
+
 @pytest.mark.parametrize("name", ["bracket", "gear", "pin"])
 def test_a_sound_part_is_kept_to_the_last_bit(name, tmp_path):
     before, unit = read(ROOT / "meshes" / f"{name}.stl", "mm", Sensor.load("gelslim"))
@@ -281,14 +288,14 @@ def test_a_surface_that_moved_is_measured_both_ways():
     assert proof.new == len(box.vertices)
 
 
-def test_steps_can_be_left_out(command, tmp_path):
+def test_steps_can_be_left_out(here, tmp_path):
     path = tmp_path / "box.stl"
     BOX.export(path)
-    done = command(path, "--unit", "mm", "--out", tmp_path / "out", *(x for s in STEPS for x in ("--skip", s)))
+    done = here(path, "--unit", "mm", "--out", tmp_path / "out", *(x for s in STEPS for x in ("--skip", s)))
     assert done.exit_code == 0, done.output
     told = json.loads((tmp_path / "out" / "box.json").read_text("utf-8"))
     assert told["outcome"] == "clean" and told["options"]["skip"] == sorted(STEPS)
-    wrong = command(path, "--unit", "mm", "--skip", "mend")
+    wrong = here(path, "--unit", "mm", "--skip", "mend")
     assert wrong.exit_code == 2 and "no step named mend" in wrong.output
 
 
@@ -320,6 +327,7 @@ def test_the_same_part_in_any_format_and_unit_is_localized_alike(few_touches, tm
         assert apart(stl, inch, stl.simulate(T).mask) < 0.01
 
 
+@pytest.mark.slow
 def test_a_curved_step_file_is_localized_within_its_tessellation(few_touches, tmp_path):
     (tmp_path / "round.step").write_text(cylinder_step(8.0, 30.0))
     fine = trimesh.creation.cylinder(8.0, 30.0, sections=1024)
@@ -433,12 +441,17 @@ def test_distances_from_thin_plates_and_wedges_are_the_least_over_all_faces(seed
 
 @pytest.mark.parametrize(
     ("ring", "height"),
-    [(PLATE, 0.5), (PLATE, 0.2), ([(0, 0), (100, 0), (0, 0.3)], 60.0), ([(0, 0), (100, 0), (0, 0.2)], 20.0)]
-    + [([(0, 0), (10, 0), (10, 10), (10, 20), (10, 10), (0, 10)], 6.0)],
+    [
+        (PLATE, 0.5),
+        pytest.param(PLATE, 0.2, marks=pytest.mark.slow),
+        pytest.param([(0, 0), (100, 0), (0, 0.3)], 60.0, marks=pytest.mark.slow),
+        ([(0, 0), (100, 0), (0, 0.2)], 20.0),
+        pytest.param([(0, 0), (10, 0), (10, 10), (10, 20), (10, 10), (0, 10)], 6.0, marks=pytest.mark.slow),
+    ],
 )
-def test_thin_plates_wedges_and_spikes_are_clean(ring, height, command, tmp_path):
+def test_thin_plates_wedges_and_spikes_are_clean(ring, height, here, tmp_path):
     (tmp_path / "thin.obj").write_text(obj_of(np.array(ring, float), height))
-    done = command(tmp_path / "thin.obj", "--unit", "mm", "--out", tmp_path / "out", "--json")
+    done = here(tmp_path / "thin.obj", "--unit", "mm", "--out", tmp_path / "out", "--json")
     (result,) = json.loads(done.stdout)["meshes"]
     assert result["outcome"] != "refused" and result["deviation_mm"] < 1e-4, result
 
@@ -452,7 +465,7 @@ def test_a_spike_without_area_is_no_deviation(tmp_path):
     assert prove(surface, repair(surface, options(surface))).largest < 1e-4
 
 
-def test_a_file_of_folded_triangles_is_refused_and_a_warning_is_told(command, tmp_path):
+def test_a_file_of_folded_triangles_is_refused_and_a_warning_is_told(here, tmp_path):
     ring = [(x, y, z) for z in (0.0, 6.0) for x, y in L_SHAPE]
     faces = [(0, k + 1, k) for k in range(1, 5)] + [(6, 6 + k, 7 + k) for k in range(1, 5)]
     faces = [tuple((c + 1) % 6 + 6 * (c // 6) for c in face) for face in faces]
@@ -461,7 +474,7 @@ def test_a_file_of_folded_triangles_is_refused_and_a_warning_is_told(command, tm
     BOX.export(tmp_path / "box.stl")
     with open(tmp_path / "box.stl", "ab") as file:
         file.write(b"end")
-    done = command(tmp_path / "fan.stl", tmp_path / "box.stl", "--unit", "mm", "--out", tmp_path / "out", "--json")
+    done = here(tmp_path / "fan.stl", tmp_path / "box.stl", "--unit", "mm", "--out", tmp_path / "out", "--json")
     fan, box = json.loads(done.stdout)["meshes"]
     assert fan["outcome"] == "refused" and "folded back onto their neighbours" in fan["reason"], fan
     assert box["warnings"] == ["3 bytes after the last triangle are passed over"]
@@ -493,9 +506,9 @@ def inch_box():
     return out.getvalue()
 
 
-def test_the_unit_of_a_file_goes_with_what_is_made_of_it(command, inch_box, tmp_path):
+def test_the_unit_of_a_file_goes_with_what_is_made_of_it(here, inch_box, tmp_path):
     (tmp_path / "part.3mf").write_bytes(inch_box)
-    done = command(tmp_path / "part.3mf", "--out", tmp_path / "out")
+    done = here(tmp_path / "part.3mf", "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     assert "part.3mf: clean, in inch" in done.output
     made = tmp_path / "out" / "part.ply"
@@ -505,21 +518,17 @@ def test_the_unit_of_a_file_goes_with_what_is_made_of_it(command, inch_box, tmp_
         np.testing.assert_allclose(np.ptp(load_mesh(made, unit).vertices, axis=0), np.multiply(25.4e-3, [1, 0.8, 0.5]))
     with pytest.raises(MeshError, match="a comment in it states the unit inch, but the unit mm was given"):
         load_mesh(made, "mm")
-    again = command(made, "--out", tmp_path / "again", "--json")
+    again = here(made, "--out", tmp_path / "again", "--json")
     assert json.loads(again.stdout)["meshes"][0]["unit"] == "inch"
     assert (tmp_path / "again" / "part.ply").read_bytes() == made.read_bytes()
-    assert (
-        "the file says inch, but --unit mm was given" in command(made, "--unit", "mm", "--out", tmp_path / "c").output
-    )
+    assert "the file says inch, but --unit mm was given" in here(made, "--unit", "mm", "--out", tmp_path / "c").output
 
 
-def test_of_several_files_the_unit_is_for_those_that_need_one(command, inch_box, tmp_path):
+def test_of_several_files_the_unit_is_for_those_that_need_one(here, inch_box, tmp_path):
     (tmp_path / "a.3mf").write_bytes(inch_box)
     BOX.export(tmp_path / "b.stl")
     BOX.copy().apply_scale(1e-3).export(tmp_path / "c.glb")
-    done = command(
-        *(tmp_path / name for name in ("a.3mf", "b.stl", "c.glb")), "--unit", "cm", "--json", "--out", tmp_path
-    )
+    done = here(*(tmp_path / name for name in ("a.3mf", "b.stl", "c.glb")), "--unit", "cm", "--json", "--out", tmp_path)
     assert [result["unit"] for result in json.loads(done.stdout)["meshes"]] == ["inch", "cm", "m"]
 
 
@@ -561,10 +570,10 @@ def test_a_mesh_that_takes_too_long_is_given_up(command, tmp_path, monkeypatch):
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_a_part_of_a_catalogue_goes_by_its_name(command, tmp_path, monkeypatch):
+def test_a_part_of_a_catalogue_goes_by_its_name(here, tmp_path, monkeypatch):
     BOX.export(tmp_path / "crate.stl")
     folder = tmp_path / "parts"
-    done = command(tmp_path / "crate.stl", "--unit", "mm", "--out", tmp_path / "out", "--add-to", folder)
+    done = here(tmp_path / "crate.stl", "--unit", "mm", "--out", tmp_path / "out", "--add-to", folder)
     assert done.exit_code == 0, done.output
     monkeypatch.setattr(catalogues, "meshes_folder", lambda: folder)
     catalogues.catalogue.cache_clear()

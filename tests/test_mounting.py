@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from speed import slow_but
 from typer.testing import CliRunner
 
 from geomtact import ImageError, Sensor, SensorError, calibrate, contact_height, contact_mask
@@ -101,7 +102,7 @@ def test_the_contact_turns_with_the_images(simulated, method):
     assert min(agreements(some, method, 1)) >= 0.97
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", slow_but(METHODS, "classical"))
 def test_the_contact_turns_with_real_images(real, method):
     for name, (rest, images) in real.items():
         assert min(agreements([(image, rest) for image in images], method, 2)) >= 0.97, name
@@ -129,7 +130,7 @@ def unit(image):
     return (image / 255).astype(np.float32)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.05, 0.1, 0.2])
+@pytest.mark.parametrize("share", slow_but([0.02, 0.05, 0.1, 0.2], 0.02, 0.2))
 @pytest.mark.parametrize("method", METHODS)
 def test_stripes_of_light_are_no_contact_and_hide_none(simulated, share, method):
     rng, kept = np.random.default_rng(3), []

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from speed import slow_but
 from typer.testing import CliRunner
 
 from geomtact.cli.next_touch import next_touch as next_touch_command
@@ -302,13 +303,14 @@ def test_cells_are_drawn_by_their_probability(plug, posterior, rng):
     assert (held.reshape(5, 20) == held.reshape(5, 20)[0]).mean() > 0.9
 
 
-def test_a_refined_cell_is_drawn_as_registration_left_it(plug, a_touch):
+@pytest.mark.parametrize("n", slow_but((1500, 4000), 1500))
+def test_a_refined_cell_is_drawn_as_registration_left_it(plug, a_touch, n):
     world = plug.localize(a_touch(plug)[1], T_world_sensor=T_MOVED)
     mode = next(mode for mode in world.modes() if mode.refined)
     cell = next(c for c, found in world.refined.items() if np.allclose(T_MOVED @ found.T, mode.T))
     row = np.flatnonzero(world.cells == cell)
     known = replace(world, cells=world.cells[row], log_prob=np.zeros(1), runs=None)
-    T = draw_cells(known, 2, np.random.default_rng(0), 4000)
+    T = draw_cells(known, 2, np.random.default_rng(0), n)
     white = np.linalg.solve(np.linalg.cholesky(mode.covariance), log(inverse(mode.T) @ T).reshape(-1, 6).T)
     assert white.mean(1) == pytest.approx(np.zeros(6), abs=0.06)
     assert np.cov(white) == pytest.approx(np.eye(6), abs=0.08)

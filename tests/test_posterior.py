@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
+from speed import slow_but
 
 from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import spelled_out
@@ -253,9 +254,9 @@ def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_
     assert posterior.likeliest(0).shape == (0, 4, 4)
 
 
-def test_as_many_of_the_likeliest_are_found_as_are_asked_for_wherever_they_stand(pin, posteriors):
+def test_as_many_of_the_likeliest_are_found_as_are_asked_for_wherever_they_stand(plug, posteriors):
     """Also where the very likeliest are every fiftieth, by which the rest is sifted."""
-    posterior = posteriors(pin)
+    posterior = posteriors(plug)
     plain = replace(
         posterior, cells=posterior.index.possible, log_prob=np.zeros(len(posterior.index.possible)), runs=None
     )
@@ -364,7 +365,7 @@ def test_a_seed_draws_what_its_generator_draws(plug, posteriors):
 # --- on disk
 
 
-@pytest.mark.parametrize("name", ["plug", "ball", "flat_nut", "cone"])
+@pytest.mark.parametrize("name", slow_but(["plug", "ball", "flat_nut", "cone"], "plug", "flat_nut"))
 def test_a_posterior_survives_the_disk(name, request, a_touch, samples, cache_dir, tmp_path):
     localizer = request.getfixturevalue(name)
     T, mask = a_touch(localizer)
@@ -458,12 +459,15 @@ def test_a_truncated_posterior_is_refused(plug, posteriors, tmp_path):
         Posterior.load(tmp_path / "p.npz")
 
 
-def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_touch):
+@pytest.fixture(scope="module")
+def exact(ball, a_touch):
+    """The posterior of one touch of a ball, every cell scored, without refinement."""
+    return replace(ball.localize(a_touch(ball)[1], effort="exact"), refined={})
+
+
+def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_touch, exact):
     """In cells and in blocks; all others keep what they have."""
-    mask = a_touch(ball)[1]
-    for effort in ("fast", "exact"):
-        before = ball.localize(mask, effort=effort)
-        before = replace(before, refined={})
+    for before in (ball.localize(a_touch(ball)[1], effort="fast"), exact):
         row = np.argsort(-before.log_prob)[:4]
         likelihood = np.array([3.0, 0.0, -2.0, 1.0])
         after = before.shared_anew(before.cells[row], likelihood)
@@ -483,8 +487,8 @@ def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_
         np.testing.assert_allclose(density - density[0], likelihood - likelihood[0], atol=1e-4)
 
 
-def test_of_mass_shared_anew_the_images_count_by_a_power_and_a_prior_in_full(ball, a_touch):
-    before = replace(ball.localize(a_touch(ball)[1], effort="exact"), refined={}, runs=None)
+def test_of_mass_shared_anew_the_images_count_by_a_power_and_a_prior_in_full(exact):
+    before = replace(exact, runs=None)
     cells, index = before.cells[np.argsort(-before.log_prob)[:40]], before.index
     rng = np.random.default_rng(0)
     likelihood, nats = rng.normal(size=40), rng.normal(size=len(index))
@@ -496,8 +500,8 @@ def test_of_mass_shared_anew_the_images_count_by_a_power_and_a_prior_in_full(bal
     np.testing.assert_allclose(shift, shift[0], atol=1e-3)
 
 
-def test_a_cell_without_likelihood_keeps_its_mass(ball, a_touch):
-    before = replace(ball.localize(a_touch(ball)[1], effort="exact"), refined={}, runs=None)
+def test_a_cell_without_likelihood_keeps_its_mass(exact):
+    before = replace(exact, runs=None)
     rows = np.argsort(-before.log_prob)[:3]
     after = before.shared_anew(before.cells[rows], np.array([-np.inf, 0.0, 2.0]))
     assert after.log_prob[rows[0]] == before.log_prob[rows[0]]

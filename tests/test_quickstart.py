@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from geomtact.cli import app
 
 ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.slow  # each command prepares, at the full size
 SECTIONS = re.split(r"^## ", (ROOT / "docs" / "quickstart.md").read_text("utf-8"), flags=re.MULTILINE)
 # With bfloat16 and without, the sample's information gain differs by 0.003 nats, the number of poses by 0.3 %, the probability
 # of a mode by 0.01 %; figures are printed with one digit after the point. Ten times that is left for other processors.

@@ -123,6 +123,7 @@ def test_a_command_says_nothing_of_missing_pictures_and_takes_any_name(tmp_path)
     assert (tmp_path / STRANGE / r"p\udcfcr_1.png").is_file()
 
 
+@pytest.mark.slow
 def test_preparation_says_nothing_of_missing_pictures_and_takes_any_name(tmp_path):
     pytest.importorskip("pymeshlab")
     ply, _ = textured(tmp_path)

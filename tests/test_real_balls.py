@@ -18,6 +18,7 @@ from geomtact.report.sensor_image import sensor_images
 from geomtact.report.write import write_all
 from geomtact.se3 import inverse, random_rotations, transform
 
+pytestmark = pytest.mark.slow  # prepares 300,000 poses of two balls
 CIRCLES = Path(__file__).with_name("circles_gelslam_gsmini.csv")
 MM = 1e-3
 DIAMETERS = ("6.310", "9.500")

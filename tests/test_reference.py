@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from speed import slow_but
 from trimesh.creation import box, cylinder
 
 from geomtact import Localizer, Sensor
@@ -94,7 +95,7 @@ def forms_of_prior(T):
     }
 
 
-@pytest.mark.parametrize("name", SYMMETRIC)
+@pytest.mark.parametrize("name", slow_but(SYMMETRIC, "ball", "flat_nut"))
 def test_modes_are_the_images_nearest_to_a_prior(name, request, a_touch, rng):
     localizer = request.getfixturevalue(name)
     T, mask = a_touch(localizer)
@@ -116,7 +117,7 @@ def test_modes_are_the_images_nearest_to_a_prior(name, request, a_touch, rng):
         check_nearest(localizer.mesh, likeliest[0], T, allowed)
 
 
-@pytest.mark.parametrize("name", SYMMETRIC)
+@pytest.mark.parametrize("name", slow_but(SYMMETRIC, "ball", "flat_nut"))
 def test_a_posterior_as_prior_hands_its_image_on_by_disk_too(name, request, a_touch, rng, tmp_path):
     localizer = request.getfixturevalue(name)
     T, mask = a_touch(localizer)
@@ -134,12 +135,14 @@ def test_a_posterior_as_prior_hands_its_image_on_by_disk_too(name, request, a_to
             check_nearest(localizer.mesh, mode.T, first.modes(1)[0].T, localizer.space.approaches)
 
 
-def test_what_a_mode_tells_turns_with_its_image(curved, a_touch, rng):
+@pytest.mark.parametrize("name", slow_but(("curved", "flat_nut"), "flat_nut"))
+def test_what_a_mode_tells_turns_with_its_image(name, request, a_touch, rng):
     """Moved by xi, a pose is moved by A xi as its image: the covariance and what is observable follow."""
-    T, mask = a_touch(curved)
-    posterior = curved.localize(mask)
+    localizer = request.getfixturevalue(name)
+    T, mask = a_touch(localizer)
+    posterior = localizer.localize(mask)
     compared = 0
-    for S in curved.mesh.symmetry.elements[1::3]:
+    for S in localizer.mesh.symmetry.elements[1::3]:
         at = posterior.modes(1)[0].T @ S
         turned = replace(posterior, reference=Reference(at[None], np.zeros(1)))
         for own, image in zip(posterior.modes(3), turned.modes(3), strict=True):
@@ -170,19 +173,20 @@ def test_what_a_contact_leaves_open_is_the_same_in_every_image():
         np.testing.assert_allclose(back.observable.T @ back.observable, np.diag([1, 0, 0, 1, 0, 0]), atol=1e-9)
 
 
-def test_a_function_is_asked_which_image_it_prefers(pin, ball, a_touch, rng):
+@pytest.mark.parametrize(("name", "turns"), [pytest.param("pin", 720, marks=pytest.mark.slow), ("ball", 40)])
+def test_a_function_is_asked_which_image_it_prefers(name, turns, request, a_touch, rng):
     """Where turns are continuous its largest value is found to a tenth of a degree."""
-    for localizer in (pin, ball):
-        T, mask = a_touch(localizer)
-        T = an_image(localizer, T, rng)
+    localizer = request.getfixturevalue(name)
+    T, mask = a_touch(localizer)
+    T = an_image(localizer, T, rng)
 
-        def density(others, T=T):
-            turned = Rotation.from_matrix(np.swapaxes(others[:, :3, :3], 1, 2) @ T[:3, :3]).magnitude()
-            return -0.5 * (turned / 0.05) ** 2
+    def density(others):
+        turned = Rotation.from_matrix(np.swapaxes(others[:, :3, :3], 1, 2) @ T[:3, :3]).magnitude()
+        return -0.5 * (turned / 0.05) ** 2
 
-        mode = localizer.localize(mask, prior=density).modes(1)[0]
-        images = mode.T @ localizer.mesh.symmetry.sampled(720 if localizer is pin else 40)
-        assert density(mode.T[None])[0] >= density(images).max() - 0.01
+    mode = localizer.localize(mask, prior=density).modes(1)[0]
+    images = mode.T @ localizer.mesh.symmetry.sampled(turns)
+    assert density(mode.T[None])[0] >= density(images).max() - 0.01
 
 
 def test_of_several_poses_those_with_more_mass_say_which_image(flat_nut, a_touch):
@@ -212,7 +216,7 @@ def test_an_image_that_the_approach_rules_out_is_not_reported(flat_nut, a_touch)
         check_nearest(flat_nut.mesh, mode.T, below[0], flat_nut.space.approaches)
 
 
-@pytest.mark.parametrize("name", SYMMETRIC)
+@pytest.mark.parametrize("name", slow_but(SYMMETRIC, "ball", "flat_nut"))
 def test_a_track_does_not_jump_between_images(name, request):
     localizer: Localizer = request.getfixturevalue(name)
     masks = random_trajectory(localizer.space, 4, 3).masks
@@ -227,7 +231,7 @@ def test_a_track_does_not_jump_between_images(name, request):
         before = modes[0].T if modes else before
 
 
-@pytest.mark.parametrize("form", ["Gaussian", "function", "pair", "posterior"])
+@pytest.mark.parametrize("form", slow_but(["Gaussian", "function", "pair", "posterior"], "function", "posterior"))
 def test_a_track_begins_at_the_image_of_its_prior(flat_nut, form, rng):
     trajectory = random_trajectory(flat_nut.space, 3, 5)
     T = an_image(flat_nut, trajectory.T_sensor_object[0], rng)
@@ -243,6 +247,7 @@ def test_a_track_begins_at_the_image_of_its_prior(flat_nut, form, rng):
         assert turned < np.radians(60)
 
 
+@pytest.mark.slow
 def test_several_sensors_report_the_image_of_the_prior(pin, rng):
     T, _ = pin.space.sample(60, rng, (0.6 * MM, 1.2 * MM))
     T = max(T, key=lambda T: pin.simulate(T).mask.sum())

@@ -197,6 +197,7 @@ window.addEventListener("load", () => setTimeout(() => {
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with")
+@pytest.mark.slow
 def test_the_page_in_a_browser(touch, tmp_path):
     """Without a network it opens without an error, draws the part, and changes modes on click and by key: each picture is another
     one, but that of the first mode comes back as it was."""
@@ -473,6 +474,7 @@ def test_several_sensors_are_shown_in_their_order(plug, rng):
         ("track", None, "track"),
     ],
 )
+@pytest.mark.studies
 def test_every_committed_picture_is_drawn_from_its_study_alone(study, which, picture, tmp_path):
     """Pixel for pixel."""
     docs = Path(__file__).parents[1] / "docs"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest, chi2, kstest
+from speed import slow_but
 
 from geomtact.errors import UsageError
 from geomtact.geometry.approach import allowed, approach_of, check_approach, facing
@@ -127,7 +128,7 @@ def test_symmetry_saves_what_it_makes_equal(symmetry):
 @each_symmetry
 @each_approach
 @each_grid
-@pytest.mark.parametrize("level", [1, 2])
+@pytest.mark.parametrize("level", slow_but([1, 2], 1))
 def test_uniform_rotations_fall_into_each_cell_by_its_weight(symmetry, approach, level, disks, rng):
     directions = grid(symmetry, approach, level, disks)
     T = random_poses(30_000, rng, directions.cones)
@@ -140,7 +141,7 @@ def test_uniform_rotations_fall_into_each_cell_by_its_weight(symmetry, approach,
 @each_symmetry
 @each_approach
 @each_grid
-@pytest.mark.parametrize("level", [1, 2])
+@pytest.mark.parametrize("level", slow_but([1, 2], 1))
 def test_each_rotation_of_the_grid_is_in_its_own_cell(symmetry, approach, level, disks):
     directions = grid(symmetry, approach, level, disks)
     R, _, _ = directions.rotations()
@@ -226,7 +227,7 @@ def test_a_face_lies_in_a_small_cell_of_its_own(symmetry, rng):
 
 
 @pytest.mark.parametrize("symmetry", ["none", "six turns"])
-@pytest.mark.parametrize("level", [1, 2])
+@pytest.mark.parametrize("level", slow_but([1, 2], 1))
 def test_cones_about_a_face_weigh_what_they_put_into_its_cells(symmetry, level, rng):
     """From far narrower than a cell of the disk to wider than the disk, about its middle and off it."""
     face, disk = np.array([0.54, 0.29, 0.79]) / np.linalg.norm([0.54, 0.29, 0.79]), 0.2 / level

@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 import trimesh
+from speed import slow_but
 from trimesh.creation import box, capsule, cone, cylinder, icosahedron, icosphere, torus
 
 from geomtact.geometry.mesh_file import load_mesh
@@ -43,7 +44,10 @@ SOLIDS = {
 }
 
 
-@pytest.mark.parametrize("name", SOLIDS)
+QUICK = ("brick", "hexagonal prism", "tetrahedron", "cube with a bump at a corner", "cube with a bump elsewhere")
+
+
+@pytest.mark.parametrize("name", slow_but(SOLIDS, *QUICK, "cylinder of 32 sides", "ball"))
 def test_known_groups_in_any_frame(name, rng):
     mesh, kind, count = SOLIDS[name]
     R = random_rotations(1, rng)[0]

@@ -42,6 +42,7 @@ def test_the_network_has_an_identity_at_its_end_and_1000_numbers():
     assert sum(p.numel() for p in network.parameters()) == 25_557_032
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_and_its_weights_score(plug, tmp_path, cache_dir, make_localizer):
     class Stopped(Exception):
         pass

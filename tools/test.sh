@@ -1,9 +1,15 @@
 #!/bin/sh
-# Sets .venv up (once) and runs the tests; arguments go to pytest, e.g. sh tools/test.sh -k report
+# Sets .venv up (once) and runs the fast tests: an instance of every law; with --all first, every test.
+# Other arguments go to pytest, e.g. sh tools/test.sh -k report
 set -eu
 cd "$(dirname "$0")/.."
 . tools/setup.sh
 set_up dev
+selected="not slow and not studies"
+if [ "${1:-}" = --all ]; then
+    selected=""
+    shift
+fi
 # two workers, each on one core: threads of both would only wait for each other
 export OMP_NUM_THREADS=1
-exec .venv/bin/python -m pytest -n 2 --dist worksteal "$@"
+exec .venv/bin/python -m pytest -n 2 --dist worksteal --durations=25 -m "$selected" "$@"
