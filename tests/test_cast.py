@@ -1,13 +1,11 @@
 """Laws of simulated contact: balls whose contact is known in closed form, and rays traced one triangle at a time."""
 
-import sys
-
 import numpy as np
 import pytest
 import trimesh
 
 from geomtact.geometry.mesh_file import load_mesh
-from geomtact.se3 import apply, random_rotations, transform, unit
+from geomtact.se3 import apply, random_rotations, transform
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
 
@@ -257,37 +255,3 @@ def test_the_housing_is_entered_by_what_reaches_below_it_outside_the_window():
     assert caster.lowest_outside(PERSPECTIVE, at(0, 0, 1 * MM)[None])[0] == np.inf
     small = box((4 * MM, 4 * MM, 4 * MM), (0, 0, 2 * MM))
     assert small.lowest_outside(PERSPECTIVE, at(0, 0, -1 * MM)[None])[0] == np.inf
-
-
-@pytest.mark.parametrize("name", ["pin", "gear"])
-def test_open3d_casts_the_same_where_embree_is_not_installed(name, monkeypatch, rng):
-    from geomtact.sensing.scene import scene_of
-
-    mesh = load_mesh(name)
-    by_embree = Caster(mesh.vertices, mesh.faces)
-    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
-    by_open3d = Caster(mesh.vertices, mesh.faces)
-    assert type(by_embree._scene) is not type(by_open3d._scene)
-    T = transform(random_rotations(20, rng), rng.uniform(-0.01, 0.01, (20, 3)) + [0, 0, 0.02])
-    mine, theirs = (caster.depths(PERSPECTIVE, T, (24, 32)) for caster in (by_embree, by_open3d))
-    both = np.isfinite(mine) & np.isfinite(theirs)
-    assert (np.isfinite(mine) != np.isfinite(theirs)).mean() < 1e-3  # rays along an edge
-    assert (np.abs(mine[both] - theirs[both]) > 1e-7).mean() < 1e-3
-    for caster in (by_embree, by_open3d):
-        assert caster.contact(PERSPECTIVE, T[0]).mask.shape == (240, 320)
-    inside = at(0, 0, -PERSPECTIVE.camera_distance) @ transform(np.eye(3), -mesh.sample_surface(1)[0][0] * 0.98)
-    assert by_embree.penetration(PERSPECTIVE, inside) == pytest.approx(by_open3d.penetration(PERSPECTIVE, inside))
-    assert (
-        by_embree.faces_met(PERSPECTIVE, T[0], (24, 32)) == by_open3d.faces_met(PERSPECTIVE, T[0], (24, 32))
-    ).mean() > 0.99
-
-    corners = mesh.vertices[mesh.faces].astype(np.float32)
-    origin = rng.normal(size=(200, 3)).astype(np.float32)
-    aim = (mesh.sample_surface(200)[0] - origin).astype(np.float32)
-    other = scene_of(corners).hits(origin, aim)
-    monkeypatch.undo()
-    own = scene_of(corners).hits(origin, aim)
-    same = own.face == other.face
-    assert same.mean() > 0.98
-    np.testing.assert_allclose(own.t[same], other.t[same], rtol=1e-4)
-    assert (unit(own.normal[same]) * unit(other.normal[same])).sum(1).min() > 0.999

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import typer
 from PIL import Image
+from speed import slow_but
 from typer.testing import CliRunner
 
 from geomtact import se3
@@ -27,7 +28,6 @@ from tools.studies.track.trajectories import random_trajectory
 
 STILL = GaussianTwist(0.0, 0.0)
 KINDS = ("pin", "ball", "cone", "flat_nut")  # an axis, a sphere, cones of approach, and a face with a housing
-MOTIONS = (UniformBall(), GaussianTwist(0.05, 1e-3))
 
 
 def track(localizer, frames, *args, **options):
@@ -55,40 +55,9 @@ def creeping(flat_nut):
     return [(t, [alone(flat_nut, mask) for mask in t.masks]) for t in found]
 
 
-@pytest.fixture(params=KINDS)
+@pytest.fixture(params=slow_but(KINDS, "ball", "flat_nut"))
 def index(request):
     return request.getfixturevalue(request.param).index
-
-
-@pytest.mark.parametrize("motion", MOTIONS, ids=lambda m: str(m))
-def test_a_motion_keeps_the_uniform_distribution_and_all_mass(index, motion, rng):
-    spread = Spreading(index, motion)
-    possible = index.possible
-    after = spread(Mixture(possible, weights(index)[possible], 0.0))
-    np.testing.assert_allclose(dense(index, after), weights(index), rtol=2e-3, atol=1e-9)
-    assert len(np.unique(after.cells)) == len(after.cells)
-    cells = np.sort(rng.choice(possible, 20, replace=False))
-    after = spread(Mixture(cells, rng.dirichlet(np.ones(20)), 0.0))
-    assert after.mass.sum() == pytest.approx(1, abs=1e-4)
-    assert after.mass.min() >= 0
-    assert (weights(index)[after.cells] > 0).all()
-
-
-@pytest.mark.parametrize("motion", MOTIONS, ids=lambda m: str(m))
-def test_parts_of_a_distribution_spread_each_for_itself(index, motion, rng):
-    """Whatever few cells hold: those of few rotations are spread by another way than those of all."""
-    spread, possible = Spreading(index, motion), index.possible
-    mass = weights(index)[possible] * rng.random(len(possible))
-    few = np.isin(index.rotation[possible % index.places], rng.choice(index.rotation, 2))
-    whole = dense(index, spread(Mixture(possible, mass, 0.0)))
-    parts = [dense(index, spread(Mixture(possible[some], mass[some], 0.0))) for some in (few, ~few)]
-    np.testing.assert_allclose(sum(parts), whole, rtol=1e-4, atol=1e-10)
-
-
-def test_what_does_not_move_stays(index, rng):
-    cells = np.sort(rng.choice(index.possible, 20, replace=False))
-    before = Mixture(cells, rng.dirichlet(np.ones(20)), 0.0)
-    np.testing.assert_allclose(dense(index, Spreading(index, STILL)(before)), dense(index, before), atol=1e-5)
 
 
 def test_a_sensor_that_hardly_moves_changes_nothing(index, rng):
@@ -196,6 +165,7 @@ def test_the_filter_beats_single_frames(flat_nut, creeping):
     assert (np.array(followed) > np.array(single_gain) - 0.2).all()
 
 
+@pytest.mark.slow
 def test_frames_alike_are_not_taken_for_independent(pin):
     """On a grid of centimetres the frames of a slow object err alike: the thesis's filter becomes sure of a wrong pose."""
     t = random_trajectory(pin.space, 8, 1)
@@ -394,6 +364,7 @@ def test_trajectories_creep_and_stay_in_contact(flat_nut):
     assert steps[3] > 3e-3
 
 
+@pytest.mark.studies
 def test_the_study_tells_what_the_posteriors_do(flat_nut):
     (told,) = track_study.follow(flat_nut, 3, 0, 3, MODERATE, "fast", first=2)
     t = track_study.make_trajectory(flat_nut, 2, 0, 3, MODERATE)
