@@ -96,6 +96,7 @@ def test_a_killed_process_loses_its_own_task_which_is_done_anew(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {*names, "killed"}
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_every_process_is_given_up_alone(tmp_path):
     told = dict(run_all(note, [(tmp_path, name, "") for name in ("deadly", "a", "b")], 2))
     assert "died, three times" in str(told.pop(0))
@@ -202,6 +203,7 @@ def test_an_address_without_a_cluster_is_said():
         list(run_all(note, [("", "a", "")], ray="127.0.0.1:1"))
 
 
+@pytest.mark.slow
 def test_the_command_prepares_several_parts_and_names_those_that_it_cannot(few_touches, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "broken.stl").write_text("no mesh")

@@ -110,6 +110,7 @@ def test_a_bulging_membrane_takes_its_own_slope_off_the_balls():
     assert np.linalg.norm(np.subtract(found.sensor.colour.weights, flat.sensor.colour.weights)) > 0.05
 
 
+@pytest.mark.slow
 def test_two_balls_tell_how_a_membrane_bulges_and_that_a_flat_one_does_not():
     """The curvature comes out somewhat too small: imprints on a bulge are not quite round."""
     for bend in (0.0, 35 * MM, 100 * MM):

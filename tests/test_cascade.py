@@ -198,6 +198,7 @@ def _with_depth(localizer, T):
     return T, localizer.space.penetration(T)
 
 
+@pytest.mark.slow
 def test_little_is_lost_where_little_mass_is_left_in_blocks(localizer, rng):
     """Mean log density at true poses, against that of a full pass."""
     lost = []

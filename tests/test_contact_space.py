@@ -432,6 +432,7 @@ def _build_slowly(folder, log):
         file.write(f"{len(index)}\n")
 
 
+@pytest.mark.slow
 def test_two_processes_at_once_build_once(tmp_path):
     context = multiprocessing.get_context("spawn")
     log = tmp_path / "log"
@@ -455,6 +456,7 @@ def _build_and_wait(folder, flag):
     tiny_index(folder)
 
 
+@pytest.mark.slow
 def test_a_killed_build_leaves_no_entry_and_no_lock(tmp_path):
     context = multiprocessing.get_context("spawn")
     flag = tmp_path / "writing"

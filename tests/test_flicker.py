@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from speed import slow_but
 
 from geomtact import contact_mask
 from geomtact.sensing.flicker import without_flicker
@@ -71,7 +72,7 @@ def overlap(a, b):
 
 
 @pytest.mark.parametrize("light", LIGHTS)
-@pytest.mark.parametrize("along_rows", [True, False])
+@pytest.mark.parametrize("along_rows", slow_but([True, False], True))
 def test_no_contact_all_across_the_image_is_evened_out(light, along_rows, rng):
     """Rods, bars and ribs, tilted by up to a degree: the image stays as it is, so the contact does."""
     for kind, size in KINDS:

@@ -200,7 +200,8 @@ def test_a_sensor_that_feels_nothing_speaks_against_poses_that_would_touch_it(pl
     assert np.corrcoef(share, ratio)[0, 1] < -0.9 and ratio[share.argmin()] > 0 > ratio[share.argmax()]
 
 
-@pytest.mark.parametrize("order", slow_but([(0, 1, 2, 3, 4), (3, 4, 0, 1, 2), (0, 3, 1, 4, 2)], (3, 4, 0, 1, 2)))
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (3, 4, 0, 1, 2), (0, 3, 1, 4, 2)])
+@pytest.mark.slow
 def test_refinement_learns_nothing_from_sensors_out_of_reach_wherever_they_stand(plug, order):
     touches = random_touches(plug.space, 3, 11)
     _, sensors = world(touches, np.random.default_rng(1))
@@ -417,6 +418,7 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
     assert done.exit_code == 2 and "2 images need --sensor-poses" in done.output
 
 
+@pytest.mark.slow
 def test_a_jaw_on_a_plain_rod_says_that_it_may_be_shifted(make_localizer):
     """Both fingers feel the same all along: no mode claims to know where along the rod they hold it."""
     bar = trimesh.creation.cylinder(6e-3, 0.1, sections=64)
@@ -451,15 +453,15 @@ def test_what_a_rig_leaves_open_of_a_pose_is_what_its_errors_make_of_it(rng):
     assert whiten @ np.mean(sampled, 0) @ whiten.T == pytest.approx(np.eye(6), abs=0.05)
 
 
-@pytest.mark.parametrize(("scenes", "right", "more"), [(1, 0, 1), pytest.param(6, 2, 3, marks=pytest.mark.slow)])
-def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug, scenes, right, more):
+@pytest.mark.slow
+def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
     """Each of the sensors but the first off by 5 mm, in a direction of its own: unless the rig is said to be known no better.
 
     Were one right rig in ten warned of, three of six would be once in 63 times.
     """
     rng = np.random.default_rng(5)
     told, last = {"right": 0, "off": 0, "known to be": 0}, {}
-    for scene in make_scenes(plug, scenes, 9, MODERATE, None, 3):
+    for scene in make_scenes(plug, 6, 9, MODERATE, None, 3):
         masks = [touch.mask for touch in scene.touches]
         off = scene.T_world_sensor.copy()
         way = rng.normal(size=(2, 3))
@@ -475,7 +477,7 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug, scenes, rig
             except NoPoseAgreesError:
                 continue
             told[name] += any("agree badly" in warning for warning in posterior.warnings)
-    assert told["right"] <= right and told["off"] >= told["right"] + more and told["known to be"] == 0, told
+    assert told["right"] <= 2 and told["off"] >= told["right"] + 3 and told["known to be"] == 0, told
     exact = plug.localize(masks, "mask", T_world_sensor=off, rig=RigStd())
     assert np.array_equal(exact.log_prob, last["off"].log_prob)
     # a mode is told no better than the rig

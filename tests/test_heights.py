@@ -75,6 +75,7 @@ def test_beside_a_flat_punch_hardly_anything_that_is_not_touched_counts_as_surel
     assert found.sure.sum() < 1.35 * touched.sum() < found.mask.sum()
 
 
+@pytest.mark.slow
 def test_sensors_of_one_kind_keep_their_own_calibration(tmp_path):
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=BALL)
     pair = [replace(SENSOR, height_noise=n * MM) for n in (0.02, 0.2)]

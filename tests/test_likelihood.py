@@ -89,6 +89,7 @@ def test_a_cast_at_the_true_pose_is_more_likely_than_beside_it(plug, rng, elasti
     assert len(better) > 10 and np.mean(better) > 0.9
 
 
+@pytest.mark.slow
 def test_on_a_fine_grid_it_tells_where_the_part_is(make_localizer):
     """One exact face, so that a cell is a few millimetres wide: more than the thesis's pixel distance tells."""
     face = [((0, 0, 1), 0.0)]

@@ -242,7 +242,8 @@ def test_a_gaussian_prior_is_where_it_says(localizer, uniform_poses):
     assert again == pytest.approx(mass, abs=0.06)  # four deviations of a share of a thousand draws
 
 
-@pytest.mark.parametrize("std", slow_but((0.02, 0.1, 0.5), 0.1))
+@pytest.mark.slow
+@pytest.mark.parametrize("std", [0.02, 0.1, 0.5])
 def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_poses, std):
     """Of what touches, by the exact caster; from narrower than a cell, where heights within it differ by more, to far wider.
     The total variation is bounded, draws included."""
@@ -261,7 +262,8 @@ def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_po
         assert 0.5 * np.abs(mass - own).sum() < apart
 
 
-@pytest.mark.parametrize("name", slow_but(["curved", "flat_nut"], "flat_nut"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["curved", "flat_nut"])
 def test_a_prior_outlives_a_sensor_that_feels_nothing_whichever_image_it_names(name, request, uniform_poses):
     """A sensor far away feels nothing: what it tells is the prior, the same of every image of a pose, and as a prior for another
     sensor it says what the prior itself says there."""
@@ -470,6 +472,7 @@ def test_millimetre_stl_and_metre_glb_give_one_posterior(make_localizer, tmp_pat
     assert PoseDistance(a.mesh).mean(first.T, other.T[None])[0] < 0.05 * MM
 
 
+@pytest.mark.slow
 def test_the_order_of_vertices_and_faces_does_not_matter(make_localizer, rng):
     mesh = load_mesh("hex_nut")
     order = rng.permutation(len(mesh.vertices))

@@ -44,6 +44,7 @@ def parts():
     return [press_part(i, 7) for i in range(3)]
 
 
+@pytest.mark.slow
 def test_a_press_shows_colour_around_its_contact(parts):
     again = press_part(0, 7)
     assert np.array_equal(again.seen, parts[0].seen) and np.array_equal(again.contact, parts[0].contact)
@@ -82,6 +83,7 @@ def test_presses_are_made_once(tmp_path, monkeypatch):
     assert np.array_equal(first[0].seen, second[0].seen) and (tmp_path / "0.npz").stat().st_mtime_ns == made
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_to_the_same_weights(parts, tmp_path):
     settings = Settings(steps=6, batch=4, validation=1)
     whole, curve = train_mask(parts, settings, tmp_path / "whole", check_every=3)
@@ -109,6 +111,7 @@ def test_a_step_of_training_lowers_the_loss(parts, tmp_path):
     assert curve["training"][-1] < 0.8 * curve["training"][0]
 
 
+@pytest.mark.slow
 def test_training_goes_on_from_weights_that_are_given(parts, tmp_path):
     first, _ = train_mask(parts, Settings(steps=10, batch=8, validation=1), tmp_path / "first")
     write_mask_network(tmp_path / "first.safetensors", first, {}, Settings(), 0)
@@ -210,6 +213,7 @@ def test_the_sensor_says_how_contact_is_found_and_probabilities_reach_the_locali
     assert np.array_equal(second.mask, second.probability > 0.5) and second.soft_mask is second.probability
 
 
+@pytest.mark.slow
 def test_by_itself_the_network_is_asked_where_light_is_blown_out_and_colours_tell_slopes(data_folder):
     """On the gels of FOTS and ObjectFolder one channel is blown out beside every ball, on the GelSight Mini none ever is."""
     for name, some in imprints(data_folder).items():

@@ -182,6 +182,7 @@ def test_a_sheet_of_no_thickness_goes_and_a_cavity_stays(tmp_path):
     sound(work.surface, tmp_path)
 
 
+@pytest.mark.slow
 def test_the_largest_body_alone_and_specks():
     speck = trimesh.creation.box((1e-3, 1e-3, 1e-3))
     speck.apply_translation([20, 0, 0])
@@ -313,6 +314,7 @@ def apart(a, b, mask):
     return 1e3 * PoseDistance(a.mesh).mean(one, other[None])[0]
 
 
+@pytest.mark.slow
 def test_the_same_part_in_any_format_and_unit_is_localized_alike(few_touches, tmp_path, rng):
     part = load_mesh("bracket")
     for file, scale in {"mm.stl": 1e3, "metre.glb": 1.0, "inch.obj": 1 / 25.4e-3}.items():
@@ -543,6 +545,7 @@ def test_nothing_is_written_over_the_input(command, tmp_path):
     assert prep_mesh._names(files) == ["part", "part_3", "part_2", "part_4"]
 
 
+@pytest.mark.slow
 def test_a_folder_gets_a_table_and_what_is_refused_leaves_nothing(command, tmp_path):
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
@@ -597,6 +600,7 @@ def test_a_part_of_a_catalogue_goes_by_its_name(here, tmp_path, monkeypatch):
         catalogues.catalogue.cache_clear()
 
 
+@pytest.mark.slow
 def test_real_nuts_and_gear_become_solids_where_they_were(data_folder, tmp_path):
     for file in ("factory_nut_m16_tight_subdiv_3x", "factory_gear_small_space_5e-4"):
         before, _ = read(data_folder / "meshes_factory_nist" / f"{file}.obj", "m", Sensor.load("gelslim"))

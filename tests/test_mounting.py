@@ -158,6 +158,7 @@ def test_stripes_of_a_twentieth_are_evened_out_on_real_images(real):
         )
 
 
+@pytest.mark.slow
 def test_steady_light_is_left_as_it_is(real, simulated):
     for rest, images in [*real.values(), *((rest, [image]) for image, rest in simulated)]:
         for image in images:

@@ -230,6 +230,7 @@ def on_a_facet(make_localizer, tmp_path_factory):
     return make_localizer(part, "gelslim", approach=[(facet, 0.0), (-facet, 0.0)], max_poses=10_000), R
 
 
+@pytest.mark.slow
 def test_after_a_touch_on_its_side_a_pencil_is_touched_at_an_end(on_a_facet):
     """From the posterior of a simulated touch, with the pencil known to lie on a facet."""
     localizer, R = on_a_facet
@@ -466,6 +467,7 @@ def test_command_refuses_what_is_no_posterior_or_has_no_contact(command, plug, t
 # The study
 
 
+@pytest.mark.slow
 def test_touching_until_sure_starts_alike_and_stops_when_sure(flat_nut, monkeypatch):
     monkeypatch.setattr(next_touch_study, "MOST", 1)
     ((best, random),) = next_touch_study.touch_until_sure(flat_nut, 1, 3, MODERATE)

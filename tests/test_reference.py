@@ -231,7 +231,7 @@ def test_a_track_does_not_jump_between_images(name, request):
         before = modes[0].T if modes else before
 
 
-@pytest.mark.parametrize("form", slow_but(["Gaussian", "function", "pair", "posterior"], "function", "posterior"))
+@pytest.mark.parametrize("form", slow_but(["Gaussian", "function", "pair", "posterior"], "function"))
 def test_a_track_begins_at_the_image_of_its_prior(flat_nut, form, rng):
     trajectory = random_trajectory(flat_nut.space, 3, 5)
     T = an_image(flat_nut, trajectory.T_sensor_object[0], rng)

@@ -433,6 +433,7 @@ def test_pictures_open(touch):
     assert sum(height for _, height in sizes.values()) == Image.open(io.BytesIO(picture.whole)).height
 
 
+@pytest.mark.slow
 def test_several_sensors_are_shown_in_their_order(plug, rng):
     """A row for each, also for one that felt nothing, with what it would show at each mode."""
     from geomtact.report.figure import draw

@@ -36,7 +36,7 @@ APPROACHES = {
     "half": [((1, 1, 1), np.pi / 2)],
 }
 each_symmetry = pytest.mark.parametrize("symmetry", SYMMETRIES)
-each_approach = pytest.mark.parametrize("approach", APPROACHES)
+each_approach = pytest.mark.parametrize("approach", slow_but(APPROACHES, "all", "half"))
 
 
 DISKS = {  # disks about faces: none; three, of which two overlap, and one about the axis of those that have one

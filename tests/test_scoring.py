@@ -324,6 +324,7 @@ def test_a_touch_that_comes_out_otherwise_changes_no_other(plug, monkeypatch):
     assert same == [False] + 11 * [True] and (touches.ids[1:] == others.ids[1:]).all()
 
 
+@pytest.mark.slow
 def test_simulated_touches_are_as_often_where_a_cell_hardly_touches_as_poses_are(cache_dir):
     """A plate on a sensor with a housing: a little tilt lets its far end strike, so many a pose lies in a cell of which, at the
     cell's own rotation, little touches."""
@@ -358,6 +359,7 @@ def test_an_unknown_score_names_the_nearest(ball):
         fitted_scorer("moment", ball.index)
 
 
+@pytest.mark.slow
 def test_a_part_whose_touches_are_all_alike_is_refused(make_localizer, monkeypatch, tmp_path):
     """A slab known to lie on its face fills the window nearly everywhere: only its rim tells anything."""
     trimesh.creation.box((200, 200, 20)).export(tmp_path / "slab.stl")

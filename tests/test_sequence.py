@@ -283,6 +283,7 @@ def test_a_prior_holds_for_the_first_frame(flat_nut, creeping):
     assert np.ptp(np.quantile(difference[likely], [0.05, 0.95])) < 0.05
 
 
+@pytest.mark.slow
 def test_a_prior_waits_for_the_first_contact(flat_nut, creeping):
     """It lies over the sensor where that touches first, not where it stood before."""
     trajectory, _ = creeping[0]

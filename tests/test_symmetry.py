@@ -141,6 +141,7 @@ def test_fast_enough(name):
     assert time.perf_counter() - start < 6  # 3 s on two free cores
 
 
+@pytest.mark.slow
 def test_real_parts(data_folder):
     def of(path, scale):
         mesh = trimesh.load_mesh(str(data_folder / path))
