@@ -88,19 +88,17 @@ def test_the_same_seed_gives_the_same_result(localizer, a_touch):
     assert (third.log_prob == one.log_prob).all() and third.credible_level(T) != one.credible_level(T)
 
 
-@pytest.mark.parametrize("name", slow_but(("curved", "flat_nut"), "flat_nut"))
-def test_efforts_differ_in_resolution_and_in_what_is_refined(name, request, a_touch):
-    localizer = request.getfixturevalue(name)
-    T, mask = a_touch(localizer)
-    fast, balanced, exact = (localizer.localize(mask, effort=e) for e in ("fast", "balanced", "exact"))
-    held = localizer.index.mass(*localizer.index.block_runs) > 0  # some blocks are ruled out as a whole
+def test_efforts_differ_in_resolution_and_in_what_is_refined(curved, a_touch):
+    T, mask = a_touch(curved)
+    fast, balanced, exact = (curved.localize(mask, effort=e) for e in ("fast", "balanced", "exact"))
+    held = curved.index.mass(*curved.index.block_runs) > 0  # some blocks are ruled out as a whole
     assert len(fast.cells) == held.sum() < len(balanced.cells) == len(exact.cells)
     assert abs(balanced.log_density(T) - exact.log_density(T)) < 2
     assert len(fast.refined) == 0 < len(balanced.refined) <= 5 <= len(exact.refined) <= 5 * 25
-    likelihood = [localizer.refinery.log_likelihood(mask, p.modes(1)[0].T[None])[0] for p in (fast, balanced)]
+    likelihood = [curved.refinery.log_likelihood(mask, p.modes(1)[0].T[None])[0] for p in (fast, balanced)]
     assert likelihood[1] >= likelihood[0] - 1e-9, "a refinement that does not raise the likelihood is dropped"
     with pytest.raises(UsageError, match="no effort named 'quick'"):
-        localizer.localize(mask, effort="quick")
+        curved.localize(mask, effort="quick")
 
 
 def test_settings_and_times_say_how_it_came_about(plug, a_touch):
