@@ -1,0 +1,71 @@
+"""What the pages print of their commands is what a run gives on any processor, within the tolerances of tools/page_outputs.py."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+
+from page_outputs import PAGES, agree, refreshed, replaced, run, shown_on
+
+SAID = """
+mode probability centre
+1 2.2 % -7.74, 11.00
+2 2.1 % 28.15, 46.92
+
+8,389 of 1,237,368 poses, in 12.3 s
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where commands run, with a cache of its own, so at the full size."""
+    folder = tmp_path_factory.mktemp("pages")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GEOMTACT_CACHE", str(folder / "cache"))
+        yield folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_prints_what_its_commands_give(page, folder):
+    for shown in shown_on(page):
+        given = run(shown.words, folder)
+        assert agree(shown.output, given), f"{page.name}: {shown.words}; run python tools/page_outputs.py\n{given}"
+
+
+@pytest.mark.parametrize("page", PAGES[:2], ids=lambda page: page.name)
+def test_there_are_outputs_to_compare(page):
+    assert sum(bool(shown.output) for shown in shown_on(page)) >= 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "same"),
+    [
+        ("12.3 s", "9 s", True),
+        ("8,389", "8,400", True),
+        ("8,389", "9,389", False),
+        ("-7.74", "-7.79", True),
+        ("-7.74", "7.74", False),
+        ("1 2.2 % -7.74, 11.00\n2 2.1 % 28.15, 46.92", "1 2.2 % 28.15, 46.92\n2 2.1 % -7.74, 11.00", True),
+        ("centre", "middle", False),
+        ("\n\n8,389", "\n8,389 of it\n\n8,389", False),
+    ],
+)
+def test_outputs_agree_but_for_the_last_digits_and_times(old, new, same):
+    assert agree(SAID, SAID.replace(old, new)) is same
+
+
+def test_lines_left_out_stand_for_any():
+    assert agree("...\n8,389 of 1,237,368 poses, in 1 s", SAID)
+    assert not agree("...\n8,389 of 9 poses, in 1 s", SAID)
+
+
+def test_a_page_is_filled_with_what_is_printed():
+    text = "One:\n\n```console\n$ geomtact x 'a b'\nold 1\n...\n$ geomtact y\n```\n\n```python\nprint(2)\n```\n\n```\nold\n```\n"
+    given = {("geomtact", "x", "a b"): "new\nold 7\nmore", ("geomtact", "y"): "1", ("python", "-c", "print(2)\n"): "2"}
+    filled = replaced(text, lambda shown: refreshed(shown, given[shown.words]))
+    assert filled == text.replace("old 1\n...", "...\nold 7\n...").replace("$ geomtact y\n", "$ geomtact y\n1\n").replace(
+        "```\nold\n", "```\n2\n"
+    )
