@@ -1,13 +1,8 @@
 """What the pages print of their commands is what a run gives on any processor, within the tolerances of tools/page_outputs.py."""
 
-import sys
-from pathlib import Path
-
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-
-from page_outputs import PAGES, agree, refreshed, replaced, run, shown_on
+from tools.page_outputs import PAGES, agree, refreshed, replaced, run, shown_on
 
 SAID = """
 mode probability centre
@@ -32,7 +27,7 @@ def folder(tmp_path_factory):
 def test_a_page_prints_what_its_commands_give(page, folder):
     for shown in shown_on(page):
         given = run(shown.words, folder)
-        assert agree(shown.output, given), f"{page.name}: {shown.words}; run python tools/page_outputs.py\n{given}"
+        assert agree(shown.output, given), f"{page.name}: {shown.words}; run python -m tools.page_outputs\n{given}"
 
 
 @pytest.mark.parametrize("page", PAGES[:2], ids=lambda page: page.name)
@@ -63,9 +58,13 @@ def test_lines_left_out_stand_for_any():
 
 
 def test_a_page_is_filled_with_what_is_printed():
-    text = "One:\n\n```console\n$ geomtact x 'a b'\nold 1\n...\n$ geomtact y\n```\n\n```python\nprint(2)\n```\n\n```\nold\n```\n"
-    given = {("geomtact", "x", "a b"): "new\nold 7\nmore", ("geomtact", "y"): "1", ("python", "-c", "print(2)\n"): "2"}
+    text = "One:\n\n```console\n$ geomtact x 'a b'\nold 1\n...\nmore 2\n$ geomtact y\n```\n\n```python\nprint(2)\n```\n\n```\nold\n```\n"
+    given = {
+        ("geomtact", "x", "a b"): "new\nold 7\nand\nso on\nmore 8\nend",
+        ("geomtact", "y"): "1",
+        ("python", "-c", "print(2)\n"): "2",
+    }
     filled = replaced(text, lambda shown: refreshed(shown, given[shown.words]))
-    assert filled == text.replace("old 1\n...", "...\nold 7\n...").replace("$ geomtact y\n", "$ geomtact y\n1\n").replace(
-        "```\nold\n", "```\n2\n"
-    )
+    assert filled == text.replace("old 1\n...\nmore 2", "old 7\n...\nmore 8").replace(
+        "$ geomtact y\n", "$ geomtact y\n1\n"
+    ).replace("```\nold\n", "```\n2\n")

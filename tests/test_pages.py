@@ -6,14 +6,14 @@ from collections import Counter
 
 import pytest
 
-from tools.page_tables import DOCS, PARTS, TABLES, between, filled, study, with_tables
+from tools.page_tables import DOCS, PARTS, TABLES, between, filled, page_path, study, with_tables
 from tools.studies.stability.command import _answers
 
 pytestmark = pytest.mark.studies
 
 
 def test_the_tables_of_every_page_are_what_its_studies_found():
-    texts = {page: (DOCS / f"{page}.md").read_text("utf-8") for page, *_ in TABLES}
+    texts = {page: page_path(page).read_text("utf-8") for page, *_ in TABLES}
     filled_anew = {page: with_tables(page, text).splitlines() for page, text in texts.items()}
     assert filled_anew == {page: text.splitlines() for page, text in texts.items()}
 

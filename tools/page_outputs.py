@@ -1,10 +1,10 @@
 """Runs the commands that the pages show, and fills in what they print, in place:
 
-    python tools/page_outputs.py [PAGE ...]
+    python -m tools.page_outputs [PAGE ...]
 
 A block marked ``console`` holds commands after ``$`` and, below each, what it prints on standard output. A block of Python
-that another block without a name follows directly is run, and the second one holds what it prints. A line ``...`` stands
-for any lines. Commands run in a scratch folder that shows the checkout's ``meshes`` and ``docs``.
+that a block without a name follows directly is run, and the second one holds what it prints. A line ``...`` stands
+for lines that are left out, as the first and the last ones may be without it. Commands run in a scratch folder that shows the checkout's ``meshes`` and ``docs``.
 """
 
 import math
@@ -23,7 +23,7 @@ PAGES = [ROOT / "README.md", ROOT / "docs" / "quickstart.md", ROOT / "docs" / "g
 CONSOLE = re.compile(r"(?<=^```console\n)(.*?)(?=^```$)", re.MULTILINE | re.DOTALL)
 SCRIPT = re.compile(r"(^```python\n(.*?)^```\n\n```\n)(.*?)(?=^```$)", re.MULTILINE | re.DOTALL)
 # Processors with bfloat16 and without differ by 0.003 nats, 0.3 % of the poses and 0.01 % of probability on the sample.
-ABSOLUTE, RELATIVE = 0.1, 0.02
+ABSOLUTE, RELATIVE = 0.15, 0.02
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?!\w)")
 TIME = re.compile(r"\d[\d.,]* (?:ms|s|min)\b")  # is another one in every run
 WIDTH = 120  # columns of the terminal
@@ -62,7 +62,7 @@ def replaced(text: str, output: Callable[[Shown], str]) -> str:
         for command in commands:
             line, _, shown = command.partition("\n")
             parts.append(f"$ {line}\n{_ended(output(Shown(tuple(shlex.split(line)), shown.strip(chr(10)))))}")
-        return "\n".join(parts)
+        return "".join(parts)
 
     def script(block: re.Match) -> str:
         return block[1] + _ended(output(Shown(("python", "-c", block[2]), block[3].strip("\n"))))
@@ -120,18 +120,23 @@ def refreshed(shown: Shown, given: str) -> str:
     lines = shown.output.splitlines()
     if "..." not in lines:
         return given
-    kept = {_bare(line) for line in lines}
+    shown_lines = [_bare(line) for line in lines if line != "..."]
     out: list[str] = []
     for line in given.splitlines():
-        if _bare(line) in kept:
+        if shown_lines and _bare(line) == shown_lines[0]:
+            shown_lines.pop(0)
             out.append(line)
-        elif not out or out[-1] != "...":
+        elif line and out and out[-1] != "...":
             out.append("...")
-    return "\n".join(out)
+    if shown_lines:
+        raise SystemExit(
+            f"{shlex.join(shown.words)}: no longer prints a line like {shown_lines[0]!r}; change the page by hand"
+        )
+    return "\n".join(out[:-1] if out[-1:] == ["..."] else out)
 
 
 def _bare(line: str) -> str:
-    return NUMBER.sub("#", " ".join(line.split()))
+    return NUMBER.sub("#", _lines(line)[0]) if line.strip() else ""
 
 
 def main() -> None:

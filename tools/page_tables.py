@@ -256,7 +256,30 @@ def sweeps(content):
         yield [f"`{name}`", KEPT, told, promised]
 
 
+def expected(touches, triplets, readings):
+    def over(sensors, key, form="{:.1f}", scale=1.0):
+        values = [
+            scale * f[key] for part in touches["parts"].values() for f in part["figures"] if f["sensors"] == sensors
+        ]
+        low, high = (form.format(extreme(values)) for extreme in (min, max))
+        return low if low == high else f"{low} to {high}"
+
+    for number in (1, 2, 3, 5):
+        first = f"simulated masks, {len(touches['parts'])} objects" * (number == 1)
+        lengths = (over(number, f"{key}_mm_median") for key in ("add_s", "mssd"))
+        yield [first, str(number), over(number, "gain_mean"), *lengths, over(number, "ms_median", scale=1e-3)]
+    (f,) = (f for f in triplets["figures"] if (f["shown"], f["touches"]) == ("reading", 3))
+    first = f"another simulator's images, {len(triplets['parts'])} objects"
+    length, ms = f["add_s_mm_quartiles"][1], f["ms_quartiles"][1]
+    yield [first, "3", f"{f['gain_mean']:.1f}", f"{length:.1f}", "", f"{1e-3 * ms:.1f}"]
+    balls = readings["parts"]["balls, parallel rays"]["figures"]
+    low, high = sorted(f"{f['off_mm_median']:.2f}" for f in balls)
+    first = f"real images, {sum(f['whole'] for f in balls)} presses of {len(balls)} balls"
+    yield [first, "1", "", f"{low} to {high}", "", ""]
+
+
 TABLES = [
+    ("README", "| images |", expected, "touches", "triplets", "readings"),
     ("readings", "| set |", contacts, "readings"),
     ("readings", "| camera |", balls, "readings"),
     *(("no-more-than-needed", f"The {PARTS[part]}:", partial(modelled, part), "choices") for part in PARTS),
@@ -318,14 +341,19 @@ def with_tables(page, text):
     return text
 
 
+def page_path(page):
+    """The file of a page: the README lies above the others."""
+    return (DOCS.parent if page == "README" else DOCS) / f"{page}.md"
+
+
 def main():
     for page in dict.fromkeys(name for name, *_ in TABLES):
-        path = DOCS / f"{page}.md"
+        path = page_path(page)
         before = path.read_text("utf-8")
         after = with_tables(page, before)
         if after != before:
             path.write_text(after, "utf-8")
-        print(f"docs/{path.name}: {'as it was' if after == before else 'filled'}")
+        print(f"{path.relative_to(DOCS.parent)}: {'as it was' if after == before else 'filled'}")
 
 
 if __name__ == "__main__":
