@@ -145,8 +145,10 @@ class Stage:
         axes.imshow(np.clip(0.5 + CONTRAST * change / 255, 0, 1), extent=(-x, x, y, -y))
         across, down = self.sensor.pixel_centres(self.outlines[touch].shape)
         axes.contour(1e3 * across, 1e3 * down, self.outlines[touch], [0.5], colors=INK, linewidths=1.6)
-        axes.set(title=f"tactile image {touch + 1}", ylabel="y [mm]", xticks=[-20, 0, 20], yticks=[-10, 0, 10])
-        axes.set_xlabel("x [mm]\nminus background, contact outlined")
+        axes.set(
+            title=f"tactile image {touch + 1} and contact", ylabel="y [mm]", xticks=[-20, 0, 20], yticks=[-10, 0, 10]
+        )
+        axes.set_xlabel("x [mm]\nbackground removed")
 
     def _object(self, axes, touch: int, ghosts: Array) -> None:
         extent = 1e3 * self.half * np.array([-1, 1, 1, -1])
