@@ -21,16 +21,16 @@ from geomtact.errors import (
 )
 
 if TYPE_CHECKING:
-    from geomtact.contact_space.carry import RigStd
+    from geomtact.contact_space.cell_transfer import ExtrinsicsStd
     from geomtact.geometry.mesh import Mesh
     from geomtact.geometry.mesh_file import load_mesh
+    from geomtact.identification import identify
     from geomtact.inference.densities import GaussianPrior
     from geomtact.inference.effort import Effort
-    from geomtact.inference.identify import identify
-    from geomtact.inference.localizer import Localizer
     from geomtact.inference.modes import Mode
     from geomtact.inference.motion import GaussianTwist
     from geomtact.inference.posterior import Posterior
+    from geomtact.localizer import Localizer
     from geomtact.planning.actions import Probe, Touch
     from geomtact.planning.next_touch import Action
     from geomtact.sensing.calibrate import calibrate
@@ -47,18 +47,18 @@ _MODULE_OF = {
     "Effort": "geomtact.inference.effort",
     "GaussianPrior": "geomtact.inference.densities",
     "GaussianTwist": "geomtact.inference.motion",
-    "Localizer": "geomtact.inference.localizer",
+    "Localizer": "geomtact.localizer",
     "Mesh": "geomtact.geometry.mesh",
     "Mode": "geomtact.inference.modes",
     "Posterior": "geomtact.inference.posterior",
     "Probe": "geomtact.planning.actions",
-    "RigStd": "geomtact.contact_space.carry",
+    "ExtrinsicsStd": "geomtact.contact_space.cell_transfer",
     "Sensor": "geomtact.sensing.sensor",
     "Touch": "geomtact.planning.actions",
     "calibrate": "geomtact.sensing.calibrate",
     "contact_height": "geomtact.sensing.height",
     "contact_mask": "geomtact.sensing.local_shape",
-    "identify": "geomtact.inference.identify",
+    "identify": "geomtact.identification",
     "load_mesh": "geomtact.geometry.mesh_file",
 }
 
@@ -80,7 +80,7 @@ __all__ = [
     "PoseError",
     "Posterior",
     "Probe",
-    "RigStd",
+    "ExtrinsicsStd",
     "Sensor",
     "SensorError",
     "Touch",

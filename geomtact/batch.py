@@ -32,7 +32,7 @@ def prepare_part(
     mesh: str, unit: str | None, sensor: str | Sensor, scorer: str, max_poses: int, cache_dir: str | Path | None
 ) -> None:
     """Prepare an object as ``Localizer.prepare`` does, and leave it in the cache."""
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
 
     Localizer.prepare(mesh, unit, sensor, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir)
 

@@ -407,7 +407,7 @@ def test_each_image_may_have_a_background_of_its_own(tmp_path, monkeypatch, rng)
         given.update(options)
         raise InputError("far enough")
 
-    monkeypatch.setattr("geomtact.inference.identify.identify", noted)
+    monkeypatch.setattr("geomtact.identification.identify", noted)
     for name in ("a", "b", "rest_a", "rest_b"):
         Image.fromarray(rng.integers(100, 110, (320, 427, 3)).astype(np.uint8)).save(f"{name}.png")
     (tmp_path / "poses.json").write_text(

@@ -16,10 +16,10 @@ import geomtact.sensing.scene
 from geomtact import se3
 from geomtact.contact_space.store import open_index
 from geomtact.geometry.mesh_file import load_mesh
-from geomtact.inference.spreading import Mixture, Spreading
+from geomtact.inference.motion_kernel import Mixture, MotionKernel
+from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.observability import Spread, motion_of
 from geomtact.registration.protocol import Problem, Surface
-from geomtact.registration.rim import make_problem
 from geomtact.scoring import fitted
 from geomtact.scoring.calibration import FLOORS, simulate_touches
 from geomtact.scoring.catalogue import SCORERS
@@ -362,7 +362,7 @@ def test_a_motion_repeats_by_its_seed_and_leans_nowhere(motion):
 @each_part
 def test_a_motion_keeps_the_uniform_distribution_and_all_mass(part, motion, request, rng):
     index = request.getfixturevalue(part).index
-    spread = Spreading(index, motion)
+    spread = MotionKernel(index, motion)
     possible = index.possible
     after = spread(Mixture(possible, weights(index)[possible], 0.0))
     np.testing.assert_allclose(dense(index, after), weights(index), rtol=2e-3, atol=1e-9)
@@ -379,7 +379,7 @@ def test_a_motion_keeps_the_uniform_distribution_and_all_mass(part, motion, requ
 def test_parts_of_a_distribution_spread_each_for_itself(part, motion, request, rng):
     """Whatever few cells hold: those of few rotations are spread by another way than those of all."""
     index = request.getfixturevalue(part).index
-    spread, possible = Spreading(index, motion), index.possible
+    spread, possible = MotionKernel(index, motion), index.possible
     mass = weights(index)[possible] * rng.random(len(possible))
     few = np.isin(index.rotation[possible % index.places], rng.choice(index.rotation, 2))
     whole = dense(index, spread(Mixture(possible, mass, 0.0)))
@@ -394,4 +394,4 @@ def test_a_motion_of_no_size_leaves_everything_where_it_was(part, motion, reques
     still = dataclasses.replace(motion, **{field.name: 1e-12 for field in dataclasses.fields(motion)})
     cells = np.sort(rng.choice(index.possible, 20, replace=False))
     before = Mixture(cells, rng.dirichlet(np.ones(20)), 0.0)
-    np.testing.assert_allclose(dense(index, Spreading(index, still)(before)), dense(index, before), atol=1e-5)
+    np.testing.assert_allclose(dense(index, MotionKernel(index, still)(before)), dense(index, before), atol=1e-5)

@@ -1,7 +1,7 @@
 """Evaluation: pose errors obey their definitions, coverage its binomial law, and a study repeats, resumes and adds up."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from geomtact.errors import InputError
 from geomtact.evaluation import coverage
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.pose_error import add, add_s, mssd
+from geomtact.inference.effort import EFFORTS
 from geomtact.se3 import exp, log, random_rotations, transform
 from geomtact.sensing.noise import CLEAN, MODERATE
 from tools.studies.__main__ import app as studies
@@ -339,7 +340,7 @@ def test_touches_of_a_known_side_are_judged_before_and_after_refinement(flat_nut
         # ten modes hold the first
         assert of_modes <= best + 1e-6 and of_answers_modes <= answer + 1e-6
         touch = next(known_approach.touches_of_side(flat_nut, outcome["side"], 1, 1, MODERATE, True))
-        grid, _ = flat_nut.touch(touch.mask, "mask", None, np.eye(4), "sensor", None, "exact", 0)
+        grid = flat_nut.localize(touch.mask, "mask", effort=replace(EFFORTS["exact"], modes=0))
         told = flat_nut.localize(touch.mask, "mask", effort="exact")
         near = [1e3 * distance.mean(touch.T_sensor_object, p.likeliest(10)).min() for p in (grid, told)]
         assert near == pytest.approx([best10, answer10], abs=1e-6)

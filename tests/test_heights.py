@@ -169,7 +169,7 @@ def test_a_prior_that_tells_the_depth_is_held_against_the_whole_press(ball, rng,
             at = T.copy()
             at[2, 3] += off
             prior = GaussianPrior(at, np.diag([0.05**2] * 3 + [(0.1 * MM) ** 2] * 3))
-            told.append(ball.touch(height, "height", None, np.eye(4), "sensor", prior, "fast", 0)[0].log_evidence)
+            told.append(ball.localize(height, "height", prior=prior, effort="fast").log_evidence)
         assert told[0] > told[1] + 1
 
 

@@ -14,7 +14,8 @@ from geomtact import InputError, Localizer, Mesh, UsageError
 from geomtact.cli import app
 from geomtact.cli.parts import parts_of
 from geomtact.errors import NoPoseAgreesError
-from geomtact.inference.identify import identify
+from geomtact.identification import identify
+from geomtact.inference.facts import Diagnostics
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
 from tools.studies.common.pictures import draw
@@ -91,22 +92,26 @@ def test_probabilities_are_evidence_times_weights(drawer):
 @pytest.mark.parametrize(
     ("said", "unlike"),
     [
-        ({"odd": False}, False),
-        ({"odd": True}, True),
-        ({"odd": False, "unexplained_nats": 7.9}, False),
-        ({"odd": False, "unexplained_nats": 8.1}, True),
-        ({"odd": False, "unexplained_nats": None}, True),
-        ({"odd": False, "unexplained_nats": 0.0, "misfit_nats": 4.5}, False),
-        ({"odd": False, "unexplained_nats": 0.0, "misfit_nats": 4.7}, True),
+        ({"is_outlier": False}, False),
+        ({"is_outlier": True}, True),
+        ({"is_outlier": False, "unexplained_nats": 7.9}, False),
+        ({"is_outlier": False, "unexplained_nats": 8.1}, True),
+        ({"is_outlier": False, "unexplained_nats": np.inf}, True),
+        ({"is_outlier": False, "unexplained_nats": 0.0, "misfit_nats": 4.5}, False),
+        ({"is_outlier": False, "unexplained_nats": 0.0, "misfit_nats": 4.7}, True),
     ],
 )
 def test_unlike_all_is_what_is_odd_or_unexplained_of_each(drawer, said, unlike):
     def localizer(said):
-        posterior = SimpleNamespace(contact=True, log_evidence=0.0, settings=said)
-        return SimpleNamespace(mesh=drawer[0].mesh, localize=lambda image: posterior)
+        posterior = SimpleNamespace(contact=True, log_evidence=0.0, diagnostics=Diagnostics(**said))
+        return SimpleNamespace(mesh=drawer[0].mesh, sensors=[drawer[0].sensor], localize=lambda image: posterior)
 
-    assert identify([localizer(said)], None).foreign == unlike
-    assert not identify([localizer(said), localizer({"odd": False})], None).foreign, "one that it is like is enough"
+    image = np.zeros(drawer[0].sensor.image_size_px[::-1], bool)
+
+    assert identify([localizer(said)], image).foreign == unlike
+    assert not identify([localizer(said), localizer({"is_outlier": False})], image).foreign, (
+        "one that it is like is enough"
+    )
 
 
 @pytest.mark.parametrize("scenes", slow_but((1, 2), 1))
@@ -132,6 +137,7 @@ def test_a_part_that_no_pose_of_agrees_is_out(drawer, monkeypatch):
 
     class Refusing:
         mesh = drawer[0].mesh
+        sensors = drawer[0].sensors
         localize = refuses
 
     found = identify([Refusing(), drawer[1]], mask, kind="mask", effort="fast")

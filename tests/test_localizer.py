@@ -19,7 +19,7 @@ from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_mass
-from geomtact.registration.rim import SINK
+from geomtact.registration.contact_problem import SINK
 from geomtact.scoring import fitted
 from geomtact.se3 import exp, log, random_rotations, transform
 
@@ -95,7 +95,7 @@ def test_efforts_differ_in_resolution_and_in_what_is_refined(curved, a_touch):
     assert len(fast.cells) == held.sum() < len(balanced.cells) == len(exact.cells)
     assert abs(balanced.log_density(T) - exact.log_density(T)) < 2
     assert len(fast.refined) == 0 < len(balanced.refined) <= 5 <= len(exact.refined) <= 5 * 25
-    likelihood = [curved.refinery.log_likelihood(mask, p.modes(1)[0].T[None])[0] for p in (fast, balanced)]
+    likelihood = [curved.mode_refiner.log_likelihood(mask, p.modes(1)[0].T[None])[0] for p in (fast, balanced)]
     assert likelihood[1] >= likelihood[0] - 1e-9, "a refinement that does not raise the likelihood is dropped"
     with pytest.raises(UsageError, match="no effort named 'quick'"):
         curved.localize(mask, effort="quick")
@@ -407,8 +407,12 @@ def test_a_prior_of_another_object_or_frame_is_refused(ball, flat_nut, a_touch):
     with pytest.raises(InputError, match="does not touch the sensor"):
         ball.localize(mask, prior=nothing)
     lost = ball.localize(np.zeros_like(mask), prior=held)
-    assert not lost.contact and lost.elsewhere is None and any("contact was lost" in each for each in lost.warnings)
-    assert lost.settings["images"] == [None]  # what is given up does not count twice later
+    assert (
+        not lost.contact
+        and lost.off_contact_log_density is None
+        and any("contact was lost" in each for each in lost.warnings)
+    )
+    assert lost.provenance.images == ()  # what is given up does not count twice later
     with pytest.raises(InputError, match="in the frame of the sensor 'other', not of 'gelsight-mini'"):
         ball.localize(np.zeros_like(mask), prior=elsewhere)
 

@@ -269,7 +269,7 @@ def test_a_camera_of_another_size_is_refused_before_anything_is_prepared(monkeyp
         for image in shown:
             video.write(np.ascontiguousarray(image))
         video.release()
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
 
     class Prepared(Exception):
         pass

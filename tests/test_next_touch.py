@@ -17,14 +17,14 @@ from geomtact.errors import GeomtactError, InputError, PoseError, UsageError
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.planning.actions import Probe, Touch
-from geomtact.planning.belief import draw_cells
+from geomtact.planning.draws import draw_cells
 from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.next_touch import (
     LEAST,
     ambiguity,
     discarded,
+    evaluate,
     information,
-    judge,
     likelihoods,
     next_touch,
 )
@@ -133,22 +133,22 @@ def test_what_varies_within_places_tells_nothing(rng):
 def test_an_action_that_tells_two_places_apart_is_worth_log_2(block):
     """Moved by 8 mm along its length, the block looks the same in the middle and not at its end."""
     poses = shifts([0, 0, 0], [8, 0, 0])
-    assert judge(block, above(0), poses).expected_nats == pytest.approx(0, abs=1e-6)
-    at_the_end = judge(block, above(22), poses)
+    assert evaluate(block, above(0), poses).expected_nats == pytest.approx(0, abs=1e-6)
+    at_the_end = evaluate(block, above(22), poses)
     assert at_the_end.expected_nats == pytest.approx(np.log(2), abs=0.02)
     assert at_the_end.expected_discarded == pytest.approx(0.5)
     # how far the sensor comes tells as much as what it then shows
     from_the_side = Touch(transform(np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]]), [60 * MM, 0, 0]), 0.05)
-    assert judge(block, from_the_side, poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
+    assert evaluate(block, from_the_side, poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
 
 
 def test_a_probe_tells_occupied_from_free(block):
     poses = shifts([0, 0, 0], [8, 0, 0])
     inside = Probe([24 * MM, 0, 0], [0, 0, -1])
-    assert judge(block, inside, poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
-    assert judge(block, inside, poses).contact == 0.5
-    assert judge(block, Probe([24 * MM, 0, 6 * MM], [0, 0, -1]), poses).contact == 0  # ends above the block
-    assert judge(block, Probe([0, 0, 0], [0, 0, -2]), poses).expected_nats == 0  # occupied at both
+    assert evaluate(block, inside, poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
+    assert evaluate(block, inside, poses).contact == 0.5
+    assert evaluate(block, Probe([24 * MM, 0, 6 * MM], [0, 0, -1]), poses).contact == 0  # ends above the block
+    assert evaluate(block, Probe([0, 0, 0], [0, 0, -2]), poses).expected_nats == 0  # occupied at both
 
 
 def test_symmetric_poses_are_no_information(block):
@@ -158,7 +158,7 @@ def test_symmetric_poses_are_no_information(block):
     place = transform(np.eye(3), [3 * MM, -2 * MM, 1 * MM])
     poses = np.tile(place @ np.stack([*half, quarter]), (2, 1, 1, 1))
     for action in (above(20, 3), above(-1, 4), Probe([22 * MM, 0, 0], [0, 1, 1]), Touch(T_MOVED, 1.0)):
-        assert judge(block, action, poses).expected_nats == pytest.approx(0, abs=1e-6)
+        assert evaluate(block, action, poses).expected_nats == pytest.approx(0, abs=1e-6)
 
 
 def test_a_sensor_stops_where_the_object_presses(block):
@@ -173,8 +173,8 @@ def test_a_sensor_stops_where_the_object_presses(block):
 
 def test_a_sensor_merely_placed_feels_what_is_there(block):
     poses = shifts([0, 0, -0.5], [0, 0, 0.5])  # tops at 4.5 and 5.5 mm
-    assert judge(block, above(0, z_mm=5, travel=0.0), poses).contact == 0.5
-    assert judge(block, above(0, z_mm=5, travel=0.0), poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
+    assert evaluate(block, above(0, z_mm=5, travel=0.0), poses).contact == 0.5
+    assert evaluate(block, above(0, z_mm=5, travel=0.0), poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
 
 
 def test_a_housing_that_strikes_first_shows_nothing(block):
@@ -187,9 +187,9 @@ def test_a_housing_that_strikes_first_shows_nothing(block):
     bare = ContactSpace(mesh, block.sensor)
     housed = ContactSpace(mesh, replace(block.sensor, housing_depth=3 * MM))
     poses, on_the_low_face = shifts([0, 0, 0], [1, 0, 0]), above(-8)
-    assert judge(bare, on_the_low_face, poses).contact == 1
-    assert judge(housed, on_the_low_face, poses).contact == 0
-    assert judge(housed, above(20), poses).contact == 1
+    assert evaluate(bare, on_the_low_face, poses).contact == 1
+    assert evaluate(housed, on_the_low_face, poses).contact == 0
+    assert evaluate(housed, above(20), poses).contact == 1
 
 
 # The thesis's pencil (figures 16 and 17)
@@ -209,7 +209,7 @@ def test_the_pencil_is_told_at_its_ends(pencil):
         Probe([50 * MM, 0, 0], [0, 0, -1]),
         Probe([0, 0, 0], [0, 0, -1]),
     ]
-    side, *ends, tip_from_above, finger_at_the_end, finger_in_the_middle = (judge(pencil, a, poses) for a in actions)
+    side, *ends, tip_from_above, finger_at_the_end, finger_in_the_middle = (evaluate(pencil, a, poses) for a in actions)
     assert side.expected_nats < LEAST
     assert finger_in_the_middle.expected_nats == 0
     for end in ends:
@@ -321,8 +321,8 @@ def test_touches_start_clear_of_the_object_and_meet_it(plug, posterior):
     touches = grid_of_touches(posterior)
     assert len(touches) >= 17
     T = draw_cells(posterior, 32, np.random.default_rng(0), 2)
-    assert all(judge(plug.space, replace(t, travel=0.0), T).contact < 0.1 for t in touches[::4])
-    assert np.mean([judge(plug.space, t, T).contact for t in touches[::4]]) > 0.5
+    assert all(evaluate(plug.space, replace(t, travel=0.0), T).contact < 0.1 for t in touches[::4])
+    assert np.mean([evaluate(plug.space, t, T).contact for t in touches[::4]]) > 0.5
     assert all(t.T_world_sensor[2, 2] < 0.1 for t in touches)  # none comes from the first sensor's side
     low = grid_of_touches(posterior, reachable=lambda T: T[2, 3] < 20 * MM)
     assert 0 < len(low) < len(touches)

@@ -5,9 +5,10 @@ import pytest
 
 from geomtact.contact_space.touch import felt_mask, sinking
 from geomtact.contact_space.touches import random_touches
+from geomtact.inference.distribution import likeliest_cells
 from geomtact.inference.gels import SHAPE, Gel
+from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.observability import Spread
-from geomtact.registration.rim import make_problem
 from geomtact.scoring.outline import OutlineLikelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.sensing.noise import CLEAN, Noise, perturb
@@ -175,7 +176,7 @@ def test_of_a_known_side_outlines_tell_more_than_the_grid(upright):
     for touch in touches:
         balanced, exact = (upright.localize(touch.mask, "mask", effort=e) for e in ("balanced", "exact"))
         more.append(exact.log_density(touch.T_sensor_object) - balanced.log_density(touch.T_sensor_object))
-        by_outline.append(exact.settings.get("by_outline", False))
+        by_outline.append(exact.diagnostics.refined_by_outline)
         assert np.exp(exact.log_prob).sum() == pytest.approx(1, abs=1e-3)
     assert np.mean(by_outline) > 0.8 and np.mean(more) > 0
     again = upright.localize(touches[-1].mask, "mask", effort="exact")
@@ -212,9 +213,9 @@ def test_a_pose_that_was_ruled_out_stays_so(upright):
     """Of a prior that names some poses: nothing that the search finds in other cells gets in."""
     touch = random_touches(upright.space, 1, 6)[0]
     plain = upright.localize(touch.mask, "mask", effort="exact")
-    chosen = plain.likeliest_cells(60)
+    chosen = likeliest_cells(plain, 60)
     known = upright.localize(
         touch.mask, "mask", effort="exact", prior=(upright.index.poses(chosen), np.full(60, 1 / 60))
     )
-    assert known.settings["by_outline"] and set(known.refined) <= set(known.cells[np.isfinite(known.log_prob)])
+    assert known.diagnostics.refined_by_outline and set(known.refined) <= set(known.cells[np.isfinite(known.log_prob)])
     assert np.exp(known.log_prob).sum() == pytest.approx(1, abs=1e-3)

@@ -63,7 +63,7 @@ def test_a_pickle_refers_to_the_cache_which_a_process_reads_once(flat_nut, a_tou
     assert len(text) < 0.5 * stored
     assert pickle.loads(text) is pickle.loads(text)
     posterior = flat_nut.localize(a_touch(flat_nut)[1], effort="fast")
-    _ = posterior.poses, posterior.densities
+    _ = posterior.poses, posterior.entropy_nats
     assert len(pickle.dumps(posterior)) < 0.5 * stored
     assert pickle.loads(pickle.dumps(posterior)).index is pickle.loads(text).index
 

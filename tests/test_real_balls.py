@@ -104,7 +104,7 @@ def print_table(presses):
 def test_a_ball_wholly_inside_lies_within_half_a_millimetre_of_where_the_eye_sees_it(presses):
     inside = [p for p in presses if p.inside]
     assert len(inside) == 29
-    assert {p.posterior.settings["contact_method"] for p in inside} == {"classical"}
+    assert {p.posterior.provenance.views[0].contact_method for p in inside} == {"classical"}
     assert {p.file: p.off_mm for p in inside if p.off_mm > 0.5} == {}
 
 

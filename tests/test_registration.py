@@ -10,11 +10,12 @@ from refining import SENSOR, SHIFT, TURN, facing_down, is_sound, off, scene, ste
 import geomtact.registration
 from geomtact import se3
 from geomtact.errors import MeshError, PoseError
+from geomtact.inference.modes import leading_cells
+from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Problem, Surface
-from geomtact.registration.rim import make_problem
 from geomtact.sensing.elastic import elastic_contact
 from geomtact.sensing.sensor import Sensor
 
@@ -206,8 +207,8 @@ def test_open3d_repeats_itself_to_the_last_digit(pin, a_touch):
     """Its sums run over threads, and a rim that tells little turns another order of adding into another pose."""
     mask = pin.localize(a_touch(pin)[1], effort="fast").observation.contact.mask
     problem = make_problem(mask, pin.sensor)
-    starts = pin.index.poses(pin.localize(a_touch(pin)[1], effort="fast").leading_cells(3))
-    icp = next(r for r in pin.refinery._refiners(pin.index, True) if r.name == "icp")
+    starts = pin.index.poses(leading_cells(pin.localize(a_touch(pin)[1], effort="fast"), 3))
+    icp = next(r for r in pin.mode_refiner.refiners(pin.index, True) if r.name == "icp")
     first = icp.refine(problem, starts).T
     assert all((first == icp.refine(problem, starts).T).all() for _ in range(15))
 

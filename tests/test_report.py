@@ -21,6 +21,7 @@ from geomtact import se3
 from geomtact.contact_space.touches import random_touches
 from geomtact.files import write_whole
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.inference.facts import Diagnostics, Provenance, ViewRecord
 from geomtact.json_values import plain, to_text
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
 from geomtact.report.result import result
@@ -54,7 +55,14 @@ class FakeMode:
 @dataclass
 class FakeIndex:
     resolution: SimpleNamespace
+    stored: np.ndarray
     angle_step: float = 0.26
+
+    def poses(self, cells):
+        return self.stored[cells]
+
+    def within_runs(self, cells, runs, share):
+        return cells
 
     def __len__(self):
         return 4000
@@ -90,22 +98,28 @@ def touch():
         frame="sensor",
         contact=True,
         poses=poses,
-        poses_of=lambda rows: poses[rows],
         log_prob=log_prob - np.log(np.exp(log_prob).sum()),
         entropy_nats=-4.2,
+        information_gain_nats=4.2,
+        cells=np.arange(3000),
+        runs=None,
+        refined={},
         effective_poses=1234.5,
-        settings={"scorer": "overlap", "temperature": np.float64(0.1)},
+        settings={"scorer": "overlap", "temperature": np.float64(0.1), "seed": 7},
+        diagnostics=Diagnostics(),
+        provenance=Provenance(views=(ViewRecord(np.eye(4), "mask", None, False, True, "0"),)),
         timing_ms={"score": 12.0},
         warnings=["a <b>bold</b> warning"],
         seed=7,
         space=SimpleNamespace(caster=caster),
-        index=FakeIndex(SimpleNamespace(step=5e-4, level=3, penetrations=(0.5e-3, 1.5e-3))),
+        index=FakeIndex(SimpleNamespace(step=5e-4, level=3, penetrations=(0.5e-3, 1.5e-3)), poses),
         T_frame_sensor=np.eye(4),
         save=lambda path: np.savez(path, poses=poses),
     )
     contact = caster.contact(sensor, modes[0].T)
     image = np.where(contact.mask, 255, 0).astype(np.uint8)
-    posterior.observations = [SimpleNamespace(contact=contact, kind="mask", method=None, warnings=[], image=image)]
+    posterior.observation = SimpleNamespace(contact=contact, kind="mask", method=None, warnings=[], image=image)
+    posterior.observations = [posterior.observation]
     return posterior, modes, lambda T: caster.contact(sensor, T)
 
 
@@ -123,7 +137,7 @@ def test_all_files_are_whole_and_agree(touch, tmp_path):
     assert set(read) == {
         *("schema", "object", "sensor", "frame", "contact", "modes", "information_gain_nats"),
         *("entropy_nats", "effective_poses"),
-        *("settings", "versions", "timing_ms", "warnings"),
+        *("settings", "diagnostics", "versions", "timing_ms", "warnings"),
     }
     assert read["settings"] == {"scorer": "overlap", "temperature": 0.1, "kind": "auto", "seed": 7}
     assert set(read["timing_ms"]) == {"score", "prepare", "report"}
@@ -237,7 +251,8 @@ def test_no_contact_still_makes_a_report(touch, tmp_path):
     )
     seen = posterior.observations[0]
     nothing = SimpleNamespace(mask=np.zeros_like(seen.contact.mask), height=None)
-    empty.observations = [SimpleNamespace(contact=nothing, kind="mask", method=None, image=np.zeros_like(seen.image))]
+    empty.observation = SimpleNamespace(contact=nothing, kind="mask", method=None, image=np.zeros_like(seen.image))
+    empty.observations = [empty.observation]
     content = write_all(tmp_path, empty, [], alone(empty, simulate))
     assert content["modes"] == []
     assert content["contact"] is False
@@ -381,8 +396,8 @@ def test_facts_are_sentences(touch):
 
 def _said_of(posterior, *methods):
     """Facts of a posterior of contacts that were found so."""
-    seen = [SimpleNamespace(**{**vars(posterior.observations[0]), "method": method}) for method in methods]
-    return facts(SimpleNamespace(**{**vars(posterior), "observations": seen}))
+    views = tuple(ViewRecord(np.eye(4), "reading", method, False, True, "0") for method in methods)
+    return facts(SimpleNamespace(**{**vars(posterior), "provenance": Provenance(views=views)}))
 
 
 def test_a_mode_that_holds_little_is_not_believed(touch, tmp_path):

@@ -19,8 +19,9 @@ from geomtact.cli.shell import one_line_errors
 from geomtact.errors import ImageError, InputError, UsageError
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference.densities import GaussianPrior
+from geomtact.inference.distribution import cell_log_density
 from geomtact.inference.motion import GaussianTwist, UniformBall
-from geomtact.inference.spreading import Mixture, Spreading
+from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
 from tools.studies.track import study as track_study
@@ -62,10 +63,10 @@ def index(request):
 
 def test_a_sensor_that_hardly_moves_changes_nothing(index, rng):
     """Neither the place nor the penetration that was known."""
-    spreading, moved = Spreading(index, STILL), se3.transform(np.eye(3), [1e-6, 0, 0])
+    motion_kernel, moved = MotionKernel(index, STILL), se3.transform(np.eye(3), [1e-6, 0, 0])
     cells = np.sort(rng.choice(index.possible, 20, replace=False))
     before = Mixture(cells, rng.dirichlet(np.ones(20)), 0.0)
-    after = spreading.carried(before, moved, spreading.left(moved), rng).normalised()
+    after = motion_kernel.carried(before, moved, motion_kernel.left(moved), rng).normalised()
     assert np.minimum(dense(index, after), dense(index, before)).sum() > 0.97
 
 
@@ -80,7 +81,7 @@ def middle_cell(localizer):
 def test_a_motion_goes_as_far_as_it_says(flat_nut):
     """A point anywhere in a cell, moved by N(0, s^2), lies s^2 + h^2 / 6 from its cell's middle in the mean square."""
     index, s = flat_nut.index, 3e-3
-    after = Spreading(index, GaussianTwist(0.0, s))(Mixture(np.array([middle_cell(flat_nut)]), np.ones(1), 0.0))
+    after = MotionKernel(index, GaussianTwist(0.0, s))(Mixture(np.array([middle_cell(flat_nut)]), np.ones(1), 0.0))
     middles = index.resolution.step * np.rint(index.shift[after.cells % index.places] / index.resolution.step)
     for along in middles.T:
         mean = after.mass @ along
@@ -98,13 +99,13 @@ def test_the_ball_ends_at_its_radius(flat_nut):
     # in six dimensions a share of r^6 lies within r
     assert np.mean(moved < 0.8 * ball.radius) == pytest.approx(0.8**6, abs=0.06)
     start = middle_cell(flat_nut)
-    after = Spreading(index, ball)(Mixture(np.array([start]), np.ones(1), 0.0))
+    after = MotionKernel(index, ball)(Mixture(np.array([start]), np.ones(1), 0.0))
     far = PoseDistance(flat_nut.mesh).mean(index.poses([start])[0], index.poses(after.cells))
     assert after.mass[far < ball.radius + 2 * index.resolution.step].sum() > 0.98
 
 
 def test_a_known_motion_of_the_sensor_moves_the_distribution(flat_nut):
-    index, spread, rng = flat_nut.index, Spreading(flat_nut.index, STILL), np.random.default_rng(0)
+    index, spread, rng = flat_nut.index, MotionKernel(flat_nut.index, STILL), np.random.default_rng(0)
     start = middle_cell(flat_nut)
     T = index.poses([start])[0]
     moved = se3.transform(se3.exp([0, 0, 0.4, 0, 0, 0])[:3, :3], [6e-3, -4e-3, 0.0])
@@ -132,18 +133,18 @@ def test_frames_of_a_still_object_multiply(flat_nut, creeping):
     three = [trajectory.masks[0], trajectory.masks[1], trajectory.masks[2]]
     *_, last = track(flat_nut, three, motion=STILL, counts=(1, 1), fresh=1e-6)
     index = flat_nut.index
-    product = np.sum([p.cell_log_density(index.possible) for p in single[:3]], axis=0)
+    product = np.sum([cell_log_density(p, index.possible) for p in single[:3]], axis=0)
     product -= np.log(np.exp(product) @ weights(index)[index.possible])
     likely = product > 0
     assert likely.sum() > 20
-    np.testing.assert_allclose(last.cell_log_density(index.possible)[likely], product[likely], atol=0.02)
+    np.testing.assert_allclose(cell_log_density(last, index.possible)[likely], product[likely], atol=0.02)
 
 
 def test_one_frame_is_a_touch(flat_nut, creeping):
     mask = creeping[0][0].masks[0]
     (first,), single = track(flat_nut, [mask], effort="balanced"), flat_nut.localize(mask)
     possible = flat_nut.index.possible
-    np.testing.assert_allclose(first.cell_log_density(possible), single.cell_log_density(possible), atol=1e-4)
+    np.testing.assert_allclose(cell_log_density(first, possible), cell_log_density(single, possible), atol=1e-4)
     assert first.modes(1)[0].probability == pytest.approx(single.modes(1)[0].probability, abs=1e-4)
 
 
@@ -185,7 +186,7 @@ def test_a_sensor_whose_motion_is_known_tells_more(flat_nut):
         blind = track(flat_nut, t.masks)
         for a, b, T in zip(known, blind, t.T_sensor_object, strict=True):
             assert a.frame == "world"
-            if a.settings["frame"] > 3:
+            if a.diagnostics.frame > 3:
                 gain.append(a.log_density(np.eye(4)) - b.log_density(T))
     assert np.mean(gain) > 0.05
 
@@ -195,7 +196,7 @@ def test_it_says_so_when_the_object_slips_and_finds_back(flat_nut):
     for seed in range(3):
         t = random_trajectory(flat_nut.space, 8, seed, slips=(5,))
         posteriors = list(track(flat_nut, t.masks))
-        slipped = [p.settings["frame"] for p in posteriors if any(w.startswith("slip?") for w in p.warnings)]
+        slipped = [p.diagnostics.frame for p in posteriors if any(w.startswith("slip?") for w in p.warnings)]
         assert set(slipped) <= {6}
         told += len(slipped)
         found = [p.log_density(T) for p, T in zip(posteriors[6:], t.T_sensor_object[6:], strict=True)]
@@ -215,7 +216,7 @@ def test_lost_contact_widens_what_is_expected(flat_nut, creeping):
     unbroken = list(track(flat_nut, [*masks[:3], masks[5]]))[-1]
     single = creeping[1][1][5]
     assert posteriors[5].entropy_nats > unbroken.entropy_nats
-    assert posteriors[5].settings["surprise_nats"] < unbroken.settings["surprise_nats"]
+    assert posteriors[5].diagnostics.surprise_nats < unbroken.diagnostics.surprise_nats
     assert not list(track(flat_nut, [nothing]))[0].contact
     after_nothing = list(track(flat_nut, [nothing, masks[5]]))[-1]
     assert after_nothing.entropy_nats == pytest.approx(single.entropy_nats, abs=1e-3)
@@ -236,7 +237,7 @@ def test_a_frame_that_the_prior_was_made_from_is_told(flat_nut, creeping):
     """Also of a prior that is what was known after many frames."""
     masks = creeping[0][0].masks
     known = list(track(flat_nut, masks[:3]))[-1]
-    assert len(set(known.settings["images"])) == 3
+    assert len(known.provenance.images) == 3
     for posterior in (flat_nut.localize(masks[0], prior=known), next(track(flat_nut, masks, prior=known))):
         assert any("counts twice" in warning for warning in posterior.warnings)
     third = flat_nut.localize(masks[2], prior=None)
@@ -268,7 +269,7 @@ def test_a_live_camera_is_asked_for_one_frame_at_a_time(flat_nut, creeping):
     posteriors = track(flat_nut, camera(), poses, most=1000)
     assert asked == []
     for n in range(1, 4):
-        assert next(posteriors).settings["frame"] == n
+        assert next(posteriors).diagnostics.frame == n
         assert asked == list(range(n))
 
 
@@ -277,8 +278,8 @@ def test_a_prior_holds_for_the_first_frame(flat_nut, creeping):
     prior = single[0]
     first = next(track(flat_nut, trajectory.masks[1:], prior=prior, effort="balanced"))
     expected = flat_nut.localize(trajectory.masks[1], prior=prior)
-    likely = expected.cell_log_density(flat_nut.index.possible) > 1
-    difference = first.cell_log_density(flat_nut.index.possible) - expected.cell_log_density(flat_nut.index.possible)
+    likely = cell_log_density(expected, flat_nut.index.possible) > 1
+    difference = cell_log_density(first, flat_nut.index.possible) - cell_log_density(expected, flat_nut.index.possible)
     # but for the modes that were refined under another prior
     assert np.ptp(np.quantile(difference[likely], [0.05, 0.95])) < 0.05
 

@@ -299,7 +299,7 @@ def test_a_localizer_takes_the_path_of_weights(make_localizer, weights, tmp_path
     mask[100:140, 150:190] = True
     posterior = localizer.localize(mask, kind="mask", effort="fast")
     assert np.exp(posterior.log_prob).sum() == pytest.approx(1, abs=1e-5)
-    assert posterior.settings["scorer"] == path
+    assert posterior.provenance.scorer == path
 
 
 def test_a_contact_far_from_all_stored_ones_counts_for_less():

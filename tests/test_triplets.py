@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 from geomtact import contact_mask, load_mesh
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import NoPoseAgreesError
+from geomtact.inference.facts import Diagnostics
 from geomtact.se3 import inverse, transform
 from geomtact.sensing.image_file import read_image
 from geomtact.sensing.sensor import Sensor
@@ -47,7 +48,7 @@ def knows(T, told):
             log_density=lambda pose: 5.0,
             credible_level=lambda pose: 0.25,
             entropy_nats=-4.0,
-            settings={"disagrees": False},
+            diagnostics=Diagnostics(),
         )
 
     return localize

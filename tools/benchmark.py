@@ -110,7 +110,7 @@ def _prepare(part: str, sensor: str, cache: str) -> dict[str, Any]:
 
     from geomtact.contact_space.store import open_index
     from geomtact.geometry.mesh_file import load_mesh
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 
     began = time.perf_counter()
@@ -139,7 +139,7 @@ def _localize(part: str, sensor: str, cache: str, repeats: str) -> dict[str, Any
     """Each touch at every effort, and by the thesis's query, in turn: all of them meet the same neighbours."""
     from geomtact.contact_space.touches import random_touches
     from geomtact.inference.effort import EFFORTS
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
 
     localizer = Localizer.prepare(part, sensor=sensor, cache_dir=cache)
     touches = random_touches(localizer.space, int(repeats), seed=0)
@@ -195,7 +195,7 @@ def starts(part: str, sensor: str, cache: Path, repeats: int) -> dict[str, Any]:
     from PIL import Image
 
     from geomtact.contact_space.touches import random_touches
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
 
     with tempfile.TemporaryDirectory() as folder:
         image = Path(folder) / "touch.png"

@@ -15,7 +15,7 @@ from geomtact.cli.shell import tell
 from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
 
 
 def follow(request: Request, images: Sequence[Path], camera: str | None) -> bool:
@@ -67,7 +67,7 @@ def localize_live(
                 tell(f"warning: image {n} skipped: {error}")
                 continue
             touched |= posterior.contact
-            if background is None and not posterior.contact and posterior.observation.kind == "reading":
+            if background is None and not posterior.contact and posterior.provenance.views[0].kind == "reading":
                 background = frame.image
             line = frame_line(n, posterior)
             own = {

@@ -34,8 +34,8 @@ from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from geomtact.cli.sensor_poses import SensorPoses
-    from geomtact.inference.identify import Identification
-    from geomtact.inference.localizer import Localizer
+    from geomtact.identification import Identification
+    from geomtact.localizer import Localizer
 
 
 class Report(StrEnum):
@@ -164,7 +164,7 @@ def localize(
         tell(f"warning: {warning}")
     give(request, images, found, took, out, reports, as_json)
     if not found.posterior.contact:
-        tell(without_contact(request, len(images), found.posterior.observation.kind))
+        tell(without_contact(request, len(images), found.posterior.provenance.views[0].kind))
         raise typer.Exit(NO_CONTACT)
 
 
@@ -193,7 +193,7 @@ def _identified(
     ``sensors`` has one for each image; ``backgrounds`` too, or one for all.
     """
     from geomtact.cli.parts import units_of
-    from geomtact.inference.identify import identify
+    from geomtact.identification import identify
     from geomtact.sensing.reading import read_observation
 
     each = backgrounds if isinstance(backgrounds, list) else [backgrounds] * len(images)
@@ -222,7 +222,7 @@ def _identified(
         prior=request.prior,
         effort=request.effort,
         seed=request.seed,
-        rig=None if placed is None else placed.rig,
+        extrinsics_std=None if placed is None else placed.extrinsics_std,
     )
     return found, took
 

@@ -14,7 +14,7 @@ from geomtact.cli.request import Request
 from geomtact.cli.shell import print_table
 
 if TYPE_CHECKING:
-    from geomtact.inference.identify import Identification
+    from geomtact.identification import Identification
     from geomtact.inference.modes import Mode
     from geomtact.inference.posterior import Posterior
 

@@ -14,7 +14,7 @@ from geomtact.cli.shell import posterior_file, progress_bar, tell
 if TYPE_CHECKING:
     from geomtact.geometry.approach import Approach
     from geomtact.geometry.mesh import Mesh
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 
 _MANY_WINDOWS = 10  # long sides of the window, from which on an object's unit is doubted
@@ -113,8 +113,8 @@ class Request:
         from geomtact.contact_space.resolution import MAX_POSES
         from geomtact.geometry.mesh_file import load_mesh
         from geomtact.inference.files import heading
-        from geomtact.inference.localizer import Localizer
         from geomtact.inference.prior import check_same
+        from geomtact.localizer import Localizer
         from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
 
         scorer = self.scorer or DEFAULT_SCORER

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from geomtact.cli.project import is_bundled
-from geomtact.contact_space.carry import RigStd
+from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.errors import InputError, nearest_name
-from geomtact.inference.rig import check_rig
+from geomtact.inference.extrinsics import check_sensor_poses
 from geomtact.json_values import is_number, read_json
 from geomtact.se3 import Array, check_transforms
 
@@ -26,12 +26,12 @@ class SensorPoses:
     ----------
     T_world_sensor : (n, 4, 4), one for each image
     sensor : n names or TOML files, where they are given
-    rig : the uncertainty of the poses
+    extrinsics_std : the uncertainty of the poses
     """
 
     T_world_sensor: Array
     sensor: list[str] | None
-    rig: RigStd
+    extrinsics_std: ExtrinsicsStd
 
 
 def read_sensor_poses(path: Path, images: int) -> SensorPoses:
@@ -81,11 +81,11 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
             raise InputError(f"--sensor-poses {path}: {key} must be a finite number >= 0, got {value!r}")
     name = f"--sensor-poses {path}: T_world_sensor"
     T = check_transforms(T, name)
-    check_rig(T, name)
+    check_sensor_poses(T, name)
     return SensorPoses(
         T,
         None if names is None else [_beside(path, name) for name in names],
-        RigStd(float(np.radians(std["std_deg"])), 1e-3 * std["std_mm"]),
+        ExtrinsicsStd(float(np.radians(std["std_deg"])), 1e-3 * std["std_mm"]),
     )
 
 

@@ -31,8 +31,8 @@ from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text
 
 if TYPE_CHECKING:
-    from geomtact.inference.localizer import Localizer
     from geomtact.inference.posterior import Posterior
+    from geomtact.localizer import Localizer
 
 
 Source = Annotated[
@@ -115,7 +115,7 @@ def track(
     touched = whole = False
     try:
         for n, (at, posterior) in enumerate(posteriors, 1):
-            line = frame_line(n, posterior) | {"surprise_nats": posterior.settings["surprise_nats"]}
+            line = frame_line(n, posterior) | {"surprise_nats": posterior.diagnostics.surprise_nats}
             touched |= posterior.contact
             typer.echo(to_line(line))
             if line["T"] is not None:
@@ -167,11 +167,9 @@ def open_track(
     localizer = request.open()
 
     from geomtact.inference.motion import UniformBall
-    from geomtact.inference.sequence import track as followed
 
     times: deque[float | None] = deque()
-    posteriors = followed(
-        localizer,
+    posteriors = localizer.track(
         _images(frames, times),
         kind=request.kind,
         background=background,

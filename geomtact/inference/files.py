@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,8 @@ from geomtact.files import write_whole
 from geomtact.geometry.approach import to_json
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
-from geomtact.inference.modes import Refined
-from geomtact.inference.posterior import Posterior
+from geomtact.inference.distribution import CellDistribution, Refined, row_poses
+from geomtact.inference.facts import Diagnostics, Provenance
 from geomtact.inference.reference import Reference
 from geomtact.se3 import check_pose, check_transforms
 from geomtact.sensing.sensor import Sensor
@@ -27,13 +28,13 @@ from geomtact.sensing.sensor import Sensor
 _KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many
 _OFF = 1e-3  # that probabilities may add up to beside 1
 WITHOUT_PRIOR = (
-    "what a prior and other sensors told is not in this file: it knows no more than where one sensor felt nothing"
+    "this file lacks the prior and other sensors: it holds only that one sensor without contact rules poses out"
 )
-_FORMAT = "geomtact/posterior/2"
+_FORMAT = "geomtact/posterior/3"
 _BROKEN = (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError)
 
 
-def save(posterior: Posterior, path: str | Path) -> None:
+def save(posterior: CellDistribution, path: str | Path) -> None:
     """Write ``posterior`` to ``path``: poses, log_prob, frame, object_sha256, sensor_toml, seed, and what
     :func:`load` needs.
 
@@ -49,27 +50,31 @@ def save(posterior: Posterior, path: str | Path) -> None:
     p = np.exp(posterior.log_prob)
     order = np.argsort(-p, kind="stable")
     some = np.sort(order[: min(_MOST, int(np.searchsorted(np.cumsum(p[order]), _KEPT)) + 1)])
-    refined, symmetry, reference = posterior.refined, posterior.mesh.symmetry, posterior.reference
+    refined, symmetry, reference = posterior.refined, posterior.index.mesh.symmetry, posterior.reference
     assert symmetry is not None
+    provenance = posterior.provenance
+    if posterior.off_contact_log_density is not None:
+        provenance = provenance.without_prior()
     keys = np.array(sorted(refined), np.int64)
     meta = {
         "format": _FORMAT,
-        "object": posterior.mesh.name,
-        "unit": posterior.mesh.unit,
+        "object": posterior.index.mesh.name,
+        "unit": posterior.index.mesh.unit,
         "symmetry": symmetry.kind,
         "approach": to_json(posterior.index.approach),
         "contact": posterior.contact,
         "log_evidence": posterior.log_evidence,
-        "settings": posterior.settings if posterior.elsewhere is None else posterior.settings | {"images": []},
-        "warnings": posterior.warnings + [WITHOUT_PRIOR] * (posterior.elsewhere is not None),
+        "provenance": provenance.to_json(),
+        "diagnostics": asdict(posterior.diagnostics),
+        "warnings": posterior.warnings + [WITHOUT_PRIOR] * provenance.lacks_prior,
         "refined": [[refined[int(k)].length, refined[int(k)].moved, refined[int(k)].observable.tolist()] for k in keys],
     }
     arrays = {
-        "poses": posterior.poses_of(some),
+        "poses": row_poses(posterior, some),
         "log_prob": posterior.log_prob[some] - (np.log(p[some].sum()) if len(some) else 0.0),
         "frame": np.array(posterior.frame),
-        "object_sha256": np.array(posterior.mesh.sha256),
-        "sensor_toml": np.array(posterior.sensor.to_toml()),
+        "object_sha256": np.array(posterior.index.mesh.sha256),
+        "sensor_toml": np.array(posterior.index.sensor.to_toml()),
         "seed": np.array(posterior.seed),
         "row_cell": posterior.cells,
         "row_length": np.zeros(0, np.int64) if posterior.runs is None else posterior.runs,
@@ -78,8 +83,8 @@ def save(posterior: Posterior, path: str | Path) -> None:
         "T_frame_sensor": posterior.T_frame_sensor,
         "symmetry_elements": symmetry.elements,
         "symmetry_line": np.stack([symmetry.centre, np.zeros(3) if symmetry.axis is None else symmetry.axis]),
-        "vertices": posterior.mesh.vertices,
-        "faces": posterior.mesh.faces,
+        "vertices": posterior.index.mesh.vertices,
+        "faces": posterior.index.mesh.faces,
         "index_key": np.array(posterior.index.key),
         "refined_cells": keys,
         "refined_T": np.array([refined[int(k)].T for k in keys]).reshape(-1, 4, 4),
@@ -113,7 +118,7 @@ def heading(path: str | Path) -> tuple[str, str, str]:
     return meta["object"], str(data["object_sha256"]), str(data["frame"])
 
 
-def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
+def load(path: str | Path, cache_dir: str | Path | None = None) -> CellDistribution:
     """Read a posterior, from its file or the folder that holds it as posterior.npz; its index is opened from the cache, or built
     anew where it is no longer there.
 
@@ -136,8 +141,10 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         _check(frame in ("sensor", "world"), f"frame {frame!r}")
         _check_rows(cells, runs, log_prob, poses)
         T_frame_sensor = check_pose(data["T_frame_sensor"], "T_frame_sensor")
+        provenance = Provenance.from_json(meta["provenance"])
+        diagnostics = Diagnostics(**meta["diagnostics"])
         extra, reference = meta["refined"], None
-        if len(data.get("reference_poses", ())):  # files of before have none
+        if len(data["reference_poses"]):
             expected, log_mass = check_transforms(data["reference_poses"]), data["reference_log_mass"]
             _check(log_mass.shape == expected.shape[:1], "reference poses without their mass")
             reference = Reference(expected, log_mass)
@@ -149,12 +156,11 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         }
     except (*_BROKEN, GeomtactError) as error:
         raise _not_saved(path, error) from None
-    settings = meta["settings"] or {}
-    max_poses, key = settings.get("max_poses", MAX_POSES), str(data["index_key"])
-    index = open_index(mesh, sensor, meta["approach"], max_poses, cache_dir, key=key)
+    max_poses = provenance.max_poses or MAX_POSES
+    index = open_index(mesh, sensor, meta["approach"], max_poses, cache_dir, key=str(data["index_key"]))
     if poses != len(index):
         raise InputError(f"{path}: its poses are not those of this version's grid; localize again")
-    return Posterior(
+    return CellDistribution(
         index,
         cells,
         log_prob,
@@ -166,7 +172,8 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         runs=runs if len(runs) else None,
         refined=refined,
         reference=reference,
-        settings=settings,
+        provenance=provenance,
+        diagnostics=diagnostics,
         warnings=meta["warnings"],
     )
 

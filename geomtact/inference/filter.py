@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import spelled_out
+from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.spreading import Mixture, Spreading
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.moments import moments_of
+from geomtact.sensing.reading import Observation
 
 # chosen on trajectories that ``tools.studies track`` does not judge (docs/tracking.md)
 NOW = 0.85  # power of a frame's likelihood in its own posterior
@@ -53,7 +54,7 @@ class Filter:
 
     Attributes
     ----------
-    spreading : what the object's motion makes of a distribution
+    motion_kernel : what the object's motion makes of a distribution
     within : (6, 6) covariance of the difference between a contact's moments and those stored for its cell
     counts : powers of a frame's likelihood in its own posterior and in those of all later frames; None for the latter lets all
         frames before count ``MEMORY`` together, each new one taking the place of the older ones by how far the contact changed
@@ -66,7 +67,7 @@ class Filter:
     frames : how many there were
     """
 
-    spreading: Spreading
+    motion_kernel: MotionKernel
     within: Array
     counts: Counts = (NOW, None)
     fresh: float = FRESH
@@ -78,9 +79,9 @@ class Filter:
     frames: int = 0
 
     def __post_init__(self) -> None:
-        self._rng = np.random.default_rng(self.spreading.seed)
+        self._rng = np.random.default_rng(self.motion_kernel.seed)
         self._last: Posterior | None = None
-        self._images: list[str] = []
+        self._images: tuple[str, ...] = ()
         self._moments: NDArray[np.float32] | None = None
 
     def step(self, seen: Posterior) -> Posterior:
@@ -88,12 +89,12 @@ class Filter:
 
         Parameters
         ----------
-        seen : the frame's own posterior under the uniform prior; one without observations stands for a frame that was not seen
+        seen : the frame's own posterior under the uniform prior; or one whose diagnostics say that the frame was skipped
         """
         began, last, surprise, warnings = perf_counter(), self._last, None, list(seen.warnings)
         known: Known | None = None
         self.frames += 1
-        if seen.contact and last is not None and np.array_equal(seen.observation.image, last.observation.image):
+        if seen.contact and last is not None and np.array_equal(_observation(seen).image, _observation(last).image):
             warnings.append(f"frame {self.frames} is the same image as the one before: it counts once")
             rests = np.array_equal(last.T_frame_sensor, seen.T_frame_sensor)
             known = (last.cells, last.log_prob) if rests else self._passed_over(seen.T_frame_sensor)
@@ -107,34 +108,38 @@ class Filter:
                 chance = f"{np.exp(min(-surprise, 99)):.3g} times less likely than chance does"
                 given_up = ": half of it is given up" if self.fresh > 0 else ""
                 warnings.append(f"slip? what was known before makes this frame {chance}{given_up}")
-        elif not seen.observations and not self.missed:
+        elif seen.diagnostics.is_skipped and not self.missed:
             known = self._passed_over(seen.T_frame_sensor)
         else:
             self.missed += 1
         timing = seen.timing_ms | {"filter": 1e3 * (perf_counter() - began)}
-        images = list(dict.fromkeys([*seen.settings.get("images", []), *self._images]))[:_IMAGES]
-        self._images = [image for image in images if image is not None]
-        settings = seen.settings | {"frame": self.frames, "surprise_nats": surprise, "images": images}
-        out = replace(seen, settings=settings, timing_ms=timing, warnings=warnings)
+        self._images = tuple(dict.fromkeys([*seen.provenance.images, *self._images]))[:_IMAGES]
+        out = replace(
+            seen,
+            provenance=replace(seen.provenance, earlier_images=self._images),
+            diagnostics=replace(seen.diagnostics, frame=self.frames, surprise_nats=surprise),
+            timing_ms=timing,
+            warnings=warnings,
+        )
         if known is not None:
             out = replace(out, cells=known[0], log_prob=known[1], runs=None, contact=True)
-        self._last = out if out.observations and out.contact else None
+        self._last = out if out.contact and not out.diagnostics.is_skipped else None
         return out
 
     def predict(self, T_frame_sensor: Array) -> None:
         """Let a frame's time pass, and the sensor move to ``T_frame_sensor`` (4, 4)."""
         if self.T_frame_sensor is not None:
             moved = inverse(T_frame_sensor) @ self.T_frame_sensor
-            left = None if np.allclose(moved, np.eye(4), atol=1e-9) else self.spreading.left(moved)
+            left = None if np.allclose(moved, np.eye(4), atol=1e-9) else self.motion_kernel.left(moved)
 
             def later(known: Mixture) -> Mixture:
                 if left is not None and len(known.cells):
-                    known = self.spreading.carried(known, moved, left, self._rng)
+                    known = self.motion_kernel.carried(known, moved, left, self._rng)
                 for _ in range(1 + min(self.missed, _WIDENED)):
-                    known = self.spreading(known)
+                    known = self.motion_kernel(known)
                 return known.normalised()
 
-            self.memory = later(self.memory).mixed(max(self.fresh, _ANEW) if self.missed else self.fresh)
+            self.memory = later(self.memory).with_uniform(max(self.fresh, _ANEW) if self.missed else self.fresh)
             self.believed = self.believed and later(self.believed)
         self.T_frame_sensor, self.missed = T_frame_sensor, 0
 
@@ -149,7 +154,7 @@ class Filter:
             with np.errstate(divide="ignore"):
                 surprise = float(np.log(self.believed.mass @ likely + self.believed.uniform))
             if has_slipped(surprise) and self.fresh > 0:
-                expected = expected.mixed(_ANEW)
+                expected = expected.with_uniform(_ANEW)
         before = self._log_density(expected)
         log_density = np.float32(now) * gain
         log_density += before
@@ -169,7 +174,7 @@ class Filter:
 
     def _weights(self, seen: Posterior) -> tuple[float, float]:
         """Powers that a frame's likelihood and what was known before have in what is remembered."""
-        mask, before = seen.observation.contact.mask, self._moments
+        mask, before = _observation(seen).contact.mask, self._moments
         self._moments = moments_of(mask, seen.sensor)
         if self.counts[1] is not None:
             return self.counts[1], 1.0
@@ -191,7 +196,7 @@ class Filter:
 
     def _normalise(self, log_density: NDArray[np.float32]) -> NDArray[np.float32]:
         """The log probability (n,) of all possible cells, of a log density (n,), which is normalised in place."""
-        log_prob = log_density + self.spreading.index.log_possible_weight
+        log_prob = log_density + self.motion_kernel.index.log_possible_weight
         # so many at a time as a processor keeps at hand
         total = sum(float(np.exp(log_prob[i : i + _AT_HAND]).sum()) for i in range(0, len(log_prob), _AT_HAND))
         log_total = np.float32(np.log(total))
@@ -210,7 +215,7 @@ class Filter:
         kept = np.flatnonzero(log_density >= bar)
         if most is not None and len(kept) > most:
             kept = kept[_largest(log_density[kept], most)]
-        cells = self.spreading.index.possible[kept]
+        cells = self.motion_kernel.index.possible[kept]
         density, weight = np.exp(log_density[kept]), self._weight[kept]
         rest = 0.0
         if self.fresh > 0 and len(kept) < len(log_density):
@@ -219,19 +224,24 @@ class Filter:
 
     def _row(self, cells: NDArray[np.int64]) -> NDArray[np.int64] | slice:
         """Which of the possible cells each of ``cells`` (n,) is."""
-        possible = self.spreading.index.possible
+        possible = self.motion_kernel.index.possible
         return slice(None) if len(cells) == len(possible) else np.searchsorted(possible, cells)
 
     @cached_property
     def _weight(self) -> NDArray[np.float32]:
         """Share (n,) of the uniform measure in each of the possible cells."""
-        index = self.spreading.index
+        index = self.motion_kernel.index
         return np.asarray(index.weight).ravel()[index.possible]
 
     def _known(self, log_prob: NDArray[np.float32]) -> Known:
         """The possible cells that have mass, by their log probability (n,)."""
-        possible, held = self.spreading.index.possible, log_prob > -np.inf
+        possible, held = self.motion_kernel.index.possible, log_prob > -np.inf
         return (possible, log_prob) if held.all() else (possible[held], log_prob[held])
+
+
+def _observation(seen: Posterior) -> Observation:
+    assert seen.observation is not None  # a frame with contact that was not skipped has one
+    return seen.observation
 
 
 def _largest(values: NDArray[np.floating], n: int) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,24 +20,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.carry import Carry, RigStd
+from geomtact.contact_space.cell_transfer import CellTransfer, ExtrinsicsStd
 from geomtact.errors import NoPoseAgreesError
 from geomtact.inference.densities import NothingFelt
-from geomtact.inference.modes import Refined
+from geomtact.inference.distribution import Refined, cell_densities
+from geomtact.inference.extrinsics import extrinsics_covariance
+from geomtact.inference.facts import Diagnostics
+from geomtact.inference.joint_refinement import refine_jointly
+from geomtact.inference.mode_refiner import ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
-from geomtact.inference.refine import Refinery
-from geomtact.inference.refine_together import refine_together
-from geomtact.inference.rig import rig_covariance
-from geomtact.inference.search import View
+from geomtact.inference.search import SensorView
 from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, inverse
 
 # Of what two sensors show, at least: what a cell's width hides of the pose it hides from all of them
 _CORRELATION = 0.1
 _NEGLIGIBLE = 25.0  # nats below the most probable place
-# Density relative to the uniform distribution below which the first sensor's places are carried roughly
-_DOUBTFUL = 0.1
+# Density relative to the uniform distribution below which the first sensor's places are transferred by one pose each
+_UNLIKELY_DENSITY = 0.1
 _DISAGREES = -2.0  # nats by which the other sensors may make a reading less likely than chance does
 # Nats a contact above which the likeliest pose leaves what is seen unexplained: so do 2 of 100 scenes of right rigs (pin, head)
 _UNEXPLAINED = 1.75
@@ -66,7 +67,9 @@ class Fused:
 
 
 def fuse(
-    posteriors: Sequence[Posterior], log_prior: NDArray[np.floating] | None = None, rig: RigStd | None = None
+    posteriors: Sequence[Posterior],
+    log_prior: NDArray[np.floating] | None = None,
+    extrinsics_std: ExtrinsicsStd | None = None,
 ) -> Fused:
     """The product of the posteriors of N sensors that touch, or do not touch, one object at the same time.
 
@@ -74,33 +77,35 @@ def fuse(
     ----------
     posteriors : of the single sensors under the uniform prior, all in the world frame, one of them with contact
     log_prior : (M,) log mass of every cell of the first index with contact, the uniform's where it is None
-    rig : how well the sensors' poses relative to each other are known
+    extrinsics_std : uncertainty of the sensors' poses relative to each other
 
     Raises
     ------
     NoPoseAgreesError
-        No pose of the object agrees with all sensors; the one that disagrees is named where it can be told.
+        No pose of the object agrees with all sensors; names the one that disagrees, where one does.
     """
     first = next(i for i, posterior in enumerate(posteriors) if posterior.contact)
     base, others = posteriors[first], [i for i in range(len(posteriors)) if i != first]
     index = base.index
     log_prior = index.log_weight if log_prior is None else log_prior
-    density = base.densities.reshape(len(index.height), -1)
+    density = cell_densities(base).reshape(len(index.height), -1)
     prior = np.exp(log_prior.astype(np.float32)).reshape(density.shape)
-    # what the other sensors say is the same at all penetrations of a place
-    touched = prior.sum(0, dtype=float)
-    felt = np.einsum("pn,pn->n", prior, density).astype(float)
-    doubtful = felt < _DOUBTFUL * touched
+    # the other sensors do not distinguish the penetrations of a place
+    place_prior = prior.sum(0, dtype=float)
+    place_mass = np.einsum("pn,pn->n", prior, density).astype(float)
+    unlikely = place_mass < _UNLIKELY_DENSITY * place_prior
 
-    def told_by(other: Posterior) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    def likelihood_of(other: Posterior) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         T_other_first = inverse(other.T_frame_sensor) @ base.T_frame_sensor
-        return _seen(Carry(index, other.index, T_other_first, rig or RigStd()), other, doubtful)
+        return _seen(
+            CellTransfer(index, other.index, T_other_first, extrinsics_std or ExtrinsicsStd()), other, unlikely
+        )
 
     with ThreadPoolExecutor(2) as pool:  # whole sensors, for parts of one would wait for each other
-        told = list(pool.map(told_by, [posteriors[i] for i in others]))
-    seen, uniform = [each[0].astype(float) for each in told], [each[1] for each in told]
-    total = float(_product(felt, seen).sum())
-    without = [_product(touched, seen), *(_product(felt, seen, i) for i in range(len(seen)))]
+        likelihoods = list(pool.map(likelihood_of, [posteriors[i] for i in others]))
+    seen, uniform = [each[0].astype(float) for each in likelihoods], [each[1] for each in likelihoods]
+    total = float(_product(place_mass, seen).sum())
+    without = [_product(place_prior, seen), *(_product(place_mass, seen, i) for i in range(len(seen)))]
     order = [first, *others]
     if not total > 0:
         raise NoPoseAgreesError(_excluded(base.mesh.name, order, [float(each.sum()) for each in without]))
@@ -108,10 +113,10 @@ def fuse(
         support = np.zeros(len(order))
         support[order] = [
             np.log(total / without[0].sum()),
-            *map(partial(_support, total, touched), without[1:], uniform),
+            *map(partial(_support, total, place_prior), without[1:], uniform),
         ]
-        logs = np.log([np.divide(felt, touched, out=np.zeros_like(felt), where=touched > 0), *seen])
-        share = _shares(np.log(touched), logs, np.array([posteriors[i].contact for i in order]))
+        logs = np.log([np.divide(place_mass, place_prior, out=np.zeros_like(place_mass), where=place_prior > 0), *seen])
+        share = _shares(np.log(place_prior), logs, np.array([posteriors[i].contact for i in order]))
         log_prob = np.float32(share[0]) * np.log(density) + (share[1:, None] * logs[1:]).sum(0).astype(np.float32)
     log_prob = log_prob.reshape(-1) + log_prior
     cells = np.flatnonzero(np.isfinite(log_prior))
@@ -124,17 +129,17 @@ def fuse(
 
 def fused_posterior(
     touches: Sequence[Posterior],
-    refineries: Sequence[Refinery],
+    mode_refiners: Sequence[ModeRefiner],
     prior: Any,
     modes: int,
-    rig: RigStd | None = None,
+    extrinsics_std: ExtrinsicsStd | None = None,
 ) -> Posterior:
     """The posterior of all sensors together, on the cells of the first that has contact, its leading modes refined.
 
     Parameters
     ----------
     touches : what each sensor tells under the uniform prior, not refined, in the world frame
-    refineries : of the object on each sensor
+    mode_refiners : of the object on each sensor
     prior : as in ``Localizer.localize``
     modes : how many are refined
 
@@ -144,14 +149,14 @@ def fused_posterior(
         As :func:`fuse`.
     """
     if not any(touch.contact for touch in touches):
-        return _nothing_felt(touches, prior)
+        return _without_contact(touches, prior)
     first = next(touch for touch in touches if touch.contact)
     timing = {stage: sum(t.timing_ms.get(stage, 0.0) for t in touches) for stage in ("read", "score", "posterior")}
     began = time.perf_counter()
     log_prior = None
     if prior is not None:
         log_prior = prior_log_mass(first.index, prior, first.T_frame_sensor, first.frame)
-    fused = fuse(touches, log_prior, rig)
+    fused = fuse(touches, log_prior, extrinsics_std)
     timing["fuse"] = 1e3 * (time.perf_counter() - began)
     against = disagreement(fused, prior is not None)
     posterior = replace(
@@ -160,81 +165,73 @@ def fused_posterior(
         log_prob=fused.log_prob,
         runs=None,
         log_evidence=float(fused.weight @ [t.log_evidence for t in touches]) + fused.log_evidence,
-        observations=first.observations + [o for touch in touches if touch is not first for o in touch.observations],
-        settings=first.settings
-        | _said(touches)
-        | {"odd": any(t.settings.get("odd", False) for t in touches), "disagrees": against is not None},
         timing_ms=timing,
-        warnings=_warnings(touches) + ([against] if against else []),
+        **_of_all(touches, None if against is None else [against]),
     )
-    if modes:
-        views = [
-            View(
-                refinery,
-                touch.observation.contact if touch.contact else None,
-                inverse(touch.T_frame_sensor) @ first.T_frame_sensor,
-            )
-            for touch, refinery in zip(touches, refineries, strict=True)
-        ]
-        began = time.perf_counter()
-        posterior = refine_together(posterior, views, modes, first.seed, log_prior)
-        timing["refine"] = 1e3 * (time.perf_counter() - began)
-        others = [touch.T_frame_sensor for touch in touches if touch.contact and touch is not first]
-        if others and rig not in (None, RigStd()):
-            posterior = replace(posterior, refined=_on_rig(posterior, np.stack(others), rig))
-        elif others and against is None:
-            agreed = _badly_agreed(posterior.settings, prior is not None)
-            posterior = replace(posterior, warnings=posterior.warnings + agreed)
+    if not modes:
+        return posterior
+    views = [
+        SensorView(
+            mode_refiner,
+            touch.observation.contact if touch.contact and touch.observation else None,
+            inverse(touch.T_frame_sensor) @ first.T_frame_sensor,
+        )
+        for touch, mode_refiner in zip(touches, mode_refiners, strict=True)
+    ]
+    began = time.perf_counter()
+    posterior = refine_jointly(posterior, views, modes, first.seed, log_prior)
+    timing["refine"] = 1e3 * (time.perf_counter() - began)
+    others = [touch.T_frame_sensor for touch in touches if touch.contact and touch is not first]
+    if others and extrinsics_std not in (None, ExtrinsicsStd()):
+        posterior = replace(posterior, refined=_widened(posterior, np.stack(others), extrinsics_std))
+    elif others and against is None:
+        warnings = poor_agreement(posterior.diagnostics.unexplained_nats, prior is not None)
+        posterior = replace(posterior, warnings=posterior.warnings + warnings)
     return posterior
 
 
-def _on_rig(posterior: Posterior, T_frame_sensor: Array, rig: RigStd) -> dict[int, Refined]:
-    """What was refined, less sure by how well is known where the other sensors (n, 4, 4) are."""
+def _widened(posterior: Posterior, T_frame_sensor: Array, extrinsics_std: ExtrinsicsStd) -> dict[int, Refined]:
+    """The refined modes, with the uncertainty of where the other sensors (n, 4, 4) are added to their covariances."""
     seen = inverse(posterior.T_frame_sensor) @ T_frame_sensor
     return {
-        cell: replace(each, covariance=each.covariance + rig_covariance(each.T, seen, rig))
+        cell: replace(each, covariance=each.covariance + extrinsics_covariance(each.T, seen, extrinsics_std))
         for cell, each in posterior.refined.items()
     }
 
 
-def _badly_agreed(settings: Mapping[str, Any], with_prior: bool = False) -> list[str]:
-    """What is said where no pose explains all sensors' readings nearly as well as others explain each of them."""
-    nats = settings.get("unexplained_nats", 0.0)  # None: no pose that was looked into suits them all
-    if nats is not None and nats <= _UNEXPLAINED:
+def poor_agreement(unexplained_nats: float | None, with_prior: bool = False) -> list[str]:
+    """The warning, if any, that no pose explains all images nearly as well as others explain each of them."""
+    if unexplained_nats is None or unexplained_nats <= _UNEXPLAINED:
         return []
-    left = "does not suit all of them" if nats is None else f"leaves {nats:.1f} nats a contact unexplained"
+    left = f"leaves {unexplained_nats:.1f} nats a contact unexplained"
+    if not np.isfinite(unexplained_nats):
+        left = "does not suit all of them"
     return [
-        f"the sensors agree badly: the likeliest pose {left}, rarely more than {_UNEXPLAINED} where the rig is right; check "
-        f"{'the prior, ' * with_prior}T_world_sensor, or whether one of them touches something else, or say how well the rig is "
-        "known (std_mm, std_deg)"
+        f"the sensors agree badly: the likeliest pose {left}, rarely more than {_UNEXPLAINED} where the sensor poses are right; "
+        f"check {'the prior, ' * with_prior}T_world_sensor, or whether one of them touches something else, or give the "
+        "uncertainty of the sensor poses (std_mm, std_deg)"
     ]
 
 
-def _nothing_felt(touches: Sequence[Posterior], prior: Any) -> Posterior:
-    """The posterior when no sensor feels anything: what was known before, where none is touched."""
+def _without_contact(touches: Sequence[Posterior], prior: Any) -> Posterior:
+    """The posterior when no sensor has contact: the prior, restricted to poses that touch none of them."""
     first, others = touches[0], touches[1:]
-    return replace(
-        first,
-        elsewhere=NothingFelt(others, prior_log_density(first.index, prior, first.frame)),
-        observations=[o for touch in touches for o in touch.observations],
-        settings=first.settings | _said(touches),
-        warnings=_warnings(touches),
-    )
+    density = NothingFelt(others, prior_log_density(first.index, prior, first.frame))
+    return replace(first, off_contact_log_density=density, **_of_all(touches))
 
 
-def _said(touches: Sequence[Posterior]) -> dict[str, Any]:
-    """What is told of every sensor."""
+def _of_all(touches: Sequence[Posterior], disagreements: Sequence[str] | None = None) -> dict[str, Any]:
+    """Fields of the joint posterior that collect those of all ``touches``, in their order; warnings with the sensor's number."""
+    first = next((touch for touch in touches if touch.contact), touches[0])
+    warnings = [f"sensor {i}: {warning}" for i, touch in enumerate(touches, 1) for warning in touch.warnings]
     return {
-        "T_world_sensor": [t.T_frame_sensor.tolist() for t in touches],
-        "touched": [t.contact for t in touches],
-        "contact_methods": [t.settings["contact_method"] for t in touches],
-        "images": [image for t in touches for image in t.settings["images"]],
+        "observations": [o for touch in touches for o in touch.observations],
+        "provenance": replace(first.provenance, views=tuple(v for t in touches for v in t.provenance.views)),
+        "diagnostics": Diagnostics(
+            is_outlier=any(t.diagnostics.is_outlier for t in touches), disagrees=disagreements is not None
+        ),
+        "warnings": warnings + list(disagreements or []),
     }
-
-
-def _warnings(touches: Sequence[Posterior]) -> list[str]:
-    """What every sensor warns of, with its number."""
-    return [f"sensor {i}: {warning}" for i, touch in enumerate(touches, 1) for warning in touch.warnings]
 
 
 def disagreement(fused: Fused, with_prior: bool = False) -> str | None:
@@ -257,23 +254,23 @@ def disagreement(fused: Fused, with_prior: bool = False) -> str | None:
 
 
 def _seen(
-    carry: Carry, other: Posterior, doubtful: NDArray[np.bool_]
+    transfer: CellTransfer, other: Posterior, unlikely: NDArray[np.bool_]
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Likelihood (n,) of what ``other`` shows at each place of ``carry.here``, and of its showing any contact, or none."""
+    """Likelihood (n,) of what ``other`` shows at each place of ``transfer.here``, and of its showing any contact, or none."""
     if not other.contact:
-        free = carry.nothing_felt()
+        free = transfer.nothing_felt()
         return free, free
-    return carry.mean(other.densities, doubtful)
+    return transfer.mean(cell_densities(other), unlikely)
 
 
-def _shares(log_prior: Array, logs: Array, felt: NDArray[np.bool_]) -> Array:
+def _shares(log_prior: Array, logs: Array, has_contact: NDArray[np.bool_]) -> Array:
     """By how much each of N sensors counts (N,), given the log density (N, n) that each gives n places.
 
     Sensors that vary alike over the places still possible say the same twice, be it the truth or an error that a place repeats to
     all. So each counts by one over the number of sensors that it speaks for, 1 + the sum of its correlations with the others. One
     without contact counts in full.
     """
-    share, logs = np.ones(len(logs)), logs[felt]
+    share, logs = np.ones(len(logs)), logs[has_contact]
     if len(logs) < 2:
         return share
     joint = log_prior + logs.mean(0)
@@ -289,7 +286,7 @@ def _shares(log_prior: Array, logs: Array, felt: NDArray[np.bool_]) -> Array:
     std = np.sqrt(np.maximum(covariance.diagonal(), 1e-12))
     correlation = np.clip(covariance / np.outer(std, std), _CORRELATION, 1)
     np.fill_diagonal(correlation, 1)
-    share[felt] = 1 / correlation.sum(1)
+    share[has_contact] = 1 / correlation.sum(1)
     return share
 
 

@@ -1,7 +1,7 @@
 """How likely the outline of a contact is at poses, as rigid and elastic gels would feel them, and a search for likelier ones.
 
 What the grid stores, and what registration casts, is where the object lies below the membrane. A real gel sinks beside what
-presses, and touches less of it, by an amount that only solving for its pressure tells.
+presses, and touches less of it, by an amount that follows only from its pressure.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Gel:
             tried = np.concatenate([T[left, None], moved(T[left, None], motion, problem)], 1)
             sinks = np.repeat(self.sinking(T[left]), around + 1, 0)
             logs = self.log_likelihood(tried.reshape(-1, 4, 4), sinks)
-            merit = (np.logaddexp.reduce(logs, 1) - np.log(len(GELS))).reshape(tried.shape[:2])
-            best = np.arange(len(left)), merit.argmax(1)
-            T[left], likely[left] = tried[best], merit[best]
+            log_likelihood = (np.logaddexp.reduce(logs, 1) - np.log(len(GELS))).reshape(tried.shape[:2])
+            best = np.arange(len(left)), log_likelihood.argmax(1)
+            T[left], likely[left] = tried[best], log_likelihood[best]
         return T, likely

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.inference.distribution import (
+    CellDistribution,
+    Refined,
+    cell_log_density,
+    cell_poses,
+    leading_rows,
+    middle_cells,
+    nearest_images,
+    rows_of,
+)
 from geomtact.se3 import Array, adjoint, inverse
-
-if TYPE_CHECKING:
-    from geomtact.inference.posterior import Posterior
 
 _LEAST, _SPARE = 6, 2  # modes grown at least, and beyond those asked for
 _POINTS = 128  # of the surface, for distances between modes
@@ -47,28 +53,17 @@ class Mode:
         return f"Mode({100 * self.probability:.2g} %, object's origin at ({x:.2f}, {y:.2f}, {z:.2f}) mm)"
 
 
-@dataclass(frozen=True)
-class Refined:
-    """What registration found at one cell: its pose in the sensor frame, and what the contact tells there."""
-
-    T: Array
-    covariance: Array
-    observable: Array
-    length: float
-    moved: bool
-
-
-def grown(posterior: Posterior, k: int, full: bool = True) -> list[tuple[int, float]]:
+def grown(posterior: CellDistribution, k: int, full: bool = True) -> list[tuple[int, float]]:
     """The cell at the heart of each of the ``k`` leading modes and the mass of the mode, most probable first.
 
     A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most. Unless
     ``full``, the mass is that of the mode's most probable cells.
     """
     moved = np.array(sorted(posterior.refined), np.int64)
-    seeds = np.union1d(moved, posterior._heart(posterior._top_rows()))
-    seeds = seeds[np.argsort(-posterior.cell_log_density(seeds) - posterior.index.log_weight[seeds], kind="stable")]
-    poses = posterior._poses_of_cells(seeds)
-    distance, radius = PoseDistance(posterior.mesh, _POINTS), mode_radius(posterior.mesh)
+    seeds = np.union1d(moved, middle_cells(posterior, leading_rows(posterior)))
+    seeds = seeds[np.argsort(-cell_log_density(posterior, seeds) - posterior.index.log_weight[seeds], kind="stable")]
+    poses = cell_poses(posterior, seeds)
+    distance, radius = PoseDistance(posterior.index.mesh, _POINTS), mode_radius(posterior.index.mesh)
     members: list[tuple[int, NDArray[np.int64]]] = []
     covered: set[int] = set()
     for cell, T in zip(seeds.tolist(), poses, strict=True):
@@ -81,23 +76,31 @@ def grown(posterior: Posterior, k: int, full: bool = True) -> list[tuple[int, fl
     return _share_out(posterior, members)[:k]
 
 
-def mode_at(posterior: Posterior, cell: int, mass: float) -> Mode:
+def leading_cells(posterior: CellDistribution, k: int) -> NDArray[np.int64]:
+    """Pose ids (m,) of the index in the middle of the ``k`` leading modes, weighed by the most probable cells alone."""
+    found = grown(posterior, k, full=False) if posterior.contact and k > 0 else []
+    return np.array([cell for cell, _ in found], np.int64)
+
+
+def mode_at(posterior: CellDistribution, cell: int, mass: float) -> Mode:
     """The mode with its heart at ``cell`` that holds ``mass``, in the posterior's frame."""
     found = posterior.refined.get(cell)
     if found is None:
         T = _touching_pose(posterior, cell)
-        found = Refined(T, posterior.index.cell_covariance(T), np.zeros((0, 6)), posterior.mesh.radius_rms, False)
-    found = carried(found, posterior.nearest_images(found.T[None])[0])
+        found = Refined(T, posterior.index.cell_covariance(T), np.zeros((0, 6)), posterior.index.mesh.radius_rms, False)
+    found = carried(found, nearest_images(posterior, found.T[None])[0])
     T = posterior.T_frame_sensor @ found.T
     return Mode(T, mass, found.covariance, found.observable, found.length, found.moved)
 
 
-def _touching_pose(posterior: Posterior, cell: int) -> Array:
+def _touching_pose(posterior: CellDistribution, cell: int) -> Array:
     """The pose (4, 4) of ``cell`` in the sensor frame, moved along z where it presses too deep: the index measures depths on
     height maps, which miss what lies between their pixels."""
-    T = posterior._poses_of_cells(np.array([cell]))
-    if np.isnan(posterior.space.penetration(T)[0]):
-        settled, ok = posterior.space.settle(T, posterior.index.resolution.penetrations[cell // posterior.index.places])
+    T = cell_poses(posterior, np.array([cell]))
+    if np.isnan(posterior.index.space.penetration(T)[0]):
+        settled, ok = posterior.index.space.settle(
+            T, posterior.index.resolution.penetrations[cell // posterior.index.places]
+        )
         T = np.where(ok, settled, T)
     return np.asarray(T[0])
 
@@ -114,7 +117,7 @@ def carried(found: Refined, T: Array) -> Refined:
     return replace(found, T=T, covariance=A @ found.covariance @ A.T, observable=observable)
 
 
-def _share_out(posterior: Posterior, members: list[tuple[int, NDArray[np.int64]]]) -> list[tuple[int, float]]:
+def _share_out(posterior: CellDistribution, members: list[tuple[int, NDArray[np.int64]]]) -> list[tuple[int, float]]:
     """Modes with the cells within reach of each, made exclusive: a cell belongs to its most probable mode."""
     todo = [(cell, inside, _mass_of(posterior, inside)) for cell, inside in members]
     out: list[tuple[int, float]] = []
@@ -130,14 +133,14 @@ def _share_out(posterior: Posterior, members: list[tuple[int, NDArray[np.int64]]
 
 
 def _within(
-    posterior: Posterior, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]
+    posterior: CellDistribution, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Cells whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""
     cells = np.union1d(posterior.index.perhaps_within(T, distance, radius), moved)
-    return cells[distance.within(T, posterior._poses_of_cells(cells), radius)]
+    return cells[distance.within(T, cell_poses(posterior, cells), radius)]
 
 
-def _mass_of(posterior: Posterior, cells: NDArray[np.int64]) -> Array:
+def _mass_of(posterior: CellDistribution, cells: NDArray[np.int64]) -> Array:
     """Probability (m,) of the run that each of ``cells`` (m,) stands for; 0 where it stands for none."""
-    row, held = posterior._rows_of(cells)
-    return np.where(held & (posterior._heart(row) == cells), np.exp(posterior.log_prob[row]), 0.0)
+    row, held = rows_of(posterior, cells)
+    return np.where(held & (middle_cells(posterior, row) == cells), np.exp(posterior.log_prob[row]), 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.carry import Carry
+from geomtact.contact_space.cell_transfer import CellTransfer
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.densities import (
@@ -18,6 +18,7 @@ from geomtact.inference.densities import (
     mean_density,
     over_images,
 )
+from geomtact.inference.distribution import cell_densities, cell_log_density
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring.calibration import normalised
 from geomtact.se3 import Array, inverse
@@ -80,7 +81,7 @@ def log_mass_of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array)
             "prior: it says that the object does not touch the sensor, but this image shows a contact; leave it out"
         )
     if prior.index.key == index.key:
-        return _log_mass(index, prior.cell_log_density(np.arange(len(index))))
+        return _log_mass(index, cell_log_density(prior, np.arange(len(index))))
     return _log_mass(index, _on_another_grid(index, prior))
 
 
@@ -142,11 +143,11 @@ def _on_another_grid(index: Index, prior: Posterior) -> Array:
     Of the prior's cells, those in which a cell's own pose lies share out what they hold together by their density at these poses;
     the mass of all others goes to the cells in which their own poses lie.
     """
-    mass = prior.densities * np.exp(prior.index.log_weight)
+    mass = cell_densities(prior) * np.exp(prior.index.log_weight)
     looked_up = _home(index, np.arange(len(index)), prior.index)
     found = np.flatnonzero(looked_up >= 0)
     told = np.zeros(len(index))
-    told[found] = np.exp(index.log_weight[found] + prior.cell_log_density(looked_up[found]))
+    told[found] = np.exp(index.log_weight[found] + cell_log_density(prior, looked_up[found]))
     seen = np.unique(looked_up[found])
     told *= mass[seen].sum() / max(told.sum(), 1e-300)
     mass[seen] = 0
@@ -171,12 +172,12 @@ def _home(index: Index, ids: NDArray[np.int64], other: Index) -> NDArray[np.int6
 def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
     """Log density (N,) of a prior that a sensor elsewhere told, in the cells of ``index``: the mean over each, for a cell is
     wider than the gel is deep, so that its own pose seldom touches there."""
-    apart = prior.elsewhere
+    apart = prior.off_contact_log_density
     others, before = (apart.others, apart.before) if isinstance(apart, NothingFelt) else ((), apart)
     density = np.ones(index.places)
     for told in (prior, *others):
-        carry = Carry(index, told.index, inverse(told.T_frame_sensor) @ T_frame_sensor)
-        density *= carry.mean(told.densities)[0] if told.contact else carry.nothing_felt()
+        transfer = CellTransfer(index, told.index, inverse(told.T_frame_sensor) @ T_frame_sensor)
+        density *= transfer.mean(cell_densities(told))[0] if told.contact else transfer.nothing_felt()
     with np.errstate(divide="ignore"):
         out = np.tile(np.log(density), len(index.height))
     if isinstance(before, OfAllImages):

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sized
 from dataclasses import asdict, replace
 from itertools import repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from geomtact.contact_space.index import Index
 from geomtact.errors import InputError, PoseError, UsageError, nearest_name
+from geomtact.inference.facts import Diagnostics, TrackRecord
 from geomtact.inference.filter import FRESH, NOW, Counts, Filter
 from geomtact.inference.motion import Motion, UniformBall
+from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import opened, prior_log_mass, reference_of
 from geomtact.inference.repeated_images import counted_once
-from geomtact.inference.spreading import Mixture, Spreading
+from geomtact.scoring.fitted import FittedScorer
 from geomtact.se3 import Array, check_transforms
-
-if TYPE_CHECKING:
-    from geomtact.inference.localizer import Localizer
 
 _ERRORS = ("raise", "skip")
 _NO_POSE = object()
@@ -28,7 +28,10 @@ _NO_FRAMES = "frames: expected at least one image, got none; check the folder, o
 
 
 def track(
-    localizer: Localizer,
+    localize: Callable[..., Posterior],
+    index: Index,
+    scorer: FittedScorer,
+    cache_dir: str | Path | None,
     frames: Iterable[Any],
     T_world_sensor: Any = None,
     motion: Motion | None = None,
@@ -47,13 +50,14 @@ def track(
 
     Parameters
     ----------
+    localize, index, scorer, cache_dir : of the localizer
     frames : images as ``localize`` takes them, a list or a generator, such as a live camera
     T_world_sensor : (4, 4) of a sensor at rest, or one a frame (n, 4, 4), a list or a generator: the posteriors are then in the
-        world frame, and where the sensor moves the object is taken to stay, but for ``motion``
-    motion : of the object from one frame to the next, ``UniformBall()`` by default; the tighter it is, the more the frames before
-        tell
+        world frame, and where the sensor moves the object stays, but for ``motion``
+    motion : of the object from one frame to the next, ``UniformBall()`` by default; the tighter it is, the more the frames
+        before constrain the pose
     effort, kind, background, seed : as for ``localize``
-    prior : what was known before the first frame with contact, over the sensor as it stands then (see ``inference.prior``)
+    prior : distribution before the first frame with contact, over the sensor as it stands then (see ``inference.prior``)
     most : cells that are kept from frame to frame at most, which bounds the time a frame takes; all that count by default
     counts : powers of a frame's likelihood, in its own posterior and in those of all later frames; None for the latter lets all
         frames before count by ``filter.MEMORY`` together, so that frames which err alike are not counted twice. (1, 1) is the
@@ -65,25 +69,26 @@ def track(
     Yields
     ------
     Posterior
-        ``settings["surprise_nats"]`` is the log of how likely the posterior before made the frame, relative to chance. Where it
-        is far below 0 a warning says that the object may have slipped, and half of what was known before is given up; the same
-        is done when contact is back after frames without. A frame without contact has the posterior that ``localize`` gives.
+        Where ``diagnostics.surprise_nats`` is far below 0, ``track`` warns that the object may have slipped and replaces half of
+        the expectation by the uniform distribution; so it does when contact is back after frames without. A frame without
+        contact has the posterior that ``localize`` gives.
 
     Raises
     ------
     UsageError, InputError
-        Told at once, or with the frame they concern, counted from 1.
+        At once, or with the frame they concern, counted from 1.
     """
     motion = motion or UniformBall()
-    _check(frames, localizer.sensor.image_size_px, motion, counts, fresh, most, on_error)
-    state = make_filter(localizer, motion, counts, fresh, most, seed)
+    _check(frames, index.sensor.image_size_px, motion, counts, fresh, most, on_error)
+    state = make_filter(index, scorer, motion, counts, fresh, most, seed)
     pairs = _pairs(frames, _poses(frames, T_world_sensor))
     options = {"effort": effort, "kind": kind, "background": background, "seed": seed}
-    return _tracked(localizer, pairs, state, prior, options, on_error == "skip")
+    return _tracked(localize, index, cache_dir, pairs, state, prior, options, on_error == "skip")
 
 
 def make_filter(
-    localizer: Localizer,
+    index: Index,
+    scorer: FittedScorer,
     motion: Motion | None = None,
     counts: Counts = (NOW, None),
     fresh: float = FRESH,
@@ -91,46 +96,55 @@ def make_filter(
     seed: int = 0,
 ) -> Filter:
     """The filter that :func:`track` puts the posteriors of single frames through, one :meth:`Filter.step` a frame."""
-    within = localizer.scorer.evidence_model.moments.covariance
-    return Filter(Spreading(localizer.index, motion or UniformBall(), seed), within, counts, fresh, most)
+    within = scorer.evidence_model.moments.covariance
+    return Filter(MotionKernel(index, motion or UniformBall(), seed), within, counts, fresh, most)
 
 
 def _tracked(
-    localizer: Localizer,
+    localize: Callable[..., Posterior],
+    index: Index,
+    cache_dir: str | Path | None,
     pairs: Iterable[tuple[int, Any, Array | None]],
     state: Filter,
     prior: Any,
     options: dict[str, Any],
     skip: bool,
 ) -> Iterator[Posterior]:
-    index, motion, made_from, expected = localizer.index, state.spreading.motion, None, None
-    settings: dict[str, Any] = {"motion": {"kind": type(motion).__name__, **asdict(motion)}}
-    settings |= {"counts": list(state.counts), "fresh": state.fresh, "most": state.most}
+    motion, made_from, expected = state.motion_kernel.motion, None, None
+    record = TrackRecord({"kind": type(motion).__name__, **asdict(motion)}, state.counts, state.fresh, state.most)
     for n, image, T in pairs:
         frame, at = ("sensor", np.eye(4)) if T is None else ("world", T)
         try:
-            seen = localizer.localize(image, T_world_sensor=T, **options)
+            seen = localize(image, T_world_sensor=T, **options)
         except InputError as error:
             if not skip:
                 raise type(error)(
                     f'frame {n}: {error}; or pass such frames over: --skip-broken, on_error="skip" in Python'
                 ) from None
-            told = [f"frame {n} was skipped: {error}"]
-            nothing = np.zeros(0, np.int64), np.zeros(0)
-            seen = Posterior(index, *nothing, frame, at, contact=False, seed=options["seed"], warnings=told)
-        if prior is not None and (seen.contact or not seen.observations):
+            seen = Posterior(
+                index,
+                np.zeros(0, np.int64),
+                np.zeros(0),
+                frame,
+                at,
+                contact=False,
+                seed=options["seed"],
+                diagnostics=Diagnostics(is_skipped=True),
+                warnings=[f"frame {n} was skipped: {error}"],
+            )
+        if prior is not None and (seen.contact or seen.diagnostics.is_skipped):
             # the cells are those over the sensor where it stands now
-            prior = opened(prior, localizer.cache_dir)
+            prior = opened(prior, cache_dir)
             log_mass = prior_log_mass(index, prior, at, frame)
             state.memory = Mixture(np.flatnonzero(np.isfinite(log_mass)), np.exp(log_mass[np.isfinite(log_mass)]), 0.0)
             made_from, expected, prior = prior, prior, None
-        if seen.observations:
+        if not seen.diagnostics.is_skipped:
             seen = counted_once(seen, made_from)
-        known = state.step(replace(seen, settings=seen.settings | settings))
-        known = replace(known, reference=reference_of(expected, known))
-        if known.contact:
-            expected = known
-        yield known
+        posterior = state.step(replace(seen, provenance=replace(seen.provenance, track=record)))
+        posterior = replace(posterior, reference=reference_of(expected, posterior))
+        if posterior.contact:
+            expected = posterior
+        yield posterior
 
 
 def _check(

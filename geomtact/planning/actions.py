@@ -1,4 +1,4 @@
-"""What can be done to learn more: touch with the sensor, or probe with a thin finger; and what either would show."""
+"""Actions that measure the pose: touch with the sensor, or probe with a thin finger; and what either would show."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from geomtact.se3 import Array, check_pose, inverse, transform
 from geomtact.sensing.moments import moments
 from geomtact.sensing.sensor import Sensor
 
-# The share of the penetration that is pressed at each pose of a cell: first in the touch that is told, then in those that it
-# is compared with. The localizer is not told it either.
+# The share of the penetration that is pressed at each pose of a cell: first in the touch that is evaluated, then in those that
+# it is compared with. The localizer is not given it either.
 PRESSED = (0.5, 0.2, 0.4, 0.6, 0.8)
 _SHAPE = (24, 32)  # of the casts
 _FARTHEST = 3.0  # m that a sensor travels at most: more is meant in millimetres
@@ -74,7 +74,7 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A thin finger comes along ``direction`` up to ``point`` and tells only whether it met the object on its way.
+    """A thin finger comes along ``direction`` up to ``point`` and reports only whether it met the object on its way.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Touches from round about, to choose from where nobody says which the robot can make."""
+"""Touches from all around the object, the default actions to choose from."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomtact.geometry.approach import facing, sunflower
+from geomtact.inference.posterior import Posterior
 from geomtact.planning.actions import Touch
-from geomtact.planning.belief import Belief, check_contact, draw_cells
+from geomtact.planning.draws import check_contact, draw_cells
 from geomtact.se3 import Array, apply, check_pose, inverse, transform
 
-_SAME_WAY = np.radians(15)
-_POSES = 128  # that tell the region
+_SAME_DIRECTION = np.radians(15)  # within which touches from one place are taken for the same
+_POSES = 128  # drawn from the posterior to find the region of the object
 
 
 def grid_of_touches(
-    posterior: Belief,
+    posterior: Posterior,
     side: ArrayLike | None = None,
     reachable: Callable[[Array], bool] | None = None,
     made: Iterable[ArrayLike] = (),
@@ -27,7 +28,7 @@ def grid_of_touches(
 
     The sensor comes from 17 directions of a half-sphere, or from those that the posterior's approach allows at its first
     mode, and starts clear of the object. Where the region is wide, up to 3 x 3 touches lie side by side. That the sensor's
-    body may strike the first sensor, or a robot its own elbow, is for ``reachable`` to say.
+    body may strike the first sensor, or a robot its own elbow, is for ``reachable`` to decide.
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ def grid_of_touches(
         sensor, along its +z
     reachable : whether the robot can bring the sensor to a pose (4, 4); asked of where it starts and of where it ends
     made : T_world_sensor (4, 4) of touches made before; what is nearly the same is left out, for it errs in the same way
-    seed : of the poses that tell the region
+    seed : of the poses that give the region
     """
     check_contact(posterior)
     space = posterior.space
@@ -55,19 +56,19 @@ def grid_of_touches(
         for x in low[0] + (np.arange(columns) + 0.5) / columns * (high[0] - low[0]):
             for y in low[1] + (np.arange(rows) + 0.5) / rows * (high[1] - low[1]):
                 first, last = (transform(R, R @ [x, y, z]) for z in (start, end))
-                again = any(_same_way(first, T, window.min() / 4) for T in before)
+                again = any(_repeats(first, T, window.min() / 4) for T in before)
                 if not again and (reachable is None or (reachable(first) and reachable(last))):
                     out.append(Touch(first, float(end - start)))
     return out
 
 
-def _same_way(T: Array, other: Array, near: float) -> bool:
+def _repeats(T: Array, other: Array, near: float) -> bool:
     """Whether sensors at ``T`` and ``other`` (4, 4) look the same way and past each other by less than ``near`` [m]."""
     apart = inverse(T) @ other
-    return bool(apart[2, 2] > np.cos(_SAME_WAY) and np.hypot(*apart[:2, 3]) < near)
+    return bool(apart[2, 2] > np.cos(_SAME_DIRECTION) and np.hypot(*apart[:2, 3]) < near)
 
 
-def _directions(posterior: Belief, side: ArrayLike | None, long_axis: Array) -> Array:
+def _directions(posterior: Posterior, side: ArrayLike | None, long_axis: Array) -> Array:
     """Directions (m, 3) from the object towards the sensor, in the posterior's frame."""
     cones = posterior.space.cones
     if cones is not None and side is None:

@@ -1,8 +1,8 @@
-"""Which touch to make next: the one whose outcome is expected to tell most about the pose (thesis 8.2).
+"""Which touch to make next: the one with the largest expected information gain for its cost (thesis 8.2).
 
 Cells are drawn from the posterior, and poses within each. Every action is tried at all of these poses in simulation. What
 it would show at one pose of a cell is compared with what it would show at other poses of this and of all other cells: so
-a difference counts only if it tells cells apart, as the localizer could, not if it lies between two poses of one cell.
+a difference counts only if it distinguishes cells, as the localizer could, not if it lies between two poses of one cell.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import UsageError
+from geomtact.inference.posterior import Posterior
 from geomtact.planning.actions import PRESSED, Probe, Touch
-from geomtact.planning.belief import Belief, check_contact, draw_cells
+from geomtact.planning.draws import check_contact, draw_cells
 from geomtact.planning.grid import grid_of_touches
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
-LEAST = 0.05  # nats below which an action does not help
+LEAST = 0.05  # nats of expected information below which an action does not help
 _CELLS = 128  # drawn from the posterior
-# Of many actions, so many are tried at all poses, for they tell most at so many of one in so many cells
+# Of many actions, those tried at all poses: the best at some of the poses of one cell in a few
 _CLOSELY, _WITHIN, _ONE_IN = 24, 3, 4
 _LEAST_CELLS = 32  # of which that is done
 # Standard deviations at one pose: of where the sensor stops and of the contact's centre [m], and of the contact's log area,
@@ -48,8 +49,8 @@ class Action:
     contact : probability that it touches
     number : among the actions given, from 1
     of : the action itself
-    roughly : whether it was tried at some of the poses alone, as one of many that tell less: its ``expected_discarded`` is then
-        not to be compared with others'
+    roughly : whether it was tried at some of the poses alone, as one of many with less information: do not compare its
+        ``expected_discarded`` with others'
     """
 
     T_world_sensor: Array
@@ -67,17 +68,17 @@ class Action:
 
 
 def next_touch(
-    posterior: Belief, actions: Iterable[Touch | Probe | ArrayLike] | None = None, n: int = _CELLS, seed: int = 0
+    posterior: Posterior, actions: Iterable[Touch | Probe | ArrayLike] | None = None, n: int = _CELLS, seed: int = 0
 ) -> list[Action]:
     """``actions`` by the information that they are expected to give for their cost, the best first; ties in their order.
 
-    Of more than 24, those that tell less at some of the poses are not tried at the others, and come last.
+    Of more than 24, those with less information at some of the poses are not tried at the others, and come last.
 
     Parameters
     ----------
-    posterior : what is known now; actions are in its frame
+    posterior : of the touches so far; actions are in its frame
     actions : touches and probes; a pose (4, 4) is a touch without travel; by default :func:`grid_of_touches`
-    n : cells drawn from the posterior; no action can be seen to tell more than log(n)
+    n : cells drawn from the posterior; no action can be expected to give more than log(n) nats
     seed : of the draws
 
     Raises
@@ -95,21 +96,21 @@ def next_touch(
         raise UsageError("next_touch: no actions to choose from; give some, or none at all for a grid of touches")
     T = draw_cells(posterior, n, np.random.default_rng(seed), len(PRESSED))
     few = T[:_WITHIN, ::_ONE_IN] if len(tried) > _CLOSELY and n >= _LEAST_CELLS else T
-    judged = _ranked(judge(posterior.space, action, few, number) for number, action in enumerate(tried, 1))
+    ranked = _ranked(evaluate(posterior.space, action, few, number) for number, action in enumerate(tried, 1))
     if few is T:
-        return judged
-    closely = _ranked(judge(posterior.space, action.of, T, action.number) for action in judged[:_CLOSELY])
-    return closely + [replace(action, roughly=True) for action in judged[_CLOSELY:]]
+        return ranked
+    closely = _ranked(evaluate(posterior.space, action.of, T, action.number) for action in ranked[:_CLOSELY])
+    return closely + [replace(action, roughly=True) for action in ranked[_CLOSELY:]]
 
 
-def _ranked(judged: Iterable[Action]) -> list[Action]:
-    """The most telling for its cost first; ties in the order in which they were given."""
-    return sorted(judged, key=lambda a: (-round(a.expected_nats / a.cost, 9), a.number))
+def _ranked(actions: Iterable[Action]) -> list[Action]:
+    """The most information for its cost first; ties in the order in which they were given."""
+    return sorted(actions, key=lambda a: (-round(a.expected_nats / a.cost, 9), a.number))
 
 
-def judge(space: ContactSpace, action: Touch | Probe, T_world_object: Array, number: int = 1) -> Action:
+def evaluate(space: ContactSpace, action: Touch | Probe, T_world_object: Array, number: int = 1) -> Action:
     """What is expected of ``action`` where the object is equally likely at each of n places, of which d poses
-    ``T_world_object`` (d, n, 4, 4) are known, d >= 2."""
+    ``T_world_object`` (d, n, 4, 4) are given, d >= 2."""
     felt, shown = action.shows(space, T_world_object)
     likelihood = likelihoods(felt, shown, _noise(space.sensor)[: shown.shape[-1]])
     return Action(
@@ -135,7 +136,7 @@ def likelihoods(felt: NDArray[np.bool_], shown: Array, noise: Array) -> Array:
     shown : (d, n, k) what it shows there
     noise : (k,) standard deviation of what is shown, at one pose
     """
-    told, felt, seen, shown = felt[0], felt[1:], shown[0], shown[1:]
+    touched, felt, seen, shown = felt[0], felt[1:], shown[0], shown[1:]
     seen = seen + noise * np.random.default_rng(0).normal(size=seen.shape)
     count = felt.sum(0)
     mean = (shown * felt[..., None]).sum(0) / np.maximum(count, 1)[:, None]
@@ -146,17 +147,17 @@ def likelihoods(felt: NDArray[np.bool_], shown: Array, noise: Array) -> Array:
     log_t = np.where(felt, -0.5 * (_FREEDOM + len(noise)) * np.log1p(square / _FREEDOM), -np.inf)
     alike = np.exp(log_t - log_t.max((1, 2), keepdims=True)) if felt.any() else np.zeros(log_t.shape)
     chance = alike.sum((1, 2), keepdims=True) / max(1, felt.sum())
-    both = told[:, None, None] & felt
+    both = touched[:, None, None] & felt
     with np.errstate(invalid="ignore"):
         ratio = np.where(both, alike / chance, 1.0)
-    right = told[:, None, None] == felt
+    right = touched[:, None, None] == felt
     return (np.where(right, 1 - _WRONG, _WRONG) * ratio).mean(1)
 
 
 def information(likelihood: Array) -> float:
     """Expected information [nats] about which of n equally likely places is the right one, of ``likelihood`` (n, n).
 
-    H(place) - E[-log P(place | outcome)], each outcome judged by what other poses of its place show: 0 to log(n). An
+    H(place) - E[-log P(place | outcome)], each outcome evaluated by what other poses of its place show: 0 to log(n). An
     outcome that misleads in the mean is worth nothing, for it can be ignored.
     """
     right = np.diag(likelihood) / likelihood.mean(1)
@@ -179,7 +180,7 @@ def ambiguity(ranked: Sequence[Action]) -> str | None:
         why = "each would touch, and show the same at all poses that are still possible; touch elsewhere or from other sides"
     else:
         why = "each would show the same at all poses that are still possible; touch elsewhere or from other sides"
-    return f"the pose stays as uncertain as it is: these actions would tell at most {most:.2f} nats, for {why}"
+    return f"the pose stays as uncertain: the expected information gain of these actions is at most {most:.2f} nats, for {why}"
 
 
 def _noise(sensor: Sensor) -> Array:

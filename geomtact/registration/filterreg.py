@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.registration.fit import FEWEST, Meeting, judged, only_told
+from geomtact.registration.contact_problem import FLAT
+from geomtact.registration.fit import FEWEST, Meeting, accept_or_revert, keep_observable
 from geomtact.registration.observability import Spread, jacobian, moved
 from geomtact.registration.protocol import Problem, Refinement, Surface
-from geomtact.registration.rim import FLAT
 from geomtact.se3 import Array, apply, check_transforms, inverse, unit
 
 _A_THREAD = 2000  # points whose nearest surface is worth a thread of its own
@@ -52,7 +52,7 @@ class FilterReg:
         """Refine the poses ``T`` (k, 4, 4) of the object in the problem's frame."""
         start = check_transforms(T, "start pose").reshape(-1, 4, 4)
         contact_filter = ContactFilter(problem, self.surface, self.objective, self.neighbours)
-        # motions zeta and sinks of the gel are held by what was known before: what is not told stays where it was
+        # motions zeta and sinks of the gel are held by their spread before: what is not observable stays where it was
         held = np.append(1 / self.spread.metres(problem.length), np.full(problem.contacts, 1 / problem.sink_std)) ** 2
         state, T, at_rest = np.zeros((len(start), len(held))), start.copy(), np.zeros(len(start), bool)
         sigma, at_end = self.spread.radius(problem.length), 0
@@ -76,7 +76,7 @@ class FilterReg:
             if at_end > 1:
                 at_rest[going] = expected < _REST**2
                 going = going[~at_rest[going]]
-        return contact_filter.judged(start, T, state[:, 6:], at_rest, self.spread)
+        return contact_filter.accept_or_revert(start, T, state[:, 6:], at_rest, self.spread)
 
 
 class ContactFilter:
@@ -120,10 +120,12 @@ class ContactFilter:
             support=(inlier > 0.5).sum(1),
         )
 
-    def judged(self, start: Array, T: Array, sinks: Array, at_rest: NDArray[np.bool_], spread: Spread) -> Refinement:
-        """``T`` (k, 4, 4) as far from ``start`` (k, 4, 4) as is told, where that can be believed (see ``fit``)."""
-        T = only_told(start, T, self.meet(T, sinks, self.narrowest), spread, self.problem)
-        return judged(start, T, self.meet(T, sinks, self.narrowest), at_rest, spread, self.problem)
+    def accept_or_revert(
+        self, start: Array, T: Array, sinks: Array, at_rest: NDArray[np.bool_], spread: Spread
+    ) -> Refinement:
+        """``T`` (k, 4, 4) moved from ``start`` (k, 4, 4) along observable directions alone, where accepted (see ``fit``)."""
+        T = keep_observable(start, T, self.meet(T, sinks, self.narrowest), spread, self.problem)
+        return accept_or_revert(start, T, self.meet(T, sinks, self.narrowest), at_rest, spread, self.problem)
 
     def pull(self, T: Array, sigma: float) -> tuple[Array, Array]:
         """Normal equations (k, 6, 6), (k, 6) of the membrane that is on the wrong side of the surface."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.registration.observability import Spread, motion_of, moved, summary, told, without_sinks
+from geomtact.registration.observability import Spread, motion_of, moved, observable_subspace, summary, without_sinks
 from geomtact.registration.protocol import Problem, Refinement
 from geomtact.se3 import Array
 
@@ -34,21 +34,21 @@ class Meeting:
     support: NDArray[np.int64]
 
 
-def only_told(start: Array, T: Array, meeting: Meeting, spread: Spread, problem: Problem) -> Array:
-    """``T`` (k, 4, 4) moved back to ``start`` (k, 4, 4) along all directions that are not told where they meet."""
+def keep_observable(start: Array, T: Array, meeting: Meeting, spread: Spread, problem: Problem) -> Array:
+    """``T`` (k, 4, 4) moved back to ``start`` (k, 4, 4) along all directions that are not observable where they meet."""
     zeta = motion_of(start, T, problem)
     for i, each in enumerate(meeting.information):
         information = without_sinks(each, problem.sink_std)
         if np.isfinite(information).all():
-            measure, move, _ = told(information, spread, problem.length)
+            measure, move, _ = observable_subspace(information, spread, problem.length)
             zeta[i] = move @ (measure @ zeta[i])
     return moved(start, zeta, problem)
 
 
-def judged(
+def accept_or_revert(
     start: Array, T: Array, meeting: Meeting, at_rest: NDArray[np.bool_], spread: Spread, problem: Problem
 ) -> Refinement:
-    """``T`` (k, 4, 4) where it can be believed: the starts (k, 4, 4) elsewhere, about which nothing was learnt.
+    """``T`` (k, 4, 4) where it can be believed: the starts (k, 4, 4) elsewhere.
 
     A pose is believed that came to rest near its start, with what was observed on the surface.
     """
@@ -67,7 +67,7 @@ def judged(
     for i in range(len(T)):
         information = np.zeros((6, 6))
         if believed[i]:
-            # noise larger than assumed tells less
+            # noise larger than assumed gives less information
             information = without_sinks(meeting.information[i], problem.sink_std) / max(1.0, meeting.residual[i]) ** 2
         covariance[i], rows = summary(out[i], information, spread, problem)
         observable.append(rows)

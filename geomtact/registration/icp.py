@@ -1,7 +1,7 @@
 """Open3D's point-to-plane ICP for the rim of a contact, with checks of its own.
 
 Open3D returns the start pose with rmse 0 when nothing corresponds, and moves freely in directions that the rim does not
-tell; so its answer is judged by the rim's own measure, and kept only as far as the rim tells.
+constrain; so its result is checked by the rim's own measure, and kept only in observable directions.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomtact.registration.contact_problem import near_surface
 from geomtact.registration.filterreg import ContactFilter
 from geomtact.registration.fit import FEWEST
 from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Problem, Refinement, Surface
-from geomtact.registration.rim import near_surface
 from geomtact.se3 import Array, check_transforms, inverse
 
 _MAX_ITERATIONS = 20
@@ -45,7 +45,7 @@ class Icp:
         ended = [first if pose is None else pose for first, pose in zip(start, found, strict=True)]
         sinks = np.zeros((len(start), problem.contacts))
         contact_filter = ContactFilter(problem, self.surface)
-        return contact_filter.judged(start, np.reshape(ended, (-1, 4, 4)), sinks, met, self.spread)
+        return contact_filter.accept_or_revert(start, np.reshape(ended, (-1, 4, 4)), sinks, met, self.spread)
 
     def _register(self, problem: Problem, start: Array) -> Array | None:
         reach = 3 * self.spread.radius(problem.length) + 2 * problem.pitch
@@ -105,7 +105,7 @@ def _one_thread() -> Iterator[None]:
 def _anchors(problem: Problem, reach: float) -> tuple[Array, Array]:
     """Points (9, 3) far from all surface and directions (9, 3) in which each is held where it is.
 
-    A wall tells nothing about the way along it; Open3D's normal equations are singular then, and its step is at random.
+    A wall does not constrain motion along it; Open3D's normal equations are singular then, and its step is at random.
     Each anchor weighs as much as a rim point, which is little against the rim.
     """
     angle, up = 2 * np.pi / 9 * np.arange(9)[:, None], problem.outwards

@@ -1,8 +1,8 @@
-"""What a contact tells about a pose, and what it leaves open.
+"""Which directions of a pose a contact constrains, and which it leaves open.
 
 Small motions are taken about the contact's centre, rotations times the contact's length, so that all six are metres
-at the contact: zeta = S A xi, with xi the twist of T exp(xi^). How sharply the rim fixes zeta is compared with how
-well it was known before; directions in which the rim adds little keep their variance and are not called told.
+at the contact: zeta = S A xi, with xi the twist of T exp(xi^). How sharply the rim fixes zeta is compared with the
+spread before; directions in which the rim adds little keep their variance and are not called observable.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array, apply, exp, hat, inverse, log, transform
 
 _LEAST_TURN = 0.02  # rad
-GAIN = 4 / 3  # information over what was known before from which a direction is told: to a quarter of the grid's step
+# information over that of the start poses, both [1/m^2], from which a direction is observable: to a quarter of the grid's step
+GAIN = 4 / 3
 
 
 @dataclass(frozen=True)
@@ -69,24 +70,24 @@ def jacobian(points: Array, normals: Array, problem: Problem) -> Array:
 
 
 def without_sinks(information: Array, sink_std: float) -> Array:
-    """Information (6, 6) about zeta, from that about zeta and the sinks of c contacts (6 + c, 6 + c), when sinks are not known.
+    """Information (6, 6) about zeta, from that about zeta and the sinks of c contacts (6 + c, 6 + c), when the sinks are free.
 
-    A sink acts as a shift of the object along the membrane's normal does, so that what one contact tells about that shift
+    A sink acts as a shift of the object along the membrane's normal does, so that one contact's information about that shift
     is capped at 1 / sink_std^2.
     """
     mixed, sinks = information[:6, 6:], information[6:, 6:]
     return information[:6, :6] - mixed @ np.linalg.solve(sinks + np.eye(len(sinks)) / sink_std**2, mixed.T)
 
 
-def told(information: Array, spread: Spread, length: float) -> tuple[Array, Array, Array]:
-    """The told directions of zeta: rows (r, 6) that measure them, columns (6, r) that move along them, their gains (r,).
+def observable_subspace(information: Array, spread: Spread, length: float) -> tuple[Array, Array, Array]:
+    """The observable directions of zeta: rows (r, 6) that measure them, columns (6, r) that move along them, their gains (r,).
 
     ``information`` (6, 6) [1/m^2] is the inverse covariance that the rim alone would give.
     """
-    known = spread.metres(length)
-    gain, axes = np.linalg.eigh(known[:, None] * information * known)
+    std = spread.metres(length)
+    gain, axes = np.linalg.eigh(std[:, None] * information * std)
     axes = axes[:, gain > GAIN]
-    return axes.T / known, known[:, None] * axes, gain[gain > GAIN]
+    return axes.T / std, std[:, None] * axes, gain[gain > GAIN]
 
 
 def moved(T: Array, zeta: ArrayLike, problem: Problem) -> Array:
@@ -104,12 +105,12 @@ def motion_of(start: Array, T: Array, problem: Problem) -> Array:
 def summary(T: Array, information: Array, spread: Spread, problem: Problem) -> tuple[Array, Array]:
     """Covariance (6, 6) of xi and the observable directions (r, 6), from the information (6, 6) about zeta.
 
-    The covariance joins what the contact tells with what was known before; nothing is unknown beyond ``spread``.
+    The covariance combines the contact's information with the spread of the start poses, which it never exceeds.
     """
-    known = spread.metres(problem.length)
-    measure, move, gain = told(information, spread, problem.length)
-    # in told directions the variance known**2 becomes known**2 / (1 + gain)
-    covariance = np.diag(known**2) - (move * (gain / (1 + gain))) @ move.T
+    std = spread.metres(problem.length)
+    measure, move, gain = observable_subspace(information, spread, problem.length)
+    # in observable directions the variance std**2 becomes std**2 / (1 + gain)
+    covariance = np.diag(std**2) - (move * (gain / (1 + gain))) @ move.T
     to_zeta = zeta_of_xi(T, problem)
     back = np.linalg.inv(to_zeta)
     scale = np.repeat([problem.length, 1.0], 3)

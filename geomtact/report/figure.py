@@ -138,7 +138,7 @@ def _modes(
 
 def _over(posterior: Posterior, shown: Sequence[SensorImage]) -> str:
     """The one of several sensors over which the object is drawn."""
-    name = next((one.name for one in shown if one.observation is posterior.observations[0]), "")
+    name = next((one.name for one in shown if one.observation is posterior.observation), "")
     return f"over {name}" if name else ""
 
 

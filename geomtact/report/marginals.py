@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geomtact.geometry.symmetry import Symmetry
+from geomtact.inference.distribution import row_poses
 from geomtact.se3 import Array
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def marginals(posterior: Posterior, T_first: Array) -> list[Samples]:
     neither.
     """
     some = _systematic(np.exp(np.asarray(posterior.log_prob, float)), _POSES)
-    poses = posterior.poses_of(some)
+    poses = row_poses(posterior, some)
     weights = np.full(len(some), 1 / len(some))
     centre = np.asarray(posterior.mesh.centre, float)
     at = 1e3 * (poses[:, :3, :3] @ centre + poses[:, :3, 3])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.planning.actions import Touch
-from geomtact.planning.belief import draw_cells
+from geomtact.planning.draws import draw_cells
 from geomtact.planning.next_touch import Action, ambiguity
 from geomtact.report.canvas import COLOURS, FIRST, SIMULATED, png, rgb
 from geomtact.se3 import Array, apply, inverse, transform
@@ -77,7 +77,7 @@ def _region(
     ends = np.concatenate([_path(posterior, action, poses) for action in best])
     outline = apply(poses, posterior.mesh.surface_points(128)).reshape(-1, 3)
     # of all sensors that touched, each taken to have the first one's window
-    placed = np.asarray(posterior.settings.get("T_world_sensor", [posterior.T_frame_sensor]))
+    placed = np.stack([view.T_frame_sensor for view in posterior.provenance.views] or [posterior.T_frame_sensor])
     windows = apply(placed, posterior.sensor.corners)
     corners = np.concatenate([outline, *windows, ends]) @ R.T
     low, high = corners.min(0)[:2], corners.max(0)[:2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -56,10 +57,11 @@ def result(
                 }
                 for mode in modes
             ],
-            "information_gain_nats": 0.0 - posterior.entropy_nats,
+            "information_gain_nats": posterior.information_gain_nats,
             "entropy_nats": posterior.entropy_nats,
             "effective_poses": posterior.effective_poses,
-            "settings": {**(settings or {}), **posterior.settings, "seed": posterior.seed},
+            "settings": {**(settings or {}), **posterior.settings},
+            "diagnostics": asdict(posterior.diagnostics),
             "versions": versions(),
             "timing_ms": {**posterior.timing_ms, **(timing_ms or {})},
             "warnings": list(posterior.warnings),
@@ -72,8 +74,8 @@ def frame_line(n: int, posterior: Posterior) -> dict[str, Any]:
     first = next(iter(posterior.modes(1)), None)
     return {
         "frame": n,
-        "contact": posterior.contact if posterior.observations else None,
-        "information_gain_nats": 0.0 - posterior.entropy_nats if posterior.contact else None,
+        "contact": None if posterior.diagnostics.is_skipped else posterior.contact,
+        "information_gain_nats": posterior.information_gain_nats if posterior.contact else None,
         "entropy_nats": posterior.entropy_nats if posterior.contact else None,
         "probability": None if first is None else first.probability,
         "T": None if first is None else first.T,

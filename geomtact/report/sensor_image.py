@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import repeat
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.sensor import Sensor
 
 if TYPE_CHECKING:
-    from geomtact.inference.localizer import Localizer
     from geomtact.inference.posterior import Posterior
+    from geomtact.localizer import Localizer
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +41,9 @@ class SensorImage:
 
 def sensor_images(posterior: Posterior, localizer: Localizer) -> list[SensorImage]:
     """The images of ``posterior``, which ``localizer`` made, in the order in which they were given."""
-    settings, seen = posterior.settings, posterior.observations
-    poses = [np.asarray(T) for T in settings.get("T_world_sensor", [posterior.T_frame_sensor])]
-    touched = settings.get("touched", [True])
-    first = touched.index(True) if any(touched) else 0
-    in_order = [*seen[1 : first + 1], *seen[:1], *seen[first + 1 :]]
-    each = (localizer, *localizer.others) if localizer.others else repeat(localizer)
+    views = posterior.provenance.views
+    each = (localizer, *localizer.others) if localizer.others else (localizer,) * len(views)
     return [
-        SensorImage(one.sensor, T, observation, one.simulate, f"sensor {number}" if len(poses) > 1 else "")
-        for number, (one, T, observation) in enumerate(zip(each, poses, in_order, strict=False), 1)
+        SensorImage(one.sensor, view.T_frame_sensor, observation, one.simulate, f"sensor {n}" if len(views) > 1 else "")
+        for n, (one, view, observation) in enumerate(zip(each, views, posterior.observations, strict=True), 1)
     ]

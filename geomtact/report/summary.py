@@ -129,7 +129,8 @@ def summaries_of(posterior: Posterior, modes: Sequence[Mode]) -> list[ModeSummar
     """Plain numbers of ``modes``; tilts and turns are about the middle of the observed contact."""
     about = [
         apply(posterior.T_frame_sensor, contact_centre(o.contact, posterior.sensor)[None])[0]
-        for o in posterior.observations[:1]
+        for o in [posterior.observation]
+        if o is not None
     ]
     return [summarise(mode, posterior.mesh.centre, *about) for mode in modes]
 
@@ -137,14 +138,15 @@ def summaries_of(posterior: Posterior, modes: Sequence[Mode]) -> list[ModeSummar
 def facts(posterior: Posterior) -> list[str]:
     """Sentences on the whole distribution: contacts, information gain, number of poses."""
     if not posterior.contact:
-        several = len(posterior.observations) > 1
+        several = len(posterior.provenance.views) > 1
         return [f"No contact was found in {'any of the images' if several else 'the image'}."]
-    gain = max(0.0, -posterior.entropy_nats)
-    empty = [str(number) for number, touched in enumerate(posterior.settings.get("touched", []), 1) if not touched]
+    gain = max(0.0, posterior.information_gain_nats)
+    views = posterior.provenance.views
+    empty = [str(number) for number, view in enumerate(views, 1) if not view.has_contact]
     lines = []
     if empty:
         lines.append(f"Sensor {' and '.join(empty)} has no contact: poses that would touch there are less probable.")
-    methods = sorted({o.method for o in posterior.observations if o.method})
+    methods = sorted({view.contact_method for view in views if view.contact_method})
     if methods:
         lines.append(f"Method of contact detection: {' and '.join(methods)}.")
     left = f"1 in {np.exp(min(gain, 700)):,.0f}"

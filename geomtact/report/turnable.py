@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geomtact.geometry.mesh import coarser
+from geomtact.inference.distribution import row_poses
 from geomtact.report.sensor_image import SensorImage
 from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.sensor import Sensor
@@ -64,7 +65,7 @@ def touched(posterior: Posterior, seed: int = 0) -> tuple[Array, Array]:
     mesh, sensor, rng = posterior.mesh, posterior.sensor, np.random.default_rng(seed)
     p = np.exp(np.asarray(posterior.log_prob, float))
     rows = rng.choice(len(p), _POSES, p=p / p.sum())
-    T = inverse(posterior.T_frame_sensor) @ posterior.poses_of(rows)
+    T = inverse(posterior.T_frame_sensor) @ row_poses(posterior, rows)
     depth = posterior.space.caster.depths(sensor, T, _SHAPE)
     x, y = sensor.pixel_centres(_SHAPE)
     points = mesh.surface_points(_POINTS, seed=seed)

@@ -72,8 +72,8 @@ class Viewer:
         )
         lines = [np.zeros((0, 2, 3))]
         picture = np.zeros((1, 1, 3), np.uint8)  # of a frame that could not be read
-        if posterior.observations:
-            seen = posterior.observation
+        seen = posterior.observation
+        if seen is not None:
             lines += [_around(_CM * apply(T, line)) for line in outlines_of(seen.contact.mask, sensor)]
             picture = _picture(seen.contact.mask if seen.kind == "mask" else seen.image)
         self._image.image = picture

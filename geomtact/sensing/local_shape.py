@@ -3,7 +3,7 @@
 The difference from the background is taken as a linear image of the gel's slope. Its two strongest colour directions
 span the slope; the 2x2 map that is left unknown is the one that makes the slope field a gradient (free of curl). Its
 integral is the gel's indentation up to a factor; the rim of the contact is where, on the way up, the gel is steepest
-(``registration/rim.py`` makes of a rim what a pose is compared with). Or the pressure that bends an elastic gel so is worked
+(``registration/contact_problem.py`` registers that rim). Or the pressure that bends an elastic gel so is worked
 out, and the contact is where there is any. A network needs no linear image: it is asked where light is blown out.
 """
 

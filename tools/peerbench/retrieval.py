@@ -19,7 +19,7 @@ ALIKE = 1e-4  # squared distances of vectors that are equal but for rounding
 
 def retrieval(given: argparse.Namespace) -> list[dict[str, Any]]:
     from geomtact.contact_space.touches import random_touches
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
 
     localizer = Localizer.prepare(given.part, sensor=given.sensor)
     index = localizer.index

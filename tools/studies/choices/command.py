@@ -15,7 +15,7 @@ from tools.studies.common import study_file, study_options
 
 if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 
 SCHEMA = "geomtact/choices/1"

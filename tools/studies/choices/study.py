@@ -22,7 +22,7 @@ from geomtact.errors import NoPoseAgreesError, UsageError, nearest_name
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.effort import EFFORTS, Effort
-from geomtact.inference.localizer import Localizer
+from geomtact.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import fit_calibration, simulate_touches
 from geomtact.scoring.catalogue import DEFAULT_SCORER, SCORERS

@@ -17,8 +17,8 @@ from geomtact.evaluation import coverage, share_with_interval
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.pose_error import mssd
-from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
+from geomtact.localizer import Localizer
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 from geomtact.sensing.sensor import Sensor

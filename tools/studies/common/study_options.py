@@ -16,7 +16,7 @@ from geomtact.cli.simulate import NoiseName
 if TYPE_CHECKING:
     from geomtact.geometry.approach import Approach
     from geomtact.geometry.mesh import Mesh
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
     from geomtact.sensing.noise import Noise
     from geomtact.sensing.sensor import Sensor
 
@@ -81,7 +81,7 @@ def localizers(
 ) -> Iterator[Localizer]:
     """A localizer for each part, the thesis's four by default, prepared when its turn comes."""
     from geomtact.contact_space.resolution import MAX_POSES
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 
     gel = Sensor.load(sensor)

@@ -11,8 +11,8 @@ import numpy as np
 
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import share_with_interval
-from geomtact.inference.identify import identify
-from geomtact.inference.localizer import Localizer
+from geomtact.identification import identify
+from geomtact.localizer import Localizer
 from geomtact.sensing.noise import Noise
 from tools.studies.touches.study import Scene, make_scenes
 

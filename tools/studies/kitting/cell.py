@@ -17,14 +17,14 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.contact_space.touches import counts, penetrations
 from geomtact.errors import InputError
-from geomtact.inference.localizer import Localizer
+from geomtact.inference.mode_refiner import LIKELIHOOD_POWER, ModeRefiner
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.refine import TRUST, Refinery
-from geomtact.inference.search import View
-from geomtact.planning.belief import draw_cells
+from geomtact.inference.search import SensorView
+from geomtact.localizer import Localizer
+from geomtact.planning.draws import draw_cells
 from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.jaw import OPPOSITE, close_jaw, first_grasp
-from geomtact.planning.next_touch import judge
+from geomtact.planning.next_touch import evaluate
 from geomtact.se3 import Array, inverse, transform
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.noise import MODERATE, Noise
@@ -111,10 +111,10 @@ def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.rando
     wider than any clearance, so their masses say too little; the pixels, cast at the pose itself, say more.
     """
     poses = draw_cells(posterior, _DRAWS, rng)[0]
-    refinery, log_weight = Refinery(space), np.zeros(len(poses))
+    mode_refiner, log_weight = ModeRefiner(space), np.zeros(len(poses))
     for T_world_sensor, mask in zip(felt.T_world_sensor, felt.masks, strict=True):
-        seen = View(refinery, Contact(mask) if mask.any() else None, inverse(T_world_sensor))
-        log_weight += (TRUST if mask.any() else _MISSED) * seen.log_likelihood(poses)
+        seen = SensorView(mode_refiner, Contact(mask) if mask.any() else None, inverse(T_world_sensor))
+        log_weight += (LIKELIHOOD_POWER if mask.any() else _MISSED) * seen.log_likelihood(poses)
     heaviest = np.argsort(-log_weight)
     weight = np.exp(log_weight - log_weight.max())[heaviest]
     return Believed(poses[heaviest], weight / weight.sum())
@@ -142,7 +142,7 @@ def choose_jaw(posterior: Posterior, belief: Believed, made: Array, rng: np.rand
     some = [touches[i] for i in rng.permutation(len(touches))[:_TRIED]]
     places = belief.T[rng.choice(len(belief.T), _PLACES, p=belief.weight)]
     T = np.tile(places, (_PRESSES, 1, 1, 1))
-    _, best = max((judge(posterior.space, touch, T).expected_nats, i) for i, touch in enumerate(some))
+    _, best = max((evaluate(posterior.space, touch, T).expected_nats, i) for i, touch in enumerate(some))
     # fingers that meet nothing meet each other in the middle
     return some[best].T_world_sensor @ transform(np.eye(3), [0.0, 0.0, 0.5 * some[best].travel])
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import share_with_interval
-from geomtact.inference.localizer import Localizer
+from geomtact.localizer import Localizer
 from geomtact.se3 import inverse
 from geomtact.sensing.noise import Noise
 from tools.studies.kitting.cell import SURE, draw_part, kit

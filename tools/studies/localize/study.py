@@ -18,8 +18,8 @@ from geomtact.evaluation import share_with_interval
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.pose_error import mssd
-from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
+from geomtact.localizer import Localizer
 from geomtact.se3 import Array, apply
 from tools.studies.common import study
 

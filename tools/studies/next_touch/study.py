@@ -17,8 +17,8 @@ from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.contact_space.touches import Touch, penetrations, random_touches
 from geomtact.errors import NoPoseAgreesError
 from geomtact.geometry.pose_error import mssd
-from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
+from geomtact.localizer import Localizer
 from geomtact.planning.actions import Touch as Planned
 from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.next_touch import next_touch

@@ -10,7 +10,7 @@ import numpy as np
 
 from geomtact.errors import InputError
 from geomtact.geometry.mesh import Mesh
-from geomtact.inference.localizer import Localizer
+from geomtact.localizer import Localizer
 from geomtact.se3 import inverse
 from geomtact.sensing.sensor import Sensor
 

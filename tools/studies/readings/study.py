@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import InputError
 from geomtact.geometry.mesh import Mesh
-from geomtact.inference.localizer import Localizer
+from geomtact.localizer import Localizer
 from geomtact.se3 import Array
 from geomtact.sensing.calibrate import SensorCalibration, calibrate_sensor, measured_diameter
 from geomtact.sensing.image_file import read_image

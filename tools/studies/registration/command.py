@@ -49,7 +49,7 @@ def judge_registration(
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.contact_space.space import ContactSpace
     from geomtact.contact_space.touches import FELT, random_touches
-    from geomtact.inference.refine import Refinery
+    from geomtact.inference.mode_refiner import ModeRefiner
     from geomtact.json_values import plain
     from geomtact.registration.observability import Spread
     from geomtact.sensing.sensor import Sensor
@@ -71,7 +71,7 @@ def judge_registration(
         assert mesh.symmetry is not None
         directions = resolution.directions(mesh.symmetry, None)
         grid = registration.Grid(directions, resolution)
-        surface = Refinery(space).surface
+        surface = ModeRefiner(space).surface
 
         def methods(
             spread: Spread, space: ContactSpace = space, surface: Surface = surface

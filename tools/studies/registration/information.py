@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask
-from geomtact.registration.observability import GAIN, Spread, moved, told
+from geomtact.registration.contact_problem import make_problem
+from geomtact.registration.observability import GAIN, Spread, moved, observable_subspace
 from geomtact.registration.protocol import Problem
-from geomtact.registration.rim import make_problem
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 
@@ -55,7 +55,7 @@ def split(information: Array, spread: Spread, length: float) -> tuple[Array, Arr
     A direction is told that ``information`` (6, 6) fixes to a standard deviation under a quarter of the grid's step, which is
     one length for shifts and another for turns: ``spread`` tells both.
     """
-    measure, move, _ = told(information, spread, length)
+    measure, move, _ = observable_subspace(information, spread, length)
     kept = move @ measure
     return kept, np.eye(6) - kept
 

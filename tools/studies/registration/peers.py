@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from geomtact.registration.contact_problem import near_surface
 from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Surface
-from geomtact.registration.rim import near_surface
 from geomtact.se3 import Array, inverse
 from tools.studies.registration.study import End, Method, Seen
 

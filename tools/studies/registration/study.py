@@ -18,11 +18,11 @@ from geomtact.contact_space.resolution import Resolution
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touches import Touch, penetrations
 from geomtact.geometry.rotations import Directions
+from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread, motion_of, moved, zeta_of_xi
 from geomtact.registration.protocol import Problem, Refiner, Surface
-from geomtact.registration.rim import make_problem
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array, inverse, log, transform
 from geomtact.sensing.noise import Noise

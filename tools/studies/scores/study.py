@@ -15,7 +15,7 @@ from geomtact.contact_space.store import open_index
 from geomtact.contact_space.touches import Touch
 from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh
-from geomtact.inference.localizer import Localizer
+from geomtact.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.catalogue import PIXELWISE
 from geomtact.scoring.moments import Moments

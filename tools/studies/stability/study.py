@@ -21,7 +21,7 @@ from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import coverage
 from geomtact.geometry.mesh import Mesh, coarser
 from geomtact.inference.filter import has_slipped
-from geomtact.inference.localizer import Localizer
+from geomtact.localizer import Localizer
 from geomtact.planning.jaw import closed_on
 from geomtact.se3 import Array, exp, inverse
 from geomtact.sensing.noise import MODERATE
@@ -178,7 +178,7 @@ def _sequences(localizer: Localizer, level: float, n: int, seed: int, effort: st
             localizer.space, _FRAMES, seed * 1000 + number, _STEP, slips=at, elastic=number % 2 == 1
         )
         told = list(localizer.track(made.masks, effort=effort, kind="mask", seed=seed))
-        slipped = any(has_slipped(posterior.settings["surprise_nats"]) for posterior in told)
+        slipped = any(has_slipped(posterior.diagnostics.surprise_nats) for posterior in told)
         yield replace(judged(localizer.mesh, made.T_sensor_object[-1], told[-1]), warned=slipped)
 
 

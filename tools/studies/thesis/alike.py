@@ -17,7 +17,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.contact_space.touches import Touch
 from geomtact.geometry.distance import PoseDistance
-from geomtact.inference.localizer import Localizer
+from geomtact.localizer import Localizer
 from geomtact.se3 import Array, exp
 from geomtact.sensing.moments import moments, without_specks
 from geomtact.sensing.noise import Noise

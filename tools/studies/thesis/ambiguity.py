@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.inference.localizer import Localizer
 from geomtact.inference.posterior import Posterior
+from geomtact.localizer import Localizer
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 from tools.studies.thesis.alike import SPACING_MM, STARTS, alike

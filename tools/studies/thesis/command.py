@@ -79,7 +79,7 @@ def _judge_part(
     cache_dir: Path | None,
 ) -> None:
     """Judge what ``content`` does not hold yet of a part; a side that was not finished is touched anew."""
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
     from tools.studies.thesis import ambiguity as open_set
     from tools.studies.thesis import known_approach
 

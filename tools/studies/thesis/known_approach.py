@@ -8,7 +8,7 @@ the best of ten poses and of ten modes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,13 @@ from geomtact.contact_space.touches import Touch, each_touch
 from geomtact.geometry.approach import Approach, approach_of
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
-from geomtact.inference.localizer import Localizer
+from geomtact.inference.effort import effort_of
+from geomtact.inference.modes import leading_cells
+from geomtact.localizer import Localizer
+from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.observability import Spread
-from geomtact.registration.rim import make_problem
 from geomtact.se3 import Array
+from geomtact.sensing.contact import Contact
 from geomtact.sensing.moments import cleaned
 from geomtact.sensing.noise import Noise
 from geomtact.sensing.sensor import Sensor
@@ -100,13 +103,13 @@ def judge_side(
 def _answers(localizer: Localizer, touch: Touch, effort: str) -> list[Array]:
     """The poses (k, 4, 4) that each of ``ROWS`` names."""
     index, sensor = localizer.index, localizer.sensor
-    grid, _ = localizer.touch(touch.mask, "mask", None, np.eye(4), "sensor", None, effort, 0)
+    grid = localizer.localize(touch.mask, "mask", effort=replace(effort_of(effort), modes=0))
     refined = localizer.localize(touch.mask, "mask", effort=effort)
     modes = [np.stack([mode.T for mode in posterior.modes(MODES)]) for posterior in (grid, refined)]
     poses = [posterior.likeliest(MODES) for posterior in (grid, refined)]
-    first = grid.leading_cells(1)
+    first = leading_cells(grid, 1)
     best = index.poses(first)
-    ours = localizer.refinery.refine(grid, grid.observation.contact, 1).refined[int(first[0])].T[None]
+    ours = localizer.mode_refiner.refine(grid, Contact(touch.mask), 1).refined[int(first[0])].T[None]
     mask = cleaned(touch.mask, sensor)
     spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
     theirs = thesis_refinement(localizer.space, spread)(Seen(mask, make_problem(mask, sensor)), best[0]).T[None]

@@ -14,7 +14,7 @@ from geomtact.cli.simulate import NoiseName
 from tools.studies.common import study_file, study_options
 
 if TYPE_CHECKING:
-    from geomtact.inference.localizer import Localizer
+    from geomtact.localizer import Localizer
 
 SCHEMA = "geomtact/touches/1"
 

@@ -13,7 +13,7 @@ from geomtact.contact_space.touches import Touch, random_touches
 from geomtact.errors import NoPoseAgreesError
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.pose_error import add_s, mssd
-from geomtact.inference.localizer import Localizer
+from geomtact.localizer import Localizer
 from geomtact.se3 import Array, inverse, random_rotations, transform
 from geomtact.sensing.noise import Noise
 from tools.studies.common.study import MODES, coverage_figures, mean_with_interval
@@ -109,7 +109,7 @@ def fuse_scenes(
                     add_s_mm=float(1e3 * add_s(T, poses[:1], points)[0]),
                     add10_mm=float(mean.min()),
                     probability=modes[0].probability,
-                    warned=posterior.settings.get("disagrees", False),
+                    warned=posterior.diagnostics.disagrees,
                     ms=ms,
                 )
             )

@@ -14,9 +14,10 @@ from geomtact.contact_space.index import Index
 from geomtact.errors import MeshError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import filter as filtering
-from geomtact.inference.localizer import Localizer
+from geomtact.inference.distribution import cell_log_density
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.sequence import make_filter
+from geomtact.localizer import Localizer
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 from tools.studies.common.study import coverage_figures, mean_with_interval
@@ -76,8 +77,8 @@ def follow(
     for number in range(first, n):
         trajectory = make_trajectory(localizer, number, seed, frames, noise)
         filters = {
-            "filter": make_filter(localizer, seed=seed),
-            "thesis": make_filter(localizer, counts=(1, 1), fresh=0, most=50, seed=seed),
+            "filter": make_filter(localizer.index, localizer.scorer, seed=seed),
+            "thesis": make_filter(localizer.index, localizer.scorer, counts=(1, 1), fresh=0, most=50, seed=seed),
         }
         told: dict[str, list[tuple[float, ...]]] = {method: [] for method in METHODS}
         rng = np.random.default_rng([seed, number, 1])
@@ -115,7 +116,7 @@ def _judged(
     """Gain, level, mass of the cells ``near`` (n,), and minus the entropy; ``cell`` (1,) holds the truth, of whose ties
     the share ``tie`` counts."""
     index = posterior.index
-    gain = float(posterior.cell_log_density(cell)[0])
+    gain = float(cell_log_density(posterior, cell)[0])
     if posterior.runs is None:
         log_measure = index.log_weight[posterior.cells]
     else:
@@ -125,13 +126,13 @@ def _judged(
     claimed = float(probability[held] @ density[held])
     above, tied = density > gain + 1e-4, np.abs(density - gain) <= 1e-4
     level = float(probability[above].sum() + tie * probability[tied].sum()) if np.isfinite(gain) else 1.0
-    mass = np.exp(posterior.cell_log_density(near)) @ index.weight.ravel()[near].astype(float)
+    mass = np.exp(cell_log_density(posterior, near)) @ index.weight.ravel()[near].astype(float)
     return gain, min(level, 1.0), float(mass), claimed
 
 
 def time_steps(localizer: Localizer, seed: int, frames: int, noise: Noise, effort: str) -> list[float]:
     """Milliseconds of each step of the filter alone, with ``LIVE`` cells kept, from the third frame of a trajectory on."""
-    state = make_filter(localizer, most=LIVE, seed=seed)
+    state = make_filter(localizer.index, localizer.scorer, most=LIVE, seed=seed)
     masks = make_trajectory(localizer, 0, seed, frames, noise).masks
     posteriors = [state.step(localizer.localize(mask, kind="mask", effort=effort, seed=seed)) for mask in masks]
     return [p.timing_ms["filter"] for p in posteriors[2:]]

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from geomtact.errors import InputError, NoPoseAgreesError
 from geomtact.geometry.pose_error import add_s
-from geomtact.inference.localizer import Localizer
+from geomtact.localizer import Localizer
 from geomtact.se3 import Array, apply, inverse, random_rotations, transform
 from geomtact.sensing.sensor import Sensor
 from tools.studies.common.study import coverage_figures
@@ -180,7 +180,7 @@ def _localized(localizer: Localizer, triplet: Triplet, shown: str, n: int, effor
         claimed=-float(posterior.entropy_nats),
         level=float(posterior.credible_level(triplet.T_world_object)),
         probability=modes[0].probability if modes else 0.0,
-        warned=posterior.settings.get("disagrees", False),
+        warned=posterior.diagnostics.disagrees,
         ms=ms,
     )
 

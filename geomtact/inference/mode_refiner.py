@@ -1,4 +1,4 @@
-"""The leading modes taken below the grid by registration (thesis 6.3)."""
+"""The leading modes of one contact mask refined by registration (thesis 6.3)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
-from geomtact.inference.modes import Refined
+from geomtact.inference.distribution import Refined
+from geomtact.inference.modes import leading_cells
 from geomtact.inference.posterior import Posterior
+from geomtact.inference.reweight import reweight_cells
+from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Refinement, Refiner, Surface
-from geomtact.registration.rim import make_problem
 from geomtact.scoring.likelihood import cast_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array
@@ -25,12 +27,12 @@ from geomtact.sensing.contact import Contact
 from geomtact.sensing.moments import cleaned, moments
 
 _SURFACE_POINTS = 30_000  # of the object
-TRUST = 0.5  # of a likelihood at one pose, in weighing the cells around several
-_SHAPE = (36, 48)  # of the casts that judge a refinement
+LIKELIHOOD_POWER = 0.5  # of the likelihood at one pose, when it weighs the cell around it
+_SHAPE = (36, 48)  # of the casts by which refinements are compared
 
 
 @dataclass(frozen=True, eq=False)
-class Refinery:
+class ModeRefiner:
     """Refines poses of one object on one sensor."""
 
     space: ContactSpace
@@ -44,7 +46,8 @@ class Refinery:
     def _shape(self) -> tuple[int, int]:
         return self.space.sensor.along(_SHAPE)
 
-    def _refiners(self, index: Index, thorough: bool) -> list[Refiner]:
+    def refiners(self, index: Index, thorough: bool) -> list[Refiner]:
+        """FilterReg for the grid of ``index``; ICP too if ``thorough``."""
         spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
         filterreg, icp = FilterReg(self.surface, spread), Icp(self.surface, spread)
         return [filterreg, icp] if thorough else [filterreg]
@@ -62,7 +65,7 @@ class Refinery:
         contact : on any grid over the window; its heights are not looked at
         thorough : whether every registration has a try, or only the one that does best
         """
-        cells = posterior.leading_cells(k)
+        cells = leading_cells(posterior, k)
         if not len(cells):
             return posterior
         index, sensor = posterior.index, self.space.sensor
@@ -70,27 +73,27 @@ class Refinery:
         problem, mask = make_problem(shown, sensor), shown > 0.5
         start = index.poses(cells)
         candidates = [start, self._centred(posterior, mask, cells, start)]
-        refinements = [refiner.refine(problem, candidates[-1]) for refiner in self._refiners(index, thorough)]
+        refinements = [refiner.refine(problem, candidates[-1]) for refiner in self.refiners(index, thorough)]
         poses = np.stack([*candidates, *(r.T for r in refinements)])
         winner, likelihood = self._best(mask, poses)
         by = [refinements[best - len(candidates)] if best >= len(candidates) else None for best in winner]
         refined = refined_at(index, cells, poses[winner, np.arange(len(cells))], by, problem.length, winner > 0)
-        return replace(posterior.shared_anew(cells, TRUST * likelihood), refined=refined)
+        return replace(reweight_cells(posterior, cells, LIKELIHOOD_POWER * likelihood), refined=refined)
 
     def _best(self, mask: NDArray[np.bool_], poses: Array) -> tuple[NDArray[np.int64], Array]:
         """At which of the poses (c, n, 4, 4) ``mask`` is most likely, for each of n modes, the first where none touches;
         and how likely (n,)."""
         # a rejected refinement is its own start: each pose is cast once
         different, which = np.unique(poses.reshape(-1, 16), axis=0, return_inverse=True)
-        merit = self.log_likelihood(mask, different.reshape(-1, 4, 4))[which.ravel()].reshape(poses.shape[:2])
+        log_likelihood = self.log_likelihood(mask, different.reshape(-1, 4, 4))[which.ravel()].reshape(poses.shape[:2])
         todo = np.arange(poses.shape[1])
         while len(todo):  # only winners are asked whether they touch, which costs more
-            best = merit[:, todo].argmax(0)
-            off = ~np.isfinite(self.space.penetration(poses[best, todo])) & np.isfinite(merit[best, todo])
-            merit[best[off], todo[off]] = -np.inf
+            best = log_likelihood[:, todo].argmax(0)
+            off = ~np.isfinite(self.space.penetration(poses[best, todo])) & np.isfinite(log_likelihood[best, todo])
+            log_likelihood[best[off], todo[off]] = -np.inf
             todo = todo[off]
-        best = merit.argmax(0)
-        return best, merit[best, np.arange(len(best))]
+        best = log_likelihood.argmax(0)
+        return best, log_likelihood[best, np.arange(len(best))]
 
     def log_likelihood(self, mask: NDArray[np.bool_], T: ArrayLike) -> Array:
         """Log likelihood (n,) of ``mask`` given the contact cast at poses ``T`` (n, 4, 4)."""
@@ -107,9 +110,9 @@ class Refinery:
         shift = np.clip(seen - index.moments[:2, cells].T * scale, -index.resolution.step, index.resolution.step)
         out = T.copy()
         out[:, :2, 3] += shift
-        wanted = np.array(index.resolution.penetrations)[cells // index.places]
+        target = np.array(index.resolution.penetrations)[cells // index.places]
         deepest = self.space.caster.depths(sensor, out, self._shape).max((1, 2))
-        out[:, 2, 3] += np.where(np.isfinite(deepest), deepest - wanted, 0.0)
+        out[:, 2, 3] += np.where(np.isfinite(deepest), deepest - target, 0.0)
         return out
 
 
@@ -121,8 +124,8 @@ def refined_at(
     length: float,
     moved: NDArray[np.bool_],
 ) -> dict[int, Refined]:
-    """What is known, by the cell, at poses ``T`` (n, 4, 4) in ``cells`` (n,): what the refinement told that found each; where
-    none did, how poses spread over a cell."""
+    """The refined poses ``T`` (n, 4, 4) by their ``cells`` (n,), with the covariance and observable directions of the refinement
+    that found each; where none did, with the spread of poses over a cell."""
     covariance, observable = np.zeros((len(cells), 6, 6)), [np.zeros((0, 6))] * len(cells)
     for i, found in enumerate(by):
         if found is not None:

@@ -1,20 +1,20 @@
-"""Which of several parts is it? By how likely each makes what the sensors show."""
+"""Object identification: which of several objects is it, by how likely each makes the images."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from geomtact.errors import NoPoseAgreesError, UsageError
+from geomtact.inference.joint_refinement import UNLIKE
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.refine_together import UNLIKE
+from geomtact.inference.views import read_views
+from geomtact.localizer import Localizer
 from geomtact.se3 import Array
-
-if TYPE_CHECKING:
-    from geomtact.inference.localizer import Localizer
+from geomtact.sensing.reading import Observation
 
 # nats a contact that the likeliest pose of the right part falls short by, of several: 5 % of 22 scenes of seed 77 did by more
 _MISFIT = 4.6
@@ -80,40 +80,59 @@ def identify(
     NoPoseAgreesError
         Of no part.
     """
-    told: list[tuple[str, float, bool]] = []  # name, evidence, unlike
-    merits: list[float] = []
+    found: list[tuple[str, float, bool]] = []  # name, evidence, unlike
+    log_odds: list[float] = []
     best: tuple[float, Localizer, Posterior] | None = None
-    known = None if weights is None else _log_weights(weights)
+    read: dict[tuple[str, ...], list[Observation]] = {}  # by the sensors that read them
+    log_weights = None if weights is None else _log_weights(weights)
     if not isinstance(localizers, Iterable):
         raise UsageError(
             f"identify: expected a localizer for each part, got {type(localizers).__name__}; give a list of them"
         )
     for i, localizer in enumerate(localizers):
-        if known is not None and i >= len(known):
-            raise UsageError(f"identify: expected a weight for each part, got {len(known)} for more")
+        if log_weights is not None and i >= len(log_weights):
+            raise UsageError(f"identify: expected a weight for each part, got {len(log_weights)} for more")
         try:
-            posterior = localizer.localize(image, **options)
+            sensors = tuple(sensor.to_toml() for sensor in localizer.sensors)
+            if sensors not in read:
+                read[sensors] = _read(localizer, image, **options)
+            posterior = localizer.localize(read[sensors], **options)
         except NoPoseAgreesError as error:
-            told.append((localizer.mesh.name, -np.inf, True))
-            merits.append(-np.inf)
+            found.append((localizer.mesh.name, -np.inf, True))
+            log_odds.append(-np.inf)
             last_error = error
             continue
-        told.append((localizer.mesh.name, posterior.log_evidence, _is_unlike(posterior)))
-        merits.append(_worth(posterior) * posterior.log_evidence + (0.0 if known is None else float(known[i])))
-        if best is None or merits[-1] > best[0]:
-            best = merits[-1], localizer, posterior
-    if not told:
+        found.append((localizer.mesh.name, posterior.log_evidence, _is_unlike(posterior)))
+        log_odds.append(
+            _evidence_power(posterior) * posterior.log_evidence
+            + (0.0 if log_weights is None else float(log_weights[i]))
+        )
+        if best is None or log_odds[-1] > best[0]:
+            best = log_odds[-1], localizer, posterior
+    if not found:
         raise UsageError("identify: expected parts to choose from, got none")
-    if known is not None and len(known) != len(told):
-        raise UsageError(f"identify: expected a weight for each of {len(told)} parts, got {len(known)}")
+    if log_weights is not None and len(log_weights) != len(found):
+        raise UsageError(f"identify: expected a weight for each of {len(found)} parts, got {len(log_weights)}")
     if best is None:
         raise last_error
     if best[0] == -np.inf:
         raise UsageError("identify: none of the parts whose weight is above 0 can show this; give others a weight")
-    probability = np.exp(merits - np.logaddexp.reduce(merits))
+    probability = np.exp(log_odds - np.logaddexp.reduce(log_odds))
     order = np.argsort(-probability, kind="stable")
-    candidates = [Candidate(told[i][0], float(probability[i]), *told[i][1:]) for i in order]
+    candidates = [Candidate(found[i][0], float(probability[i]), *found[i][1:]) for i in order]
     return Identification(candidates, best[1], best[2])
+
+
+def _read(
+    localizer: Localizer,
+    image: Any,
+    kind: str = "auto",
+    background: Any = None,
+    T_world_sensor: Any = None,
+    **_: Any,
+) -> list[Observation]:
+    views = read_views(image, T_world_sensor, localizer.sensors, kind, background)
+    return [view.observation for view in views]
 
 
 def _log_weights(weights: Sequence[float]) -> Array:
@@ -124,15 +143,13 @@ def _log_weights(weights: Sequence[float]) -> Array:
         return np.asarray(np.log(given / given.sum()))
 
 
-def _worth(posterior: Posterior) -> float:
-    return 1.0 if "unexplained_nats" in posterior.settings else _OF_MOMENTS
+def _evidence_power(posterior: Posterior) -> float:
+    """Of the evidence: in full where pixels were compared, less where only moments were."""
+    return 1.0 if posterior.diagnostics.unexplained_nats is not None else _OF_MOMENTS
 
 
 def _is_unlike(posterior: Posterior) -> bool:
-    if not posterior.contact:
-        return False
-    told = posterior.settings
-    limits = {"unexplained_nats": UNLIKE, "misfit_nats": _MISFIT}
-    return told["odd"] or any(
-        told.get(name, 0.0) is None or told.get(name, 0.0) > most for name, most in limits.items()
+    found = posterior.diagnostics
+    return posterior.contact and (
+        found.is_outlier or (found.unexplained_nats or 0.0) > UNLIKE or (found.misfit_nats or 0.0) > _MISFIT
     )

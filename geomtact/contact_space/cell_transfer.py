@@ -33,8 +33,8 @@ _SPREAD = 1.2  # of heights over the other sensor, in units of what the steps of
 
 
 @dataclass(frozen=True)
-class RigStd:
-    """How well the pose of one sensor relative to another is known: standard deviations.
+class ExtrinsicsStd:
+    """Uncertainty of one sensor's pose relative to another: standard deviations.
 
     Attributes
     ----------
@@ -47,33 +47,33 @@ class RigStd:
 
 
 @dataclass(frozen=True, eq=False)
-class Carry:
-    """Poses of ``here`` carried to the sensor of ``there``, which sees the same object.
+class CellTransfer:
+    """Cells of ``here`` transferred to the sensor of ``there``, which touches the same object.
 
     Attributes
     ----------
     here, there : contact pose spaces of one object
     T_there_here : (4, 4) of the sensor of ``here`` in the frame of that of ``there``
-    rig : how well ``T_there_here`` is known
+    extrinsics_std : uncertainty of ``T_there_here``
     """
 
     here: Index
     there: Index
     T_there_here: Array
-    rig: RigStd = RigStd()
+    extrinsics_std: ExtrinsicsStd = ExtrinsicsStd()
 
     @cached_property
     def std(self) -> float:
         """Standard deviation [m] of the object's height over the other sensor within a cell, at that sensor's own grid."""
         grids = (self.here, self.there)
         steps = sum((g.angle_step * g.mesh.radius_rms) ** 2 + g.resolution.step**2 for g in grids) / 12
-        return float(np.sqrt(_SPREAD**2 * steps + self._rig_std**2))
+        return float(np.sqrt(_SPREAD**2 * steps + self._extrinsics_std**2))
 
     @property
-    def _rig_std(self) -> float:
-        """Standard deviation [m] of the object along each axis of the other sensor, for the rig's sake."""
+    def _extrinsics_std(self) -> float:
+        """Standard deviation [m] of the object along each axis of the other sensor that the extrinsics add."""
         lever = float(np.linalg.norm(self.T_there_here[:3, 3]))
-        return float(np.hypot(self.rig.translation, self.rig.rotation * lever))
+        return float(np.hypot(self.extrinsics_std.translation, self.extrinsics_std.rotation * lever))
 
     def shares(self) -> NDArray[np.float32]:
         """Which share (P, n) of each place of ``here`` touches the other sensor at each of its P penetrations."""
@@ -221,7 +221,7 @@ class Carry:
         # evenly over the lattice cell (Roberts, R2 sequence)
         even = (0.5 + np.outer(np.arange(len(turned)), [0.7548776662466927, 0.5698402909980532])) % 1 - 0.5
         shifts = self.here.resolution.step * even @ self.T_there_here[:3, :2].T
-        shifts[:, :2] += self._rig_std * np.random.default_rng(0).normal(size=(len(turned), 2))
+        shifts[:, :2] += self._extrinsics_std * np.random.default_rng(0).normal(size=(len(turned), 2))
         return list(zip(turned, shifts.astype(np.float32), strict=True))
 
     def _rotations_there(self, rotations: Array) -> NDArray[np.int32]:

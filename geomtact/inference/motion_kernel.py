@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags, identity
 
-from geomtact.contact_space.carry import Carry
+from geomtact.contact_space.cell_transfer import CellTransfer
 from geomtact.contact_space.index import Index
 from geomtact.geometry.approach import allowed, approach_of
 from geomtact.inference.motion import Motion
@@ -31,7 +31,7 @@ class Mixture:
     mass: NDArray[np.floating] = field(default_factory=lambda: np.zeros(0))
     uniform: float = 1.0
 
-    def mixed(self, uniform: float) -> Mixture:
+    def with_uniform(self, uniform: float) -> Mixture:
         """The distribution with a share ``uniform`` more of the uniform one."""
         return Mixture(self.cells, (1 - uniform) * self.mass, (1 - uniform) * self.uniform + uniform)
 
@@ -42,7 +42,7 @@ class Mixture:
 
 
 @dataclass(frozen=True, eq=False)
-class Spreading:
+class MotionKernel:
     """What a motion makes of a distribution over the cells of ``index``.
 
     Cells are about as wide as the motion, so what counts is the share of a cell that leaves it. Shifts along x and along y,
@@ -133,11 +133,11 @@ class Spreading:
         return Mixture(found, out.reshape(-1)[found], before.uniform)
 
     def _touching(self, T_after_before: Array) -> NDArray[np.float32]:
-        return Carry(self.index, self.index, T_after_before).shares()
+        return CellTransfer(self.index, self.index, T_after_before).shares()
 
     @cached_property
     def _standing(self) -> NDArray[np.float32]:
-        """Which share (n,) of every place touches by :class:`Carry` where nothing moves."""
+        """Which share (n,) of every place touches by :class:`CellTransfer` where nothing moves."""
         return np.maximum(self._touching(np.eye(4)).sum(0), 1e-30)
 
     @cached_property

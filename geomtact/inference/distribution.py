@@ -1,0 +1,173 @@
+"""A distribution over the cells of a contact index, and what can be read off single cells."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geomtact.contact_space.index import Index, spelled_out
+from geomtact.inference.facts import Diagnostics, Provenance
+from geomtact.inference.reference import Reference
+from geomtact.se3 import Array
+from geomtact.sensing.reading import Observation
+
+LEADING_CELLS = 400  # number of the most probable cells from which modes are grown
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What registration found at one cell: its pose in the sensor frame, and the observable directions there."""
+
+    T: Array
+    covariance: Array
+    observable: Array
+    length: float
+    moved: bool
+
+
+@dataclass(frozen=True, eq=False)
+class CellDistribution:
+    """The content of a posterior.
+
+    Attributes
+    ----------
+    index : the discretised contact pose space it lives on
+    cells : (N,) pose ids of the index, ascending; cells that are not among them, nor in their runs, have no mass
+    log_prob : (N,) log probability of each, normalised
+    frame : "sensor" or "world"
+    T_frame_sensor : (4, 4)
+    contact : whether the image shows any contact
+    off_contact_log_density : without contact, the prior's log density at poses (n, 4, 4) in ``frame``; it is not saved
+    log_evidence : log of the mean likelihood under the prior, comparable between objects for the same images and effort
+    seed : of the random choices made where credible levels tie
+    runs : (N,) how many cells from each of ``cells`` on share one density, as the cells of a block do where there is
+        little mass; one each by default
+    refined : what registration found, by pose id
+    reference : poses of the prior or of the frame before, by which modes are reported at one of their images under the object's
+        symmetry
+    observations : one for each image, in the order given; none for a loaded posterior
+    provenance, diagnostics : what it was made from, and what to think of it
+    timing_ms, warnings : time by stage; one line each
+    """
+
+    index: Index
+    cells: NDArray[np.int64]
+    log_prob: NDArray[np.floating]
+    frame: str = "sensor"
+    T_frame_sensor: Array = field(default_factory=lambda: np.eye(4))
+    contact: bool = True
+    off_contact_log_density: Callable[[Array], Array] | None = None
+    log_evidence: float = 0.0
+    seed: int = 0
+    runs: NDArray[np.int64] | None = None
+    refined: dict[int, Refined] = field(default_factory=dict)
+    reference: Reference | None = None
+    observations: list[Observation] = field(default_factory=list)
+    provenance: Provenance = field(default_factory=Provenance)
+    diagnostics: Diagnostics = field(default_factory=Diagnostics)
+    timing_ms: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+
+def rows_of(posterior: CellDistribution, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The row (n,) whose run may hold each pose id (n,), and whether it does."""
+    row = np.maximum(np.searchsorted(posterior.cells, ids, "right") - 1, 0)
+    return row, (ids >= posterior.cells[row]) & (ids < posterior.cells[row] + run_lengths(posterior, row))
+
+
+def run_lengths(posterior: CellDistribution, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of cells (m,) in the run of each of ``rows`` (m,)."""
+    return np.ones(len(rows), np.int64) if posterior.runs is None else posterior.runs[rows]
+
+
+def row_log_density(posterior: CellDistribution, rows: NDArray[np.int64]) -> Array:
+    """Log density (m,) of ``rows`` (m,) relative to the uniform distribution."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if posterior.runs is None:
+            log_mass = posterior.index.log_weight[posterior.cells[rows]]
+        else:
+            log_mass = np.log(posterior.index.mass(posterior.cells[rows], posterior.runs[rows]))
+        density = (posterior.log_prob[rows] - log_mass).astype(float)
+    return np.where(np.isfinite(density), density, -np.inf)
+
+
+def cell_log_density(posterior: CellDistribution, ids: ArrayLike) -> Array:
+    """Log density (n,) in the cells of pose ids (n,) of the index, relative to the uniform distribution."""
+    row, held = rows_of(posterior, np.asarray(ids))
+    return np.where(held, row_log_density(posterior, row), -np.inf)
+
+
+def cell_densities(posterior: CellDistribution) -> NDArray[np.float32]:
+    """Density (N,) in every cell of the index, relative to the uniform distribution."""
+    index, cells = posterior.index, posterior.cells
+    out = np.zeros(len(index), np.float32)
+    if posterior.runs is None:
+        out[cells] = np.exp(posterior.log_prob.astype(np.float32) - index.log_weight[cells])
+    else:
+        density = np.exp(row_log_density(posterior, np.arange(len(cells))).astype(np.float32))
+        out[spelled_out(cells, posterior.runs)] = np.repeat(density, posterior.runs)
+    return out
+
+
+def cell_poses(posterior: CellDistribution, cells: NDArray[np.int64]) -> Array:
+    """Poses (m, 4, 4) of ``cells`` (m,) in the sensor frame, refined where registration found better."""
+    T = posterior.index.poses(cells)
+    if posterior.refined:
+        for i in np.flatnonzero(np.isin(cells, list(posterior.refined))):
+            T[i] = posterior.refined[int(cells[i])].T
+    return T
+
+
+def row_poses(posterior: CellDistribution, rows: ArrayLike) -> Array:
+    """Poses (m, 4, 4) of ``rows`` (m,) in the posterior's frame: those rows of ``Posterior.poses``."""
+    return posterior.T_frame_sensor @ cell_poses(posterior, middle_cells(posterior, np.asarray(rows, np.int64)))
+
+
+def middle_cells(posterior: CellDistribution, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The cell (m,) that represents each of ``rows`` (m,): that of a run with half of the run's measure before it."""
+    cells, runs = posterior.cells[rows], run_lengths(posterior, rows)
+    many = runs > 1
+    out = cells.copy()
+    out[many] = posterior.index.within_runs(cells[many], runs[many], 0.5)
+    return out
+
+
+def log_mass_per_cell(posterior: CellDistribution) -> NDArray[np.floating]:
+    """Log mass (N,) of one cell of each row; the cells of a run share its mass equally."""
+    log_mass = posterior.log_prob
+    if posterior.runs is not None:
+        many = np.flatnonzero(posterior.runs > 1)
+        log_mass = log_mass.copy()
+        log_mass[many] -= np.log(posterior.runs[many])
+    return log_mass
+
+
+def leading_rows(posterior: CellDistribution, n: int = LEADING_CELLS) -> NDArray[np.int64]:
+    """The ``n`` rows (m,) with the most mass per cell, in any order; fewer where fewer have mass."""
+    p = log_mass_per_cell(posterior)
+    rows = np.zeros(0, np.int64)
+    if len(p) > 100 * n:
+        # the quantile of every fiftieth row leaves few to look at; for a small n, by chance, too few
+        some, few = p[::50], max(1, n // 5)
+        rows = np.flatnonzero(p >= np.partition(some, -few)[-few])
+    if len(rows) < n:
+        rows = np.arange(len(p))
+    if len(rows) > n:
+        rows = rows[np.argpartition(p[rows], -n)[-n:]]
+    return rows[p[rows] > -np.inf]
+
+
+def likeliest_cells(posterior: CellDistribution, n: int) -> NDArray[np.int64]:
+    """Pose ids (m,) of the ``n`` most probable cells, or of the middles of runs of them, the most probable first."""
+    rows = leading_rows(posterior, n)
+    return middle_cells(posterior, rows[np.argsort(-posterior.log_prob[rows], kind="stable")[:n]])
+
+
+def nearest_images(posterior: CellDistribution, T: Array) -> Array:
+    """The images (n, 4, 4) of poses ``T`` (n, 4, 4), in the sensor frame, that are nearest to the posterior's reference;
+    themselves without one."""
+    reference = posterior.reference
+    return T if reference is None else reference.nearest(T, posterior.index.space, posterior.T_frame_sensor)

@@ -1,0 +1,138 @@
+"""What a posterior was made from, and what was noticed on the way: typed, so that no decision reads a text or a key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from geomtact.inference.effort import Effort
+from geomtact.se3 import Array
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What to think of a posterior.
+
+    Attributes
+    ----------
+    is_outlier : whether a contact is unlike any simulated touch of the object
+    disagrees : whether the other sensors, or the prior, contradict a sensor's image
+    unexplained_nats : per contact, by how much the likeliest pose explains less than the poses that suit each sensor best;
+        inf where no pose suits all; None where poses were not searched for
+    misfit_nats : per contact, by how much the likeliest pose misses masks beyond what is usual; as ``unexplained_nats``, and
+        None with measured depths
+    refined_by_outline : whether the outline was compared with those of rigid and elastic gels
+    frame : number of the frame in a sequence, from 1; None outside of one
+    surprise_nats : log of how likely the posterior of the frame before made this frame, relative to chance; None where
+        there was nothing to compare with
+    is_skipped : whether the frame's image could not be read
+    """
+
+    is_outlier: bool = False
+    disagrees: bool = False
+    unexplained_nats: float | None = None
+    misfit_nats: float | None = None
+    refined_by_outline: bool = False
+    frame: int | None = None
+    surprise_nats: float | None = None
+    is_skipped: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ViewRecord:
+    """What was resolved for one image.
+
+    Attributes
+    ----------
+    T_frame_sensor : (4, 4) of the sensor in the posterior's frame
+    kind : "mask", "height" or "reading"
+    contact_method : by which the contact was found in a reading; None for other kinds
+    has_height : whether depths were measured
+    has_contact : whether the image shows contact
+    digest : of an image with contact; None for one without
+    """
+
+    T_frame_sensor: Array
+    kind: str
+    contact_method: str | None
+    has_height: bool
+    has_contact: bool
+    digest: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class TrackRecord:
+    """How frames of a sequence were combined: the arguments of ``track``, and the motion with its kind."""
+
+    motion: Mapping[str, float | str]
+    counts: tuple[float, float | None]
+    fresh: float
+    most: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class Provenance:
+    """What a posterior was made from.
+
+    Attributes
+    ----------
+    effort, scorer, max_poses : as resolved by ``localize`` and ``prepare``
+    scored_by, temperature, floor : the score that was used, and its calibration
+    views : one for each image, in the order given
+    earlier_images : digests of images with contact that the prior or the frames before were made from
+    lacks_prior : whether the prior, and other sensors without contact, were left out when it was saved
+    track : how frames were combined, in a sequence
+    """
+
+    effort: str | Effort = "balanced"
+    scorer: str = ""
+    max_poses: int | None = None
+    scored_by: str | None = None
+    temperature: float | None = None
+    floor: float | None = None
+    views: tuple[ViewRecord, ...] = ()
+    earlier_images: tuple[str, ...] = ()
+    lacks_prior: bool = False
+    track: TrackRecord | None = None
+
+    @property
+    def base(self) -> int:
+        """Number of the view whose cells the posterior lives on: the first with contact."""
+        return next((i for i, view in enumerate(self.views) if view.has_contact), 0)
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Digests of all images with contact, its own first."""
+        own = (view.digest for view in self.views if view.digest is not None)
+        return tuple(dict.fromkeys([*own, *self.earlier_images]))
+
+    def without_prior(self) -> Provenance:
+        """As it is saved where the prior cannot be."""
+        return replace(self, earlier_images=(), lacks_prior=True)
+
+    def to_json(self) -> dict[str, Any]:
+        """In types of JSON."""
+        views = [asdict(view) | {"T_frame_sensor": view.T_frame_sensor.tolist()} for view in self.views]
+        return asdict(replace(self, views=())) | {"views": views}
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Provenance:
+        """Inverse of :meth:`to_json`.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError, UsageError
+            It was not written by :meth:`to_json`.
+        """
+        effort, track = content["effort"], content["track"]
+        views = (ViewRecord(**view | {"T_frame_sensor": np.array(view["T_frame_sensor"])}) for view in content["views"])
+        resolved = {
+            "effort": Effort(**effort) if isinstance(effort, dict) else effort,
+            "views": tuple(views),
+            "earlier_images": tuple(content["earlier_images"]),
+            "track": None if track is None else TrackRecord(**track | {"counts": tuple(track["counts"])}),
+        }
+        return cls(**{**content, **resolved})

@@ -1,0 +1,37 @@
+"""A fitted score by reference: pickled by what it was fitted on, and read from the cache once in each process."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, TypeVar
+
+from geomtact.contact_space.index import Index
+from geomtact.errors import CacheError
+from geomtact.scoring.calibration import Calibration
+from geomtact.scoring.fitted import FittedScorer, fitted_scorer
+
+_Kind = TypeVar("_Kind")
+Fit = tuple[Calibration, Calibration | None, bool]
+
+
+def fit_of(scorer: FittedScorer) -> Fit:
+    """What distinguishes a score from another of its name."""
+    return scorer.calibration, scorer.exact_calibration, scorer.cascade is None
+
+
+@lru_cache(4)
+def reopened(kind: type[_Kind], index: Index, scorer: str, fit: Fit, *rest: Any) -> _Kind:
+    """``kind(index, scorer, *rest)`` with the score of that name, read from the cache entry of ``index``.
+
+    Raises
+    ------
+    CacheError
+        The score there was fitted otherwise than ``fit``.
+    """
+    fitted = fitted_scorer(scorer, index, index.folder)
+    if fit_of(fitted) != fit:
+        raise CacheError(
+            f"cache entry {index.folder}: its score {scorer!r} is not the one that was pickled; prepare the object again, and "
+            "pickle it anew"
+        )
+    return kind(index, fitted, *rest)  # type: ignore[call-arg]

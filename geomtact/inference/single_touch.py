@@ -1,0 +1,176 @@
+"""The posterior of one sensor's image (thesis 6.1), and its leading modes refined (thesis 6.3)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.contact_space.index import Index
+from geomtact.inference.effort import Effort, effort_of
+from geomtact.inference.facts import Diagnostics, Provenance, ViewRecord
+from geomtact.inference.joint_refinement import refine_jointly
+from geomtact.inference.mode_refiner import ModeRefiner
+from geomtact.inference.outline_refinement import few_are_left, refine_by_outline
+from geomtact.inference.posterior import Posterior
+from geomtact.inference.prior import lost_contact, prior_log_density, prior_log_mass
+from geomtact.inference.repeated_images import digest
+from geomtact.inference.search import SensorView
+from geomtact.inference.views import Placed
+from geomtact.scoring.calibration import posterior_log_prob
+from geomtact.scoring.fitted import FittedScorer
+from geomtact.sensing.contact import Contact, SoftMask
+
+LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
+
+_HOLLOW = 0.01  # share of the surface in hollows that the sensor may fit into, from which the user is warned
+# nats by which an image is likelier without the prior: were the moments' likelihood exact, one image in exp(5), or 148, at most
+# would be, its pose drawn from the prior (Markov's inequality)
+_CONTRADICTION_NATS = 5.0
+
+
+def touch_posterior(
+    index: Index, scorer: FittedScorer, placed: Placed, prior: Any, provenance: Provenance, seed: int
+) -> tuple[Posterior, LogMass]:
+    """The posterior of one image on the cells of ``index``, not refined; and the log mass of every cell (M,) before it, where
+    there is a prior and contact.
+
+    Parameters
+    ----------
+    prior : as of ``Localizer.localize``, opened
+    provenance : its effort says which cells are scored
+    """
+    observation, T_frame_sensor, frame = placed.observation, placed.T_frame_sensor, placed.frame
+    contact, warnings = observation.contact, [*index.mesh.warnings, *observation.warnings]
+    shown, above = _scored(contact)
+    posterior = Posterior(
+        index,
+        np.zeros(0, np.int64),
+        np.zeros(0),
+        frame,
+        T_frame_sensor,
+        contact=bool((shown > 0.5).any()),
+        seed=seed,
+        observations=[observation],
+        provenance=replace(provenance, views=(_record(placed, bool((shown > 0.5).any())),)),
+        timing_ms={"read": placed.read_ms},
+        warnings=warnings,
+    )
+    if not posterior.contact:
+        return replace(posterior, off_contact_log_density=prior_log_density(index, prior, frame)), None
+    timing, log_prior = posterior.timing_ms, None
+    resolved = effort_of(provenance.effort).resolved
+    with timed(timing, "score"):
+        if prior is not None:
+            log_prior = prior_log_mass(index, prior, T_frame_sensor, frame)
+        if prior is None and not above:
+            rows = scorer.rows(index, shown, resolved)
+        else:
+            rows = scorer.cells(index, shown, log_prior, resolved == "all", above)
+    with timed(timing, "posterior"):
+        log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
+        model = scorer.evidence_model
+        usual, likeliest = model.evidence(index, shown)
+        evidence = usual if log_prior is None else model.evidence(index, shown, log_prior, above)[0]
+    if log_prior is not None:
+        without_prior = model.evidence(index, shown, index.log_weight, above)[0] if above else usual
+        warnings.extend(_contradiction(without_prior - evidence))
+    is_outlier = model.is_outlier(usual, likeliest)
+    if is_outlier:
+        warnings.append("the contact is unlike any touch of this object that was simulated: is it the right object?")
+    warnings.extend(_hollows(index.space.hollow))
+    calibration = rows.calibration
+    posterior = replace(
+        posterior,
+        cells=rows.first,
+        log_prob=log_prob,
+        runs=rows.runs,
+        log_evidence=evidence,
+        provenance=replace(
+            posterior.provenance, scored_by=rows.by, temperature=calibration.temperature, floor=calibration.floor
+        ),
+        diagnostics=Diagnostics(is_outlier=is_outlier),
+    )
+    return posterior, log_prior
+
+
+def give_up_lost_contact(posterior: Posterior, prior: Any) -> tuple[Posterior, Any]:
+    """``posterior`` and ``prior``; without the prior where that holds that the object touches, but the image shows no contact."""
+    if posterior.contact or not lost_contact(prior, posterior.sensor, posterior.T_frame_sensor):
+        return posterior, prior
+    warning = "contact was lost: the prior, by which the object touches the sensor where it stands, is given up"
+    return replace(posterior, off_contact_log_density=None, warnings=[*posterior.warnings, warning]), None
+
+
+def refine_modes(posterior: Posterior, log_prior: LogMass, refiner: ModeRefiner, effort: Effort) -> Posterior:
+    """The ``posterior`` of one image with its leading modes refined below the grid.
+
+    A mask is registered mode by mode. Depths, and outlines where few cells are left, are searched for and weighed.
+    ``log_prior`` is as of :func:`touch_posterior`.
+    """
+    if not posterior.contact or posterior.observation is None:
+        return posterior
+    with timed(posterior.timing_ms, "refine"):
+        contact = posterior.observation.contact
+        has_height = contact.height is not None
+        if not effort.modes or not (has_height or (effort.outlines and few_are_left(posterior))):
+            return refiner.refine(posterior, contact, effort.modes, effort.thorough)
+        view = SensorView(refiner, contact, np.eye(4))
+        if has_height:
+            return refine_jointly(posterior, [view], effort.modes, posterior.seed, log_prior)
+        return refine_by_outline(posterior, view, effort.modes, posterior.seed, log_prior)
+
+
+def _scored(contact: Contact) -> tuple[SoftMask, float]:
+    """The mask that is scored, and the depth [m] of the contour line of the gel that bounds it: where depths are measured, one
+    at which the gel surely lies on the object, which reaches below it by as much."""
+    if contact.height is not None and contact.height[contact.mask].any():
+        return contact.deeper(contact.sure_depth), contact.sure_depth
+    return contact.soft_mask, 0.0
+
+
+def _record(placed: Placed, has_contact: bool) -> ViewRecord:
+    observation = placed.observation
+    # a mask is the same in whichever two values
+    image = observation.contact.mask if observation.kind == "mask" else observation.image
+    return ViewRecord(
+        placed.T_frame_sensor,
+        observation.kind,
+        observation.method,
+        observation.contact.height is not None,
+        has_contact,
+        digest(image) if has_contact else None,
+    )
+
+
+def _contradiction(nats: float) -> list[str]:
+    """The warning, if any, where an image is ``nats`` likelier without the prior."""
+    if not nats > _CONTRADICTION_NATS:
+        return []
+    return [
+        f"the prior and the image contradict each other, by {nats:.0f} nats: look whether both are of this touch and object, "
+        "and at the prior's frame and units"
+    ]
+
+
+def _hollows(share: float) -> list[str]:
+    """The warning, if any, of an object with this share of its surface in hollows that are wider than the window."""
+    if not share > _HOLLOW:
+        return []
+    return [
+        f"{100 * share:.0f} % of the object's surface lies in hollows wider than the sensor's window, and touches in there are "
+        "mistaken for others: touch from outside, or localize on a mesh of that wall alone"
+    ]
+
+
+@contextmanager
+def timed(timing_ms: dict[str, float], stage: str) -> Iterator[None]:
+    """Write the time that the block takes into ``timing_ms`` under ``stage``."""
+    start = time.perf_counter()
+    yield
+    timing_ms[stage] = 1e3 * (time.perf_counter() - start)
