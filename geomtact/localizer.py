@@ -96,10 +96,10 @@ class Localizer(PreparedObject):
         NoPoseAgreesError
             Of several sensors: there is no pose at which the object touches all that show contact.
         """
-        each, resolved = (self, *self.others), effort_of(effort)
+        resolved = effort_of(effort)
         views = read_views(image, T_world_sensor, self.sensors, kind, background)
         prior = opened(prior, self.cache_dir)
-        each = each if self.others else each * len(views)
+        each = self.by_sensor if self.others else [self] * len(views)
         touches = [
             touch_posterior(
                 one.index,

@@ -29,8 +29,10 @@ STAGES = [
     ["contact_space"],
     ["scoring"],
     ["registration"],
-    ["planning"],
     ["inference"],
+    ["planning"],
+    ["localizer"],
+    ["identification"],
     ["training"],
     ["batch", "evaluation", "report"],
     ["cli"],
@@ -85,6 +87,36 @@ def test_imports_go_one_way():
             elif not (parts[1] == own or HEIGHT[parts[1]] < HEIGHT[own] or {own, parts[1]} == {"errors", "se3"}):
                 offences.append(f"{path}:{line}: {own} imports from {parts[1]}, a later stage")
     assert not offences, "\n".join(offences)
+
+
+def test_no_two_modules_import_each_other():
+    """Not by way of others either, within a folder, within a function, or for types alone."""
+    name_of = {path: "geomtact." + ".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in MODULES}
+    apart = [path for path in MODULES if path.name not in ("__init__.py", "__main__.py")]
+    graph = {name_of[path]: {name for name, _ in imports(path)} for path in apart}
+    for path, node in nodes(apart):
+        if isinstance(node, ast.ImportFrom):  # ``from geomtact.sensing import noise`` names a module
+            graph[name_of[path]] |= {f"{node.module}.{alias.name}" for alias in node.names}
+    left = {name: targets & set(graph) for name, targets in graph.items()}
+    while free := {name for name, targets in left.items() if not targets}:
+        left = {name: targets - free for name, targets in left.items() if name not in free}
+    assert not left, f"these modules import each other, or one that does: {sorted(left)}"
+
+
+def test_no_module_uses_another_ones_private_names():
+    """A private attribute belongs to what the module itself defines; a private name is not imported."""
+    rooms = ("inference", "planning", "registration", "localizer", "identification")
+    for path in (each for each in MODULES if stage(each) in rooms):
+        own = {node.name for node in parsed(path) if isinstance(node, ast.FunctionDef)}
+        own |= {
+            node.attr for node in parsed(path) if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "self"
+        }
+        for node in parsed(path):
+            if isinstance(node, ast.ImportFrom):
+                private = [alias.name for alias in node.names if re.match("_[a-z]", alias.name)]
+                assert not private, f"{path}:{node.lineno} imports {private}"
+            elif isinstance(node, ast.Attribute) and re.match("_[a-z]", node.attr):
+                assert node.attr in own, f"{path}:{node.lineno} uses {ast.unparse(node)} of another module"
 
 
 def test_what_scripts_import_is_there():

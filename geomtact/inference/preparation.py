@@ -68,9 +68,14 @@ class PreparedObject:
         return self.index.sensor
 
     @property
+    def by_sensor(self) -> list[Self]:
+        """This one and the others: one for each image, or one for all."""
+        return [self, *self.others]
+
+    @property
     def sensors(self) -> list[Sensor]:
         """One for each image, or one for all."""
-        return [self.index.sensor, *(one.index.sensor for one in self.others)]
+        return [one.index.sensor for one in self.by_sensor]
 
     @property
     def space(self) -> ContactSpace:

@@ -42,7 +42,7 @@ class SensorImage:
 def sensor_images(posterior: Posterior, localizer: Localizer) -> list[SensorImage]:
     """The images of ``posterior``, which ``localizer`` made, in the order in which they were given."""
     views = posterior.provenance.views
-    each = (localizer, *localizer.others) if localizer.others else (localizer,) * len(views)
+    each = localizer.by_sensor if localizer.others else [localizer] * len(views)
     return [
         SensorImage(one.sensor, view.T_frame_sensor, observation, one.simulate, f"sensor {n}" if len(views) > 1 else "")
         for n, (one, view, observation) in enumerate(zip(each, views, posterior.observations, strict=True), 1)

@@ -253,7 +253,7 @@ def localize_balls(
     balls = {}
     for ball in BALLS:
         prepared = Localizer.prepare(_ball(ball), sensor=list(sensors.values()), cache_dir=cache_dir)
-        each = replace(prepared, others=()), *prepared.others
+        each = [replace(one, others=()) for one in prepared.by_sensor]
         for used, localizer in zip(sensors, each, strict=True):
             balls[ball, used] = localizer
     for row in circles_of(circles, (*_BY_EYE, "ball_mm"))[first:]:
