@@ -399,8 +399,8 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
     args = ["localize", *paths, "--object", "connector_plug", "--sensor", "gelslim"]
     done = CliRunner().invoke(app, [*args, "--sensor-poses", str(poses), "--json", "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
-    assert "0.png was made of gear, as its metadata says, and is localized on connector_plug" in done.stderr
-    assert "1.png was made with digit, as its metadata says, and is localized on gelslim" in done.stderr
+    assert "0.png was made of gear by its metadata, but is localized with connector_plug" in done.stderr
+    assert "1.png was made with digit by its metadata, but is localized with gelslim" in done.stderr
     content = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))
     assert content["frame"] == "world" and len(content["settings"]["views"]) == 2 and content["modes"]
     for text, words in [

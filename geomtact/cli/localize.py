@@ -234,7 +234,7 @@ def _warn_of_metadata(image: Path, metadata: Mapping[str, Any], name: str | None
     for word, key, used in (("of", "object", name), ("with", "sensor", sensor)):
         made = metadata.get(f"geomtact:{key}")
         if made and used and Path(made).stem != printable(Path(used).stem):
-            tell(f"warning: {image} was made {word} {made} by its metadata, but is localized {word} {used}")
+            tell(f"warning: {image} was made {word} {made} by its metadata, but is localized with {used}")
 
 
 def _check_images(images: list[Path], sensor_poses: Path | None) -> None:
