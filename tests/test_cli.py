@@ -58,6 +58,7 @@ def test_help_and_lists(geomtact):
     commands = {
         "localize",
         "prepare",
+        "evaluate",
         "train",
         "simulate",
         "sensors",

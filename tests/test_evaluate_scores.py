@@ -9,6 +9,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from geomtact import Localizer, load_mesh
+from geomtact.evaluation import LEVELS, describe
 from geomtact.scoring import catalogue, fitted
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.sensor import Sensor
@@ -88,7 +89,7 @@ def test_the_file_says_all_that_the_figures_depend_on(whole, folder):
             localizer = Localizer.prepare(
                 part, sensor="gelsight-mini", scorer=name, max_poses=3000, cache_dir=folder / "cache"
             )
-            assert entry["settings"] == json.loads(json.dumps(study.describe(localizer)))
+            assert entry["settings"] == json.loads(json.dumps(describe(localizer)))
             assert entry["settings"]["index"] == localizer.index.key and entry["settings"]["calibration"]["temperature"]
             assert entry["bytes_per_pose"] == pytest.approx(
                 24 if name == "moments" else np.prod(localizer.index.resolution.mask_shape) / 8 + 2
@@ -132,7 +133,7 @@ def test_over_all_parts_means_are_of_parts_and_coverage_is_of_touches(whole):
         assert together["gain_standard_error"] == pytest.approx(np.sqrt(np.square(errors).sum()) / 2)
         level = [o.level for part in content["parts"] for o in outcomes(content, part, name)]
         assert together["n"] == len(level) == 2 * TOUCHES
-        assert [c["share"] for c in together["coverage"]] == [np.mean(np.array(level) <= m) for m in study.NOMINAL]
+        assert [c["share"] for c in together["coverage"]] == [np.mean(np.array(level) <= m) for m in LEVELS]
         assert entry["prepare_s"]["index"] == np.mean([e["prepare_s"]["index"] for e in each])
 
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from geomtact import Localizer, Mesh, load_mesh
 from geomtact.errors import InputError
-from geomtact.evaluation import coverage
+from geomtact.evaluation import LEVELS, coverage
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.pose_error import add, add_s, mssd
 from geomtact.inference.effort import EFFORTS
@@ -115,10 +115,10 @@ def test_coverage_of_calibrated_levels_and_its_intervals():
     assert (none.share, none.low) == (0, 0)
     assert none.high == pytest.approx(1 - 0.025 ** (1 / 10))  # Clopper and Pearson in closed form for no hit
     rng = np.random.default_rng(0)
-    hits = [c.low <= c.nominal <= c.high for _ in range(100) for c in coverage(rng.random(60), study.NOMINAL)]
+    hits = [c.low <= c.nominal <= c.high for _ in range(100) for c in coverage(rng.random(60), LEVELS)]
     assert np.mean(hits) >= 0.95  # exact intervals are never too short
-    shares = [c.share for c in coverage(rng.random(20_000), study.NOMINAL)]
-    np.testing.assert_allclose(shares, study.NOMINAL, atol=0.012)
+    shares = [c.share for c in coverage(rng.random(20_000), LEVELS)]
+    np.testing.assert_allclose(shares, LEVELS, atol=0.012)
 
 
 def test_touches_repeat_and_only_elastic_ones_are_felt_anew(localizer):

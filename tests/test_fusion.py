@@ -14,12 +14,11 @@ from geomtact.cli import app
 from geomtact.contact_space.cell_transfer import CellTransfer, ExtrinsicsStd
 from geomtact.contact_space.touches import random_touches
 from geomtact.errors import InputError, NoPoseAgreesError, UsageError
+from geomtact.evaluation import simultaneous_touches
 from geomtact.inference.distribution import cell_densities, cell_log_density
 from geomtact.inference.extrinsics import extrinsics_covariance
 from geomtact.inference.fusion import _shares, disagreement, fuse, poor_agreement
-from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
-from tools.studies.touches.study import make_scenes
 
 
 def world(touches, rng):
@@ -464,7 +463,7 @@ def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
     """
     rng = np.random.default_rng(5)
     told, last = {"right": 0, "off": 0, "known to be": 0}, {}
-    for scene in make_scenes(plug, 6, 9, MODERATE, None, 3):
+    for scene in simultaneous_touches(plug.space, 6, 3, 9):
         masks = [touch.mask for touch in scene.touches]
         off = scene.T_world_sensor.copy()
         way = rng.normal(size=(2, 3))

@@ -14,13 +14,13 @@ from geomtact import InputError, Localizer, Mesh, UsageError
 from geomtact.cli import app
 from geomtact.cli.parts import parts_of
 from geomtact.errors import NoPoseAgreesError
+from geomtact.evaluation import simultaneous_touches
 from geomtact.identification import identify
 from geomtact.inference.facts import Diagnostics
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
 from tools.studies.common.pictures import draw
 from tools.studies.identify.study import Told, identify_scenes, summarise
-from tools.studies.touches.study import make_scenes
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_unlike_all_is_what_is_odd_or_unexplained_of_each(drawer, said, unlike):
 @pytest.mark.parametrize("flat", slow_but((0, 2), 2))
 def test_three_noisy_touches_of_a_part_are_not_unlike_it(drawer, flat, scenes):
     """Rigid and elastic gels in turn; some scenes of each part that has flats."""
-    for scene in make_scenes(drawer[flat], scenes, 1, MODERATE, None, 3):
+    for scene in simultaneous_touches(drawer[flat].space, scenes, 3, 1):
         masks = [touch.mask for touch in scene.touches]
         assert not identify([drawer[flat]], masks, kind="mask", T_world_sensor=scene.T_world_sensor, seed=1).foreign
 

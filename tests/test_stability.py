@@ -15,6 +15,7 @@ from geomtact.contact_space.contact_class import CLASSES, contact_class
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touches import penetrations
 from geomtact.errors import NoPoseAgreesError
+from geomtact.evaluation import simultaneous_touches
 from geomtact.json_values import plain
 from geomtact.se3 import inverse
 from geomtact.sensing.noise import CLEAN, MODERATE
@@ -27,7 +28,6 @@ from tools.studies.stability import worlds
 from tools.studies.stability.plot import draw_stability
 from tools.studies.stability.study import SWEEPS, opposed
 from tools.studies.stability.worlds import World, cut_off, knobbed, larger, scanned
-from tools.studies.touches.study import make_scenes
 from tools.studies.track.trajectories import random_trajectory
 
 pytestmark = pytest.mark.studies
@@ -239,7 +239,7 @@ def told(plug, monkeypatch):
 def test_a_rig_is_off_by_what_is_said_but_for_its_first_sensor(plug, told, name, level, mm, degrees):
     answers = list(stability.swept(plug, SWEEPS[name], level, 8, 1, "fast"))
     assert answers == [REFUSED] * 8
-    true = [scene.T_world_sensor for scene in make_scenes(plug, 8, 1, MODERATE, None, 3)]
+    true = [scene.T_world_sensor for scene in simultaneous_touches(plug.space, 8, 3, 1)]
     off = inverse(np.array(true)) @ np.array(told)
     assert off[:, 0] == pytest.approx(np.tile(np.eye(4), (8, 1, 1)))
     turned = Rotation.from_matrix(off[:, 1:, :3, :3].reshape(-1, 3, 3)).magnitude()

@@ -34,7 +34,8 @@ STAGES = [
     ["localizer"],
     ["identification"],
     ["training"],
-    ["batch", "evaluation", "report"],
+    ["batch", "evaluation"],
+    ["report"],
     ["cli"],
 ]
 HEIGHT = {name: k for k, names in enumerate(STAGES) for name in names}

@@ -7,6 +7,7 @@ import sys
 import typer
 
 from geomtact.cli.calibrate import calibrate
+from geomtact.cli.evaluate import evaluate
 from geomtact.cli.library import cache, objects, sensors
 from geomtact.cli.localize import localize
 from geomtact.cli.next_touch import next_touch
@@ -54,7 +55,7 @@ app = typer.Typer(
     + "\n\n'geomtact localize --help' shows the form of poses.json. 'geomtact sensors' lists the sensors.",
 )
 app.command(epilog=EXAMPLES + SENSOR_POSES)(one_line_errors(localize))
-for command in (track, view, prepare, train, simulate, calibrate, sensors, objects, cache):
+for command in (track, view, prepare, evaluate, train, simulate, calibrate, sensors, objects, cache):
     app.command()(one_line_errors(command))
 app.command("next-touch")(one_line_errors(next_touch))
 

@@ -57,16 +57,16 @@ def judge_choices(
     preparing is known too. Prints tables, and writes all answers to --out.
     """
     from geomtact.contact_space.store import FORMAT
+    from geomtact.evaluation import identity
     from geomtact.json_values import plain
     from geomtact.sensing.sensor import Sensor
     from tools.studies.choices import study as choices
-    from tools.studies.common import study
 
     content, gel = study_file.load(out, SCHEMA), Sensor.load(sensor)
     ways = choices.ways_of(weights or [], only or [])
     for mesh in study_options.meshes(parts, unit, gel):
         settings = plain(
-            study.whose(mesh, gel)
+            identity(mesh, gel)
             | {
                 "index_format": FORMAT,
                 "touches": touches,

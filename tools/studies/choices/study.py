@@ -19,6 +19,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import CALIBRATION_NOISE, felt_height
 from geomtact.contact_space.touches import Touch, random_touches
 from geomtact.errors import NoPoseAgreesError, UsageError, nearest_name
+from geomtact.evaluation import simultaneous_touches
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.effort import EFFORTS, Effort
@@ -35,7 +36,6 @@ from tools.studies.common.answer import REFUSED, Answer, judged
 from tools.studies.common.study import mean_with_interval
 from tools.studies.kitting.fixture import upwards
 from tools.studies.scores import study as scores
-from tools.studies.touches.study import make_scenes
 
 SCENES = ("one touch", "three sensors", "known side")
 DEFAULT, _ENCODER = "balanced", "encoder"
@@ -194,7 +194,7 @@ def make(kind: str, localizer: Localizer, n: int, seed: int) -> list[Scene]:
     Where a height map shows contact it is off by a smooth field, as strong as the sensor's file says.
     """
     if kind == "three sensors":
-        scenes = make_scenes(localizer, n, seed, MODERATE, None, _SENSORS)
+        scenes = simultaneous_touches(localizer.space, n, _SENSORS, seed)
         return [Scene(s.T_world_object, [t.mask for t in s.touches], s.T_world_sensor) for s in scenes]
     space = localizer.space
     if kind == "known side":

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geomtact.evaluation import assess
+from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.pose_error import mssd
 from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array
 from tools.studies.common.study import CERTAIN, WRONG_MM
@@ -51,14 +52,12 @@ def judged(mesh: Mesh, T: Array, posterior: Posterior, nearest: Array | None = N
 
     Where ``T`` lies outside the contact pose space, its density and level are those of ``nearest`` (4, 4), a pose inside.
     """
-    inside = T if nearest is None else nearest
-    modes = posterior.modes(1)
-    poses = np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
+    found = assess(posterior, T, 1, PoseDistance(mesh), nearest)
     return Answer(
-        gain=float(posterior.log_density(inside)),
-        claimed=-float(posterior.entropy_nats),
-        level=float(posterior.credible_level(inside)),
-        mssd_mm=float(1e3 * mssd(T, poses, mesh).min(initial=np.inf)),
-        probability=modes[0].probability if modes else 0.0,
+        gain=found.gain,
+        claimed=found.expected_gain,
+        level=found.level,
+        mssd_mm=float(1e3 * found.mssd.min(initial=np.inf)),
+        probability=found.probability,
         warned=bool(posterior.warnings),
     )

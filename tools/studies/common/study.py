@@ -13,18 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.contact_space.contact_class import CLASSES, contact_class
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touches import Touch, random_touches
-from geomtact.evaluation import coverage, share_with_interval
+from geomtact.evaluation import LEVELS, assess, coverage, share_with_interval
 from geomtact.geometry.distance import PoseDistance
-from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.pose_error import mssd
 from geomtact.inference.posterior import Posterior
 from geomtact.localizer import Localizer
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
-from geomtact.sensing.sensor import Sensor
 
 THESIS_PARTS = ("pin", "damping_pin", "head", "elbow_pipe")
-NOMINAL = (0.5, 0.8, 0.9, 0.95)
 MODES = 10  # as many as the thesis's best10 has poses
 WRONG_MM = 10.0  # MSSD beyond which a first mode is wrong
 RESAMPLES = 2000
@@ -98,20 +94,19 @@ def judged(
         began = time.perf_counter()
         posterior = localizer.localize(touch.mask, kind="mask", effort=effort, seed=seed)
         ms = 1e3 * (time.perf_counter() - began)
-        modes = posterior.modes(MODES)
-        poses = np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
-        largest, mean = 1e3 * mssd(T, poses, localizer.mesh), 1e3 * distance.mean(T, poses)
+        found = assess(posterior, T, MODES, distance)
+        largest, mean = 1e3 * found.mssd, 1e3 * found.mean
         outcome = Outcome(
             elastic=touch.elastic,
             penetration_mm=1e3 * touch.penetration,
-            gain=float(posterior.log_density(T)),
-            claimed=-float(posterior.entropy_nats),
-            level=float(posterior.credible_level(T)),
+            gain=found.gain,
+            claimed=found.expected_gain,
+            level=found.level,
             mssd_mm=float(largest[:1].min(initial=np.inf)),
             add_mm=float(mean[:1].min(initial=np.inf)),
             mssd10_mm=float(largest.min(initial=np.inf)),
             add10_mm=float(mean.min(initial=np.inf)),
-            probability=modes[0].probability if modes else 0.0,
+            probability=found.probability,
             ms=ms,
             contact=contact_class(localizer.space, T),
         )
@@ -152,7 +147,7 @@ def mean_with_interval(values: Array, rng: np.random.Generator) -> list[float]:
 
 def coverage_figures(levels: ArrayLike, confidence: float = 0.95) -> dict[str, Any]:
     """Coverage at the nominal masses of the credible levels (n,) of true poses, and the greatest error among them."""
-    found = coverage(levels, NOMINAL, confidence)
+    found = coverage(levels, LEVELS, confidence)
     return {
         "coverage": [asdict(c) for c in found],
         "coverage_error": max(abs(c.share - c.nominal) for c in found),
@@ -182,28 +177,6 @@ def random_add(distance: PoseDistance, space: ContactSpace, n: int = 200) -> flo
 def expected_random_add(localizer: Localizer) -> float:
     """Expected ADD of a random guess [mm], in whose units the thesis gives its errors."""
     return 1e3 * random_add(PoseDistance(localizer.mesh), localizer.space)
-
-
-def whose(mesh: Mesh, sensor: Sensor) -> dict[str, Any]:
-    """Whose touches they are: the part's and the sensor's names and hashes."""
-    return {
-        "object": mesh.name,
-        "object_sha256": mesh.sha256,
-        "sensor": sensor.name,
-        "sensor_sha256": sensor.sha256,
-    }
-
-
-def describe(localizer: Localizer) -> dict[str, Any]:
-    """What the figures of a localizer depend on."""
-    index, calibration = localizer.index, localizer.scorer.calibration
-    return whose(localizer.mesh, localizer.sensor) | {
-        "index": index.key,
-        "poses": len(index),
-        "grid": index.resolution.to_json(),
-        "scorer": localizer.scorer.name,
-        "calibration": asdict(calibration),
-    }
 
 
 def _figures(outcomes: Sequence[Outcome], random_add_mm: float) -> dict[str, Any]:

@@ -51,29 +51,18 @@ def begun(entry: dict[str, Any] | None, settings: dict[str, Any]) -> bool:
     import json
 
     from geomtact.errors import InputError
+    from geomtact.evaluation import changed
     from geomtact.json_values import plain
 
     if entry is None:
         return False
     held, wanted = entry.get("settings", {}), json.loads(json.dumps(plain(settings)))
-    other = [key for key in {**held, **wanted} if not _alike(held.get(key), wanted.get(key))]
-    if other:
+    if other := changed(held, wanted):
         raise InputError(
             f"--out holds a study of {settings.get('object', 'this part')} with other settings ({', '.join(other)}); give "
             "another file, or the same settings to go on with it"
         )
     return True
-
-
-def _alike(held: Any, wanted: Any) -> bool:
-    """Whether two settings are the same, but for what another processor's arithmetic makes of the last digits."""
-    if isinstance(held, dict) and isinstance(wanted, dict):
-        return held.keys() == wanted.keys() and all(_alike(held[key], wanted[key]) for key in held)
-    if isinstance(held, list) and isinstance(wanted, list):
-        return len(held) == len(wanted) and all(map(_alike, held, wanted))
-    if isinstance(held, float) and isinstance(wanted, float):
-        return math.isclose(held, wanted, rel_tol=1e-5)
-    return bool(held == wanted)
 
 
 def outcomes(entry: dict[str, Any], kind: Callable[..., Any]) -> list:
@@ -189,9 +178,9 @@ def length(mm: float | None) -> str:
 
 def masses() -> list[str]:
     """Headings of :func:`inside`."""
-    from tools.studies.common.study import NOMINAL
+    from geomtact.evaluation import LEVELS
 
-    return [f"in {100 * mass:.0f} %" for mass in NOMINAL]
+    return [f"in {100 * mass:.0f} %" for mass in LEVELS]
 
 
 def inside(figures: Mapping[str, Any]) -> list[str]:

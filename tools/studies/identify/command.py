@@ -42,14 +42,14 @@ def judge_identification(
     Prints how often the right part is the most probable, how often a part that is not among them is said to be foreign, and how
     often one that is; and writes them and every probability to --out.
     """
+    from geomtact.evaluation import describe
     from geomtact.geometry.catalogue import catalogue
-    from tools.studies.common import study
     from tools.studies.identify import study as identification
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     everyone = list(study_options.localizers(parts or list(catalogue()), unit, sensor, cache_dir, max_poses))
     for own in everyone:
-        settings = study.describe(own) | {
+        settings = describe(own) | {
             "among": {each.mesh.name: each.mesh.sha256 for each in everyone},
             "scenes": scenes,
             "noise": {"name": noise.value, **asdict(strength)},

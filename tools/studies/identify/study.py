@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from geomtact.errors import NoPoseAgreesError
-from geomtact.evaluation import share_with_interval
+from geomtact.evaluation import SimultaneousTouches, share_with_interval, simultaneous_touches
 from geomtact.identification import identify
 from geomtact.localizer import Localizer
 from geomtact.sensing.noise import Noise
-from tools.studies.touches.study import Scene, make_scenes
 
 MOST = 3  # touches
 
@@ -40,11 +40,14 @@ def identify_scenes(
     own: Localizer, all_parts: Sequence[Localizer], n: int, seed: int, noise: Noise, effort: str, first: int = 0
 ) -> Iterator[list[Told]]:
     """Scenes ``first`` to ``n`` of the part of ``own``, rigid and elastic in turn, each from one to three touches."""
-    for number, scene in enumerate(make_scenes(own, n, seed, noise, None, MOST)[first:], first):
+    scenes = simultaneous_touches(own.space, n, MOST, seed, noise)
+    for number, scene in enumerate(islice(scenes, first, None), first):
         yield [_told(all_parts, scene, number, touches, seed, effort) for touches in range(1, MOST + 1)]
 
 
-def _told(parts: Sequence[Localizer], scene: Scene, number: int, touches: int, seed: int, effort: str) -> Told:
+def _told(
+    parts: Sequence[Localizer], scene: SimultaneousTouches, number: int, touches: int, seed: int, effort: str
+) -> Told:
     images = [touch.mask for touch in scene.touches[:touches]]
     options: dict[str, Any] = {
         "kind": "mask",

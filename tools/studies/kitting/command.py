@@ -33,13 +33,13 @@ def judge_kitting(
     Prints them for each clearance and number of touches, and writes them and every run to --out.
     """
     from geomtact.contact_space.touches import penetrations
-    from tools.studies.common import study
+    from geomtact.evaluation import describe
     from tools.studies.kitting import cell as kitting
     from tools.studies.kitting import study as kitting_study
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir):
-        settings = study.describe(localizer) | {
+        settings = describe(localizer) | {
             "noise": {"name": noise.value, **asdict(strength)},
             "penetration_mm": [1e3 * depth for depth in penetrations(localizer.space)],
             "sure": kitting.SURE,

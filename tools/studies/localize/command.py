@@ -59,13 +59,14 @@ def judge(
 
     ``felt`` as in ``study.make_touches``; ``solver`` names it in the file.
     """
+    from geomtact.evaluation import describe
     from tools.studies.common import study
     from tools.studies.localize import study as proper
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     all_figures: dict[tuple[str, str], dict[str, Any]] = {}
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir, max_poses):
-        settings = study.describe(localizer) | {
+        settings = describe(localizer) | {
             "touches": touches,
             "noise": {"name": str(noise), **asdict(strength)},
             "effort": str(effort),

@@ -39,7 +39,7 @@ def judge_next_touch(
 
     Prints their numbers and pose errors, and writes them and every run to --out.
     """
-    from tools.studies.common import study
+    from geomtact.evaluation import describe
     from tools.studies.kitting.fixture import upwards
     from tools.studies.next_touch import study as next_touch_study
 
@@ -48,7 +48,7 @@ def judge_next_touch(
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir, _POSES, lying):
-        settings = study.describe(localizer) | {
+        settings = describe(localizer) | {
             "runs": runs,
             "noise": {"name": noise.value, **asdict(strength)},
             "seed": seed,

@@ -49,12 +49,12 @@ def judge_registration(
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.contact_space.space import ContactSpace
     from geomtact.contact_space.touches import FELT, random_touches
+    from geomtact.evaluation import identity
     from geomtact.inference.mode_refiner import ModeRefiner
     from geomtact.json_values import plain
     from geomtact.registration.observability import Spread
     from geomtact.sensing.sensor import Sensor
     from geomtact.versions import versions
-    from tools.studies.common import study
     from tools.studies.registration import study as registration
     from tools.studies.registration.peers import peers
 
@@ -78,7 +78,7 @@ def judge_registration(
         ) -> dict[str, registration.Method]:
             return registration.own_methods(space, surface, spread) | peers(surface, spread)
 
-        settings = study.whose(mesh, pressed) | {
+        settings = identity(mesh, pressed) | {
             "touches": touches,
             "noise": {"name": noise.value, **asdict(strength)},
             "elastic": FELT[felt],

@@ -17,6 +17,7 @@ from geomtact.contact_space.contact_class import contact_class
 from geomtact.contact_space.resolution import Resolution
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touches import Touch, penetrations
+from geomtact.evaluation import LEVELS
 from geomtact.geometry.rotations import Directions
 from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
@@ -36,7 +37,6 @@ FAR = Spread(np.radians(6), 3e-3)  # of starts that are turned and shifted by th
 FROM_GRID = 3  # starts a touch that are as far off as a grid's poses
 OWN = ("none", "icp", "filterreg", "both", "thesis")
 SUCCESS_MM = 0.5  # error in what the contact tells
-NOMINAL = (0.5, 0.8, 0.9, 0.95)
 _MASK_NEIGHBOURS = 200  # within a filled mask, the nearest points alone pull nowhere
 MASK = (48, 64)  # half a pixel of such a mask is what a refined pose may lose
 
@@ -342,14 +342,14 @@ def _over_all(some: Sequence[Trial]) -> dict[str, Any]:
 def _from_grid(some: Sequence[Trial], half_pixel_mm: float) -> dict[str, Any]:
     told, stated = [t for t in some if t.told], [t for t in some if t.level is not None]
     before, after = (np.array([getattr(t, name) for t in told]) for name in ("start_mm", "error_mm"))
-    inside = [float(np.mean([t.level <= mass for t in stated])) for mass in NOMINAL] if stated else None  # type: ignore[operator]
+    inside = [float(np.mean([t.level <= mass for t in stated])) for mass in LEVELS] if stated else None  # type: ignore[operator]
     return {
         "n": len(some),
         "error_mm_median": float(np.median(after)) if len(told) else None,
         "of_start": float(np.median(after) / np.median(before)) if len(told) else None,
         "worse": float((after > before + half_pixel_mm).mean()) if len(told) else None,
         "stated": len(stated),
-        "coverage": inside and dict(zip(map(str, NOMINAL), inside, strict=True)),
+        "coverage": inside and dict(zip(map(str, LEVELS), inside, strict=True)),
         "agreement": float(np.mean([t.agrees for t in stated])) if stated else None,  # type: ignore[misc]
     }
 

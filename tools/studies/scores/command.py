@@ -172,6 +172,7 @@ def _judge(
 ) -> None:
     """Judge one score on one part, from where the file ends."""
     from geomtact.contact_space.touches import FELT
+    from geomtact.evaluation import describe
     from geomtact.inference.effort import EFFORTS
     from geomtact.json_values import plain
     from geomtact.scoring.catalogue import DEFAULT_SCORER
@@ -182,7 +183,7 @@ def _judge(
     scorer, effort = (DEFAULT_SCORER, name) if name in EFFORTS else (name, options.effort)
     with progress_bar(f"preparing {mesh.name}, {name}") as progress:
         localizer, seconds = scores.prepare(mesh, options.sensor, scorer, options.max_poses, cache_dir, progress)
-    described = plain(study.describe(localizer))
+    described = plain(describe(localizer))
     found = part["scores"].get(name)
     outcomes = study_file.earlier(found, described, scores.Scored)
     known = {**(found["prepare_s"] if found else {}), "index": part["index_s"]}

@@ -51,8 +51,8 @@ def judge_stability(
     Prints for each level what is known, how often the answer is wrong, and how often nothing says so; and writes all to --out.
     """
     from geomtact.errors import UsageError, nearest_name
+    from geomtact.evaluation import describe
     from geomtact.json_values import plain
-    from tools.studies.common import study
     from tools.studies.stability import study as stability
 
     names = sweep or list(stability.SWEEPS)
@@ -61,7 +61,7 @@ def judge_stability(
             raise UsageError(f"no sweep named {name!r}{nearest_name(name, stability.SWEEPS)}")
     content = study_file.load(out, SCHEMA)
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir, max_poses):
-        settings = study.describe(localizer) | {"touches": touches, "effort": effort.value, "seed": seed}
+        settings = describe(localizer) | {"touches": touches, "effort": effort.value, "seed": seed}
         part = localizer.mesh.name
         found = content["parts"].get(part)
         sweeps = dict(found["sweeps"]) if study_file.begun(found, settings) else {}

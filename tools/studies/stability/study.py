@@ -18,7 +18,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import felt_mask, spoilt
 from geomtact.contact_space.touches import counts, penetrations
 from geomtact.errors import NoPoseAgreesError
-from geomtact.evaluation import coverage
+from geomtact.evaluation import coverage, simultaneous_touches
 from geomtact.geometry.mesh import Mesh, coarser
 from geomtact.inference.filter import has_slipped
 from geomtact.localizer import Localizer
@@ -28,7 +28,6 @@ from geomtact.sensing.noise import MODERATE
 from tools.studies.common.answer import REFUSED, Answer, judged
 from tools.studies.common.study import CERTAIN
 from tools.studies.stability.worlds import TRIED, World, knobbed, larger, scanned, touches
-from tools.studies.touches.study import make_scenes
 from tools.studies.track.trajectories import random_trajectory
 
 _SENSORS = 3  # that touch at once, where the rig is wrong
@@ -123,7 +122,7 @@ def _rigs(off: Array, localizer: Localizer, level: float, n: int, seed: int, eff
     """Scenes of three sensors whose poses are told wrongly, each off at random by ``level`` times ``off`` (6,) [rad, m], but the
     first."""
     rng = np.random.default_rng([seed, 7])
-    for scene in make_scenes(localizer, n, seed, MODERATE, None, _SENSORS):
+    for scene in simultaneous_touches(localizer.space, n, _SENSORS, seed):
         T = scene.T_world_sensor.copy()
         T[1:] = T[1:] @ np.array([exp(level * off * rng.normal(size=6)) for _ in T[1:]])
         yield _together(localizer, scene.T_world_object, T, [touch.mask for touch in scene.touches], effort, seed)

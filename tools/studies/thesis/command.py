@@ -47,12 +47,12 @@ def judge_thesis_table(
     """
     from geomtact.contact_space.store import FORMAT
     from geomtact.contact_space.touches import FELT
+    from geomtact.evaluation import identity
     from geomtact.sensing.sensor import Sensor
-    from tools.studies.common import study
 
     content, gel, strength = study_file.load(out, SCHEMA), Sensor.load(sensor), study_options.noise_named(noise)
     for mesh in study_options.meshes(parts, unit, gel):
-        settings = study.whose(mesh, gel) | {
+        settings = identity(mesh, gel) | {
             "index_format": FORMAT,
             "max_poses": _POSES,
             "sides": sides,

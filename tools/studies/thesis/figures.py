@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from geomtact import Localizer, Sensor, load_mesh
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touches import each_touch
+from geomtact.evaluation import simultaneous_touches
 from geomtact.geometry.distance import PoseDistance
 from geomtact.scoring.overlap import OVERLAPS, to_grid
 from geomtact.se3 import apply, exp, inverse, transform, unit
@@ -24,7 +25,7 @@ from geomtact.sensing.cast import Caster
 from geomtact.sensing.noise import MODERATE
 from tools.studies.common.study import THESIS_PARTS, random_add
 from tools.studies.thesis.known_approach import draw_sides
-from tools.studies.touches.study import make_scenes
+from tools.studies.touches.study import SENSORS
 
 ORANGE, BLUE = "#D55E00", "#0072B2"
 SENSOR = Sensor.load("gelslim")
@@ -97,7 +98,7 @@ def contacts_added():
     for row, name in zip(grid, THESIS_PARTS, strict=True):
         localizer = Localizer.prepare(name, sensor=SENSOR)
         mesh, space, distance = localizer.mesh, localizer.space, PoseDistance(localizer.mesh)
-        (scene,) = make_scenes(localizer, 1, SEED, MODERATE, None)
+        (scene,) = simultaneous_touches(localizer.space, 1, SENSORS, SEED)
         truth, told[name] = scene.T_world_object, []
         window = np.column_stack([np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * SENSOR.half_window, np.zeros(4)])
         view = lying(mesh) @ inverse(truth @ transform(np.eye(3), mesh.centre))

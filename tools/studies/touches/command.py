@@ -39,12 +39,12 @@ def judge_touches(
     Prints gain, coverage and pose errors for each number of sensors, and writes them and every outcome to --out.
     """
     from geomtact.contact_space.touches import FELT
-    from tools.studies.common import study
+    from geomtact.evaluation import describe, simultaneous_touches
     from tools.studies.touches import study as sensors_study
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir):
-        settings = study.describe(localizer) | {
+        settings = describe(localizer) | {
             "scenes": scenes,
             "noise": {"name": noise.value, **asdict(strength)},
             "elastic": FELT[felt],
@@ -53,7 +53,7 @@ def judge_touches(
         }
 
         def more(first: int, localizer: Localizer = localizer) -> Iterator[Any]:
-            made = sensors_study.make_scenes(localizer, scenes, seed, strength, FELT[felt])
+            made = simultaneous_touches(localizer.space, scenes, sensors_study.SENSORS, seed, strength, FELT[felt])
             return sensors_study.fuse_scenes(localizer, made, effort, seed, first)
 
         study_file.judged(

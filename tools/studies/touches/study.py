@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
-from geomtact.contact_space.touches import Touch, random_touches
-from geomtact.errors import NoPoseAgreesError
+from geomtact.evaluation import SimultaneousTouches, assess, localized
 from geomtact.geometry.distance import PoseDistance
-from geomtact.geometry.pose_error import add_s, mssd
+from geomtact.geometry.pose_error import add_s
 from geomtact.localizer import Localizer
-from geomtact.se3 import Array, inverse, random_rotations, transform
-from geomtact.sensing.noise import Noise
+from geomtact.se3 import Array
 from tools.studies.common.study import MODES, coverage_figures, mean_with_interval
 
 SENSORS = 5
 _POINTS = 20_000  # for ADD-S, which says no less than the distance between points (0.3 mm on the pin)
-
-
-@dataclass(frozen=True)
-class Scene:
-    """One object in the world, touched by several sensors: their poses (n, 4, 4), the object's (4, 4), and the touches."""
-
-    T_world_sensor: Array
-    T_world_object: Array
-    touches: list[Touch]
 
 
 @dataclass(frozen=True)
@@ -60,55 +49,32 @@ class FusedOutcome:
     ms: float
 
 
-def make_scenes(
-    localizer: Localizer, n: int, seed: int, noise: Noise, elastic: bool | None, sensors: int = SENSORS
-) -> list[Scene]:
-    """``n`` scenes of so many ``sensors``, one touch each, uniform over the contact pose space, wherever they meet the object.
-
-    ``elastic`` as in ``touches.random_touches``.
-    """
-    rng = np.random.default_rng([seed, 13])
-    touches = random_touches(localizer.space, n * sensors, seed, elastic, noise)
-    out = []
-    for i in range(n):
-        some = touches[i * sensors : (i + 1) * sensors]
-        T_world_object = transform(random_rotations(1, rng)[0], rng.uniform(-0.3, 0.3, 3))
-        T = np.stack([T_world_object @ inverse(touch.T_sensor_object) for touch in some])
-        out.append(Scene(T, T_world_object, some))
-    return out
-
-
 def fuse_scenes(
-    localizer: Localizer, scenes: Sequence[Scene], effort: str, seed: int, first: int = 0
+    localizer: Localizer, scenes: Iterable[SimultaneousTouches], effort: str, seed: int, first: int = 0
 ) -> Iterator[list[FusedOutcome]]:
     """Each scene from ``first`` on localized from its first sensor, its first two, and so on."""
     distance, points = PoseDistance(localizer.mesh), localizer.mesh.surface_points(_POINTS)
-    for number, scene in enumerate(scenes[first:], first):
+    for number, scene in enumerate(islice(scenes, first, None), first):
         out = []
         for n in range(1, len(scene.touches) + 1):
-            began = time.perf_counter()
-            images = [touch.mask for touch in scene.touches[:n]]
-            try:
-                posterior = localizer.localize(images, "mask", None, scene.T_world_sensor[:n], effort=effort, seed=seed)
-            except NoPoseAgreesError:
-                out.append(FusedOutcome(number, n, -np.inf, 0.0, 1.0, np.inf, np.inf, np.inf, np.inf, 0.0, True, 0.0))
+            posterior, ms = localized(localizer, scene, n, effort, seed)
+            if posterior is None:
+                out.append(FusedOutcome(number, n, -np.inf, 0.0, 1.0, np.inf, np.inf, np.inf, np.inf, 0.0, True, ms))
                 continue
-            ms = 1e3 * (time.perf_counter() - began)
-            modes = posterior.modes(MODES)
-            T, poses = scene.T_world_object, np.array([mode.T for mode in modes]).reshape(-1, 4, 4)
-            mean = 1e3 * distance.mean(T, poses)
+            T = scene.T_world_object
+            found = assess(posterior, T, MODES, distance)
             out.append(
                 FusedOutcome(
                     scene=number,
                     sensors=n,
-                    gain=float(posterior.log_density(T)),
-                    claimed=-float(posterior.entropy_nats),
-                    level=float(posterior.credible_level(T)),
-                    mssd_mm=float(1e3 * mssd(T, poses[:1], localizer.mesh)[0]),
-                    add_mm=float(mean[0]),
-                    add_s_mm=float(1e3 * add_s(T, poses[:1], points)[0]),
-                    add10_mm=float(mean.min()),
-                    probability=modes[0].probability,
+                    gain=found.gain,
+                    claimed=found.expected_gain,
+                    level=found.level,
+                    mssd_mm=float(1e3 * found.mssd[0]),
+                    add_mm=float(1e3 * found.mean[0]),
+                    add_s_mm=float(1e3 * add_s(T, found.poses[:1], points)[0]),
+                    add10_mm=float(1e3 * found.mean.min()),
+                    probability=found.probability,
                     warned=posterior.diagnostics.disagrees,
                     ms=ms,
                 )

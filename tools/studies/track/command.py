@@ -32,13 +32,13 @@ def judge_track(
 
     Prints gain, coverage and how often each loses the part, and writes them and every trajectory to --out.
     """
+    from geomtact.evaluation import describe
     from geomtact.json_values import plain
-    from tools.studies.common import study
     from tools.studies.track import study as track_study
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir):
-        settings = study.describe(localizer) | {
+        settings = describe(localizer) | {
             "trajectories": trajectories,
             "frames": track_study.FRAMES,
             "filter": track_study.settings(),

@@ -28,15 +28,15 @@ def judge_triplets(
 
     Prints position errors, gain and coverage for each number of touches, and writes them and every outcome to --out.
     """
+    from geomtact.evaluation import describe
     from geomtact.json_values import plain
-    from tools.studies.common import study
     from tools.studies.triplets import study as triplets
 
     content = study_file.load(out, SCHEMA)
     read = triplets.read_triplets(folder, seed)
     prepared = study_options.localizers(list(read), "m", triplets.SENSOR, cache_dir, max_poses)
     for (mesh, some), localizer in zip(read.items(), prepared, strict=True):
-        settings = study.describe(localizer) | {"effort": effort.value, "seed": seed}
+        settings = describe(localizer) | {"effort": effort.value, "seed": seed}
         done = study_file.earlier(content["parts"].get(mesh.stem), settings, triplets.Outcome)
         each = 1 + 3 * len(triplets.SHOWN)
         with progress_bar(f"localizing {mesh.stem}") as progress:
