@@ -259,21 +259,32 @@ def test_by_default_all_scores_are_judged_on_the_thesis_parts():
     assert sort_words(["iou", "head"], ["l1"]) == (["head"], ["l1", "iou"])
 
 
-def test_the_stopwatch_gives_time_to_the_step_that_reports(monkeypatch):
-    now = iter([0.0, 2.0, 5.0, 6.0, 10.0])
+def test_a_step_is_timed_by_itself_and_one_from_the_cache_is_not(monkeypatch):
+    now = iter([0.0, 2.0, 5.0, 9.0])
     monkeypatch.setattr(scores.time, "perf_counter", lambda: next(now))
-    told = []
-    watch = scores.Stopwatch(lambda done, step: told.append(step))
-    for step in ("describing a", "calibrating", "describing b"):
-        watch(0.5, step)
-    assert told == ["describing a", "calibrating", "describing b"]
-    assert watch.of("describing") == 3 and watch.of("calibrating") == 3 and watch.total() == 10
+    heard = []
+
+    def work(report):
+        report(0.5, "half")
+        return "made"
+
+    assert scores.timed(work, lambda done, doing: heard.append((done, doing))) == ("made", 2.0)
+    assert heard == [(0.5, "half")]
+    assert scores.timed(lambda report: "read") == ("read", None)
 
 
 def test_what_the_cache_held_is_not_timed(whole, folder):
     mesh, sensor = load_mesh("ball"), Sensor.load("gelsight-mini")
-    _, seconds = scores.prepare(mesh, sensor, "iou", 3000, folder / "cache")
-    assert seconds == {"index": None, "describe": 0.0, "calibrate": None}
+    _, times = scores.prepare(mesh, sensor, "iou", 3000, folder / "cache")
+    assert times == scores.PrepareTimes(index=None, describe=0.0, calibrate=None)
+
+
+def test_a_score_that_compares_vectors_is_timed_step_by_step(evaluate, tmp_path, monkeypatch):
+    monkeypatch.setattr(fitted, "TOUCHES", 40)
+    mesh, sensor = load_mesh("ball"), Sensor.load("gelsight-mini")
+    first, again = (scores.prepare(mesh, sensor, "encoder", 3000, tmp_path)[1] for _ in range(2))
+    assert min(first.index, first.describe, first.calibrate) > 0
+    assert again == scores.PrepareTimes(None, None, None)
 
 
 def test_the_picture_is_drawn_from_the_file_alone(whole):

@@ -61,6 +61,11 @@ def descriptor_of(name: str, index: Index) -> tuple[Descriptor, type[VectorScore
     return Tower(load_weights(path), cell_size(index.sensor, index.resolution.step, swing)), EncoderScorer
 
 
+def vectors_file(folder: Path, descriptor: Descriptor) -> Path:
+    """Where the vectors that a descriptor makes of an index lie, whose cache entry is ``folder``."""
+    return folder / f"{descriptor.name}-{fingerprint(descriptor)}.npy"
+
+
 def _check_whose(path: Path, metadata: dict[str, str], index: Index) -> None:
     for what, given in (("part", index.mesh), ("sensor", index.sensor)):
         if metadata.get(f"{what}_sha256", given.sha256) != given.sha256:

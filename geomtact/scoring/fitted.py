@@ -26,6 +26,7 @@ from geomtact.scoring.catalogue import (
     check_name,
     descriptor_of,
     fingerprint,
+    vectors_file,
     vectors_name,
 )
 from geomtact.scoring.encoder import EncoderScorer
@@ -129,7 +130,7 @@ def fitted_scorer(
     if found is not None:
         descriptor, compared = found
         label = f"{Path(name).name}-{fingerprint(descriptor)}"
-        path = None if folder is None else folder / f"{descriptor.name}-{fingerprint(descriptor)}.npy"
+        path = None if folder is None else vectors_file(folder, descriptor)
         scorers[vectors_name(name)] = compared(descriptor, describe_index(index, descriptor, path, progress))
     path = None if folder is None else folder / f"{label}.json"
     fitted = _fitted_before(name, path, scorers, index)

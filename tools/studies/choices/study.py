@@ -178,14 +178,15 @@ def prepare(
     approach = None if way.cone is None else [(upwards(mesh), way.cone)]
     if not way.quotient:
         mesh = replace(mesh, symmetry=Symmetry("none", np.eye(4)[None], None, mesh.centre))
-    localizer, seconds = scores.prepare(mesh, sensor, way.scorer, way.max_poses, cache_dir, progress, approach)
+    localizer, times = scores.prepare(mesh, sensor, way.scorer, way.max_poses, cache_dir, progress, approach)
     if (way.noise, way.elastic) != (CALIBRATION_NOISE, None):
         fitted = localizer.scorer
         touches = simulate_touches(localizer.index, TOUCHES, SEED, progress, way.elastic, way.noise)
         calibration = fit_calibration(fitted.scorer, localizer.index, touches)
         localizer = replace(localizer, scorer=replace(fitted, calibration=calibration, cascade=None))
-    known = [s for s in seconds.values() if s is not None]
-    return localizer, sum(known) if len(known) == len(seconds) else None
+    steps = (times.index, times.describe, times.calibrate)
+    known = [s for s in steps if s is not None]
+    return localizer, sum(known) if len(known) == len(steps) else None
 
 
 def make(kind: str, localizer: Localizer, n: int, seed: int) -> list[Scene]:

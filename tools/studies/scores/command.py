@@ -182,12 +182,12 @@ def _judge(
     # the name of an effort stands for the default score at that effort
     scorer, effort = (DEFAULT_SCORER, name) if name in EFFORTS else (name, options.effort)
     with progress_bar(f"preparing {mesh.name}, {name}") as progress:
-        localizer, seconds = scores.prepare(mesh, options.sensor, scorer, options.max_poses, cache_dir, progress)
+        localizer, times = scores.prepare(mesh, options.sensor, scorer, options.max_poses, cache_dir, progress)
     described = plain(describe(localizer))
     found = part["scores"].get(name)
     outcomes = study_file.earlier(found, described, scores.Scored)
     known = {**(found["prepare_s"] if found else {}), "index": part["index_s"]}
-    seconds = {step: known.get(step) if s is None else s for step, s in seconds.items()}
+    seconds = {step: known.get(step) if s is None else s for step, s in asdict(times).items()}
     part["index_s"] = seconds["index"]
     part["random_add_mm"] = part["random_add_mm"] or study.expected_random_add(localizer)
 

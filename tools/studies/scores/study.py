@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from geomtact.contact_space.index import Index
-from geomtact.contact_space.store import open_index
+from geomtact.contact_space.store import default_cache_dir, open_index
 from geomtact.contact_space.touches import Touch
 from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
-from geomtact.scoring.catalogue import PIXELWISE
+from geomtact.scoring.catalogue import PIXELWISE, descriptor_of, vectors_file
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.product import Product
 from geomtact.scoring.protocol import Scorer
-from geomtact.scoring.vectors import VectorScorer
+from geomtact.scoring.vectors import VectorScorer, describe_index
 from geomtact.sensing.sensor import Sensor
 from tools.studies.common import study
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -33,30 +35,28 @@ class Scored(study.Outcome):
     score_ms: float
 
 
-class Stopwatch:
-    """A progress callback that adds up the seconds of each step and passes the report on.
+@dataclass(frozen=True)
+class PrepareTimes:
+    """Seconds that building the index, describing its contacts and calibrating the score took; None where the cache held it."""
 
-    A step reports when some of it is done, so the time since the report before belongs to the step that is named.
-    """
+    index: float | None
+    describe: float | None
+    calibrate: float | None
 
-    def __init__(self, progress: Progress | None = None):
-        self.seconds: dict[str, float] = {}
-        self._progress = progress
-        self._began = self._last = time.perf_counter()
 
-    def __call__(self, done: float, step: str = "") -> None:
-        now = time.perf_counter()
-        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
-        self._last = now
-        if self._progress:
-            self._progress(done, step)
+def timed(step: Callable[[Progress], _T], progress: Progress | None = None) -> tuple[_T, float | None]:
+    """What ``step`` makes, and the seconds that it took; None where it reports no progress, for then the cache held it."""
+    reported = False
 
-    def total(self) -> float:
-        return time.perf_counter() - self._began
+    def report(done: float, doing: str) -> None:
+        nonlocal reported
+        reported = True
+        if progress:
+            progress(done, doing)
 
-    def of(self, start: str) -> float:
-        """Seconds of all steps whose name starts so."""
-        return sum((seconds for step, seconds in self.seconds.items() if step.startswith(start)), 0.0)
+    began = time.perf_counter()
+    made = step(report)
+    return made, time.perf_counter() - began if reported else None
 
 
 def prepare(
@@ -67,23 +67,23 @@ def prepare(
     cache_dir: Path | None,
     progress: Progress | None = None,
     approach: Approach | None = None,
-) -> tuple[Localizer, dict[str, float | None]]:
-    """A localizer with ``scorer``, and the seconds that building the index, describing its contacts and calibrating the
-    score took; None for what was read from the cache."""
-    watch = Stopwatch(progress)
-    open_index(mesh, sensor, approach, max_poses, cache_dir, watch)
-    index_s = watch.total() if watch.seconds else None
-    watch = Stopwatch(progress)
-    localizer = Localizer.prepare(
-        mesh, None, sensor, approach, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir, progress=watch
+) -> tuple[Localizer, PrepareTimes]:
+    """A localizer with ``scorer``, and the time that each step took."""
+    folder = cache_dir or default_cache_dir()
+    index, index_s = timed(lambda report: open_index(mesh, sensor, approach, max_poses, folder, report), progress)
+    found = descriptor_of(scorer, index)
+    describe_s: float | None = 0.0  # of a score that compares no vectors
+    if found is not None:
+        descriptor, _ = found
+        path = vectors_file(folder / index.key, descriptor)
+        _, describe_s = timed(lambda report: describe_index(index, descriptor, path, report), progress)
+    localizer, calibrate_s = timed(
+        lambda report: Localizer.prepare(
+            mesh, None, sensor, approach, scorer=scorer, max_poses=max_poses, cache_dir=folder, progress=report
+        ),
+        progress,
     )
-    described = watch.of("describing")
-    stores = isinstance(localizer.scorer.scorer, VectorScorer) or localizer.scorer.cascade is not None
-    return localizer, {
-        "index": index_s,
-        "describe": None if stores and not described else described,
-        "calibrate": watch.of("simulating") + watch.of("calibrating") if watch.of("calibrating") else None,
-    }
+    return localizer, PrepareTimes(index_s, describe_s, calibrate_s)
 
 
 def bytes_read(localizer: Localizer, effort: str) -> float:
