@@ -18,6 +18,7 @@ from geomtact.cli.options import approach_from
 from geomtact.errors import CacheError, InputError, UsageError
 from tools.studies.__main__ import COMMANDS
 from tools.studies.__main__ import app as studies
+from tools.studies.__main__ import main as run_study
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +103,26 @@ def test_usage_errors_are_told_in_one_line(args, said, monkeypatch, capsys):
     told = capsys.readouterr()
     assert stopped.value.code == 2 and told.out == ""
     assert told.err.startswith("error: ") and told.err.count("\n") == 1 and said.lower() in told.err.lower()
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["scores", "--effort", "best"], "'balanced'"),
+        (["score"], "did you mean 'scores'?"),
+        (["localize"], "missing argument 'OBJECT...'"),
+        (["localize", "--nope"], "no such option: --nope"),
+        (["touches", "--touches", "0"], "'--touches'"),
+        (["touches", "--out", ""], "after --out"),
+    ],
+)
+def test_usage_errors_of_studies_are_one_line(args, said, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["python -m tools.studies", *args])
+    with pytest.raises(SystemExit) as stopped:
+        run_study()
+    printed = capsys.readouterr()
+    assert stopped.value.code == 2 and printed.out == ""
+    assert printed.err.startswith("error: ") and printed.err.count("\n") == 1 and said.lower() in printed.err.lower()
 
 
 def test_the_command_exits_with_the_status_of_what_it_did(monkeypatch, capsys):
