@@ -256,7 +256,7 @@ def sweeps(content):
         yield [f"`{name}`", KEPT, told, promised]
 
 
-def expected(touches, triplets, readings):
+def expected(touches, triplets):
     def over(sensors, key, form="{:.1f}", scale=1.0):
         values = [
             scale * f[key] for part in touches["parts"].values() for f in part["figures"] if f["sensors"] == sensors
@@ -272,14 +272,10 @@ def expected(touches, triplets, readings):
     first = f"another simulator's images, {len(triplets['parts'])} objects"
     length, ms = f["add_s_mm_quartiles"][1], f["ms_quartiles"][1]
     yield [first, "3", f"{f['gain_mean']:.1f}", f"{length:.1f}", "", f"{1e-3 * ms:.1f}"]
-    balls = readings["parts"]["balls, parallel rays"]["figures"]
-    low, high = sorted(f"{f['off_mm_median']:.2f}" for f in balls)
-    first = f"real images, {sum(f['whole'] for f in balls)} presses of {len(balls)} balls"
-    yield [first, "1", "", f"{low} to {high}", "", ""]
 
 
 TABLES = [
-    ("README", "| images |", expected, "touches", "triplets", "readings"),
+    ("README", "| images |", expected, "touches", "triplets"),
     ("readings", "| set |", contacts, "readings"),
     ("readings", "| camera |", balls, "readings"),
     *(("no-more-than-needed", f"The {PARTS[part]}:", partial(modelled, part), "choices") for part in PARTS),
