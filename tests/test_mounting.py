@@ -285,8 +285,8 @@ def test_a_camera_of_another_size_is_refused_before_anything_is_prepared(monkeyp
         assert result.exit_code == 3 and "expected 240 x 320 px for sensor digit" in " ".join(result.output.split())
     result = CliRunner().invoke(app, [*localize, "digit.avi", *part])
     assert isinstance(result.exception, Prepared)
-    said = "320 x 240 px are turned by 90 degrees counter-clockwise, as the driver of digit does"
-    assert said in " ".join(result.output.split())
+    warning = "turning 320 x 240 px by 90 degrees counter-clockwise, as the driver of digit does"
+    assert warning in " ".join(result.output.split())
     result = CliRunner().invoke(app, [*localize, "digit.avi", *part, "--rotate", "45"])
     assert result.exit_code == 2 and "expected 0, 90, 180 or 270 degrees" in " ".join(result.output.split())
 

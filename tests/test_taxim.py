@@ -74,7 +74,7 @@ def test_the_command_makes_a_sensor_of_a_table(table, tmp_path):
     sensor = Sensor.load(tmp_path / "mine.toml")
     assert sensor.image_size_px == SHAPE[::-1] and sensor.colour is not None
     assert "has no pitch" in run().output
-    assert "stands alone" in run("--ball-mm", 6).output
+    assert "needs no presses" in run("--ball-mm", 6).output
     assert "the background 80 x 60" in run("--sensor", "digit").output
     (tmp_path / "polycalib.npz").write_bytes(b"no table")
     assert run("--pitch-mm", 0.1, 0.1).exit_code == 3
