@@ -16,6 +16,7 @@ from geomtact import load_mesh, se3
 from geomtact.cli import app, main, project
 from geomtact.cli.options import approach_from
 from geomtact.errors import CacheError, InputError, UsageError
+from geomtact.sensing import reading
 from tools.studies.__main__ import COMMANDS
 from tools.studies.__main__ import app as studies
 from tools.studies.__main__ import main as run_study
@@ -300,6 +301,21 @@ def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touch
     geomtact("cache", "--clear", "--limit-gb", 1, status=2)
 
 
+def test_localize_reads_each_image_once(geomtact, touched, tmp_path, monkeypatch):
+    """For one sensor and for two, though a bad image is reported before an index is prepared."""
+    opened, read_image = [], reading.read_image
+    monkeypatch.setattr(reading, "read_image", lambda path: opened.append(path.name) or read_image(path))
+    geomtact("localize", touched / "ball_1.png", "--effort", "fast")
+    assert opened == ["ball_1.png"]
+    opened.clear()
+    at = [json.loads((touched / f"ball_{k}.json").read_text())["T_sensor_object"] for k in (1, 2)]
+    content = {"T_world_sensor": [np.linalg.inv(T).tolist() for T in at]}
+    (tmp_path / "poses.json").write_text(json.dumps(content))
+    both = [touched / f"ball_{k}.png" for k in (1, 2)]
+    geomtact("localize", *both, "--sensor-poses", "poses.json", "--effort", "fast")
+    assert opened == ["ball_1.png", "ball_2.png"]
+
+
 def test_images_and_folders_of_any_name_serve(geomtact, touched, tmp_path):
     name = os.fsdecode(b"t\xfcr")
     image = shutil.copy(touched / "ball_1.png", tmp_path / f"{name}.png")
@@ -423,13 +439,17 @@ def test_interrupt_exits_130_without_a_traceback():
 
 def test_each_image_may_have_a_background_of_its_own(tmp_path, monkeypatch, rng):
     monkeypatch.chdir(tmp_path)
-    given = {}
+    read_observation, given = reading.read_observation, []
 
-    def noted(*_, **options):
-        given.update(options)
+    def noted(image, sensor, kind, background):
+        given.append((image.name, background))
+        return read_observation(image, sensor, kind, background)
+
+    def refused(*_, **__):
         raise InputError("far enough")
 
-    monkeypatch.setattr("geomtact.identification.identify", noted)
+    monkeypatch.setattr(reading, "read_observation", noted)
+    monkeypatch.setattr("geomtact.identification.identify", refused)
     for name in ("a", "b", "rest_a", "rest_b"):
         Image.fromarray(rng.integers(100, 110, (320, 427, 3)).astype(np.uint8)).save(f"{name}.png")
     (tmp_path / "poses.json").write_text(
@@ -438,9 +458,9 @@ def test_each_image_may_have_a_background_of_its_own(tmp_path, monkeypatch, rng)
     run = ["localize", "a.png", "b.png", "--object", "ball", "--sensor", "gelslim", "--sensor-poses", "poses.json"]
     both = ["--background", "rest_a.png", "--background", "rest_b.png"]
     assert "far enough" in CliRunner().invoke(app, [*run, *both]).output
-    assert given["background"] == ["rest_a.png", "rest_b.png"]
+    assert given == [("a.png", "rest_a.png"), ("b.png", "rest_b.png")]
     CliRunner().invoke(app, [*run, *both[:2]])
-    assert given["background"] == "rest_a.png"
+    assert given[2:] == [("a.png", "rest_a.png"), ("b.png", "rest_a.png")]
     refused = CliRunner().invoke(app, [*run, *both, *both[:2]])
     assert refused.exit_code == 2 and "expected one, or one for each of 2 images, got 3" in " ".join(
         refused.output.split()

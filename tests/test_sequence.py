@@ -6,6 +6,7 @@ import io
 import json
 import re
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.distribution import cell_log_density
 from geomtact.inference.motion import GaussianTwist, UniformBall
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
+from geomtact.sensing import reading
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.reading import write_image
 from tools.studies.track import study as track_study
@@ -423,6 +425,17 @@ def test_track_prints_a_line_a_frame(command, folder, flat_nut, creeping):
     np.testing.assert_allclose(written[:, 4:], [line["quat_xyzw"] for line in lines], atol=1e-8)
     names = "".join(f"{folder / name}.png\n" for name in ("f_2", "f_9", "f_10"))
     assert command("-", input=names).stdout.splitlines() == command(folder).stdout.splitlines()
+
+
+def test_track_reads_each_image_once(command, folder, monkeypatch):
+    """The first one too, which is checked before the index is prepared."""
+    opened = []
+    read_image = reading.read_image
+    monkeypatch.setattr(reading, "read_image", lambda path: opened.append(Path(path).stem) or read_image(path))
+    for options in ((), ("--sensor", "gelsight-mini"), ("--sensor", "gelsight-mini", "--skip-broken")):
+        opened.clear()
+        command(folder, *options)
+        assert opened == ["f_2", "f_9", "f_10"]
 
 
 def test_track_writes_a_page_that_plays_the_sequence(command, folder):

@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ class Frame:
 
     Attributes
     ----------
-    image : path, or (H, W, 3) RGB
+    image : path, (H, W, 3) RGB, or the Observation that it was read as
     time : [s] of a video, or since 1970 from a camera; None where the source has none
     skipped : images that came since the one before, and are not given
     """
@@ -44,13 +44,13 @@ def all_frames(
     source: str,
     follow: bool = False,
     sensor: Sensor | None = None,
-    check: Callable[[Any], None] = lambda image: None,
+    read: Callable[[Any], Any] = lambda image: image,
     masks: bool = False,
 ) -> Iterator[Frame]:
     """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
 
-    ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`; ``check`` is given the first image
-    of a folder or a video; ``masks`` says that a video is of contact masks: what is over half bright in it counts as contact.
+    ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`; ``read`` reads the first image of
+    a folder or a video at once, so that a bad one is reported early; ``masks`` says that a video is of contact masks: what is over half bright in it counts as contact.
     Names that leave the order of a folder's images open bring a warning.
 
     Raises
@@ -67,9 +67,11 @@ def all_frames(
             raise InputError(f"{path}: no image in this folder; expected {', '.join(_IMAGES)}")
         if (open_question := doubt(images)) is not None:
             tell(f"warning: {path}: {open_question}")
-        if images:
-            check(str(images[0]))
-        return _followed(path) if follow else (Frame(str(image)) for image in images)
+        frames = _followed(path) if follow else (Frame(str(image)) for image in images)
+        if not images:
+            return frames
+        first, image = str(images[0]), read(str(images[0]))
+        return (Frame(image) if frame.image == first else frame for frame in frames)
     if path.is_char_device() or (source.isdigit() and not path.exists()):
         return camera_frames(source, sensor)
     if not path.is_file():
@@ -79,11 +81,10 @@ def all_frames(
     if path.suffix.lower() in _IMAGES:
         raise UsageError(f"{path}: is one image; give its folder, or use 'geomtact localize'")
     frames = _filmed(path, masks)
-    first = next(frames, None)
-    if first is None:
+    start = next(frames, None)
+    if start is None:
         raise InputError(f"{path}: no image in this video; give another, or a folder of images")
-    check(first.image)
-    return chain([first], frames)
+    return chain([replace(start, image=read(start.image))], frames)
 
 
 def listed(folder: Path) -> list[Path]:

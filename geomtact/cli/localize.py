@@ -155,14 +155,14 @@ def localize(
     sensors = placed.sensor if placed is not None and placed.sensor else [request.values["sensor"]] * len(images)
     several = background if background and len(background) > 1 else None
     backgrounds = [str(each) for each in several] if several else request.values["background"]
-    found, took = _identified(request, images, sensors, backgrounds, objects, placed)
+    found, timing_ms = _identified(request, images, sensors, backgrounds, objects, placed)
     for image, made, used in zip(images, metadata, sensors, strict=True):
         _warn_of_metadata(image, made, objects[0] if len(objects) == 1 else None, used)
     if len(objects) > 1 and found.foreign:
         tell("warning: the contact is out-of-distribution for every candidate: it may be of another object")
     for warning in found.posterior.warnings:
         tell(f"warning: {warning}")
-    give(request, images, found, took, out, reports, as_json)
+    give(request, images, found, timing_ms, out, reports, as_json)
     if not found.posterior.contact:
         tell(without_contact(request, len(images), found.posterior.provenance.views[0].kind))
         raise typer.Exit(NO_CONTACT)
@@ -187,44 +187,45 @@ def _identified(
     backgrounds: list[str] | str | None,
     objects: Sequence[str | None],
     placed: SensorPoses | None,
-) -> tuple[Identification, float]:
-    """The object, of ``objects``, and its posterior, and how long indexes took to prepare or read [ms].
+) -> tuple[Identification, dict[str, float]]:
+    """The object, of ``objects``, and its posterior; and the time to read the images and to prepare the indexes [ms].
 
-    ``sensors`` has one for each image; ``backgrounds`` too, or one for all.
+    ``sensors`` has one for each image; ``backgrounds`` too, or one for all. Each image is read once.
     """
     from geomtact.cli.parts import units_of
     from geomtact.identification import identify
     from geomtact.sensing.reading import read_observation
 
     each = backgrounds if isinstance(backgrounds, list) else [backgrounds] * len(images)
-    for image, sensor, background in zip(images, sensors, each, strict=True):
-        if (gel := request.mounted(sensor)) is not None:
-            # a bad image is reported before minutes go into an index
-            read_observation(image, gel, request.kind, background)
+    began = time.perf_counter()
+    # a bad image is reported before minutes go into an index, and a missing sensor by opening the index
+    observations = [
+        read_observation(image, gel, request.kind, background)
+        for image, sensor, background in zip(images, sensors, each, strict=True)
+        if (gel := request.mounted(sensor)) is not None
+    ]
+    timing_ms = {"read": 1e3 * (time.perf_counter() - began), "prepare": 0.0}
     frame = "sensor" if placed is None else "world"
-    took, units = 0.0, dict(zip(objects, units_of(objects, request.values["unit"]), strict=True))
+    units = dict(zip(objects, units_of(objects, request.values["unit"]), strict=True))
 
     def opened(name: str | None) -> Localizer:
-        nonlocal took
         began = time.perf_counter()
         own, announce = {"object": name, "unit": units[name]}, name == objects[0]
         on = {s: request.open({**own, "sensor": s}, frame, announce=announce) for s in dict.fromkeys(sensors)}
-        took += 1e3 * (time.perf_counter() - began)
+        timing_ms["prepare"] += 1e3 * (time.perf_counter() - began)
         first, *others = (on[sensor] for sensor in sensors)
         return replace(first, others=tuple(others)) if len(on) > 1 else first
 
     found = identify(
         map(opened, objects),
-        [str(image) for image in images],
-        kind=request.kind,
-        background=backgrounds,
+        observations,
         T_world_sensor=None if placed is None else placed.T_world_sensor,
         prior=request.prior,
         effort=request.effort,
         seed=request.seed,
         extrinsics_std=None if placed is None else placed.extrinsics_std,
     )
-    return found, took
+    return found, timing_ms
 
 
 def _warn_of_metadata(image: Path, metadata: Mapping[str, Any], name: str | None, sensor: str | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,19 +25,19 @@ def give(
     request: Request,
     images: Sequence[Path],
     found: Identification,
-    took: float,
+    timing_ms: Mapping[str, float],
     out: Path | None,
     reports: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Print what was found, after indexes ``took`` so long [ms], and write it into ``out``."""
+    """Print what was found, after stages that took ``timing_ms``, and write it into ``out``."""
     from geomtact.json_values import to_text
     from geomtact.report.result import result
 
     posterior = found.posterior
     began = time.perf_counter()
     modes = posterior.modes(MODES)
-    timing = {"prepare": took, "modes": 1e3 * (time.perf_counter() - began)}
+    timing = {**timing_ms, "modes": 1e3 * (time.perf_counter() - began)}
     settings = {
         "image": str(images[0]) if len(images) == 1 else [str(image) for image in images],
         "kind": request.kind,

@@ -159,11 +159,12 @@ def open_track(
     request = Request.of(given, _metadata(source), **options)
     sensor, background = request.mounted(), request.values["background"]
 
-    def check(image: Any) -> None:
-        if sensor is not None and not skip_broken:
-            read_observation(image, sensor, request.kind, background)
+    def read(image: Any) -> Any:
+        if sensor is None or skip_broken:
+            return image  # opening the index reports a missing sensor; broken images are skipped in their turn
+        return read_observation(image, sensor, request.kind, background)
 
-    frames = all_frames(source, follow, sensor, check, masks=request.kind == Kind.mask.value)
+    frames = all_frames(source, follow, sensor, read, masks=request.kind == Kind.mask.value)
     localizer = request.open()
 
     from geomtact.inference.motion import UniformBall
