@@ -417,12 +417,12 @@ def test_a_mode_that_holds_little_is_not_believed(touch, tmp_path):
 def test_angles_are_drawn_within_their_range():
     from matplotlib.figure import Figure
 
-    from geomtact.report.figure import _marginals
+    from geomtact.report.figure import draw_marginals
 
     turns = np.linspace(-180, 180, 500)
     samples = Samples("turn", turns, np.full(500, 1 / 500), 0.0, 7.0, -180.0, 180.0)
     figure = Figure()
-    _marginals(figure.subfigures(), [samples])
+    draw_marginals(figure.subfigures(), [samples])
     assert figure.axes[0].get_xlim() == (-180, 180)
 
 

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from geomtact.cli import app
 from geomtact.errors import UsageError
 from geomtact.report import viewer
+from geomtact.report.canvas import to_pixels
 from geomtact.report.viewer import Viewer
 from geomtact.se3 import transform
 from geomtact.sensing.reading import write_image
@@ -58,12 +59,12 @@ def test_without_contact_no_part_is_drawn(shown, flat_nut):
 
 def test_images_of_every_kind_can_be_shown():
     mask = np.array([[True, False], [False, False]])
-    assert np.array_equal(viewer._picture(mask)[..., 0], [[255, 0], [0, 0]])
-    assert (viewer._picture(np.ones((2, 2), bool)) == 255).all()
-    assert viewer._picture(np.linspace(0, 1e-3, 6).reshape(2, 3)).shape == (2, 3, 3)
-    assert not viewer._picture(np.zeros((2, 2))).any()
+    assert np.array_equal(to_pixels(mask)[..., 0], [[255, 0], [0, 0]])
+    assert (to_pixels(np.ones((2, 2), bool)) == 255).all()
+    assert to_pixels(np.linspace(0, 1e-3, 6).reshape(2, 3)).shape == (2, 3, 3)
+    assert not to_pixels(np.zeros((2, 2))).any()
     colour = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
-    assert np.array_equal(viewer._picture(colour), colour)
+    assert np.array_equal(to_pixels(colour), colour)
 
 
 def test_without_viser_it_is_said_how_to_get_it(flat_nut, monkeypatch):

@@ -11,7 +11,7 @@ import typer
 
 from geomtact.cli.options import CacheDir, Effort, EffortName, MaxPoses, Seed, SensorName, Unit, check_name
 from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
-from geomtact.cli.project import require, resolve
+from geomtact.cli.project import required, resolve
 from geomtact.cli.request import Request
 from geomtact.cli.shell import check_folder, print_table, progress_bar, tell
 from geomtact.errors import InputError, UsageError
@@ -54,18 +54,17 @@ def evaluate(
     with moderate noise. Several objects are evaluated in parallel, one on each core.
     """
     from geomtact.contact_space.store import default_cache_dir
-    from geomtact.geometry.catalogue import catalogue
     from geomtact.json_values import read_json, to_text
-    from geomtact.sensing.sensor import bundled_sensors
 
     given = {"object": objects[0] if objects else None, "unit": unit, "sensor": sensor, "effort": effort}
     values, sources = resolve(given)
-    objects = objects or [require(values, "object", list(catalogue()), "a mesh file with --unit", "OBJECT")]
+    first, sensor_named = required(values, "OBJECT")
+    objects = objects or [first]
     effort = values["effort"] or Effort.balanced.value
     check_name("effort", effort, Effort, sources.get("effort"))
     check_folder(out)
     options: dict[str, Any] = {
-        "sensor": everywhere(require(values, "sensor", bundled_sensors(), "a TOML file")),
+        "sensor": everywhere(sensor_named),
         "sensors": _numbers(sensors),
         "touches": touches,
         "effort": effort,

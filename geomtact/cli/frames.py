@@ -49,8 +49,9 @@ def all_frames(
 ) -> Iterator[Frame]:
     """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
 
-    ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`; ``read`` reads the first image of
-    a folder or a video at once, so that a bad one is reported early; ``masks`` says that a video is of contact masks: what is over half bright in it counts as contact.
+    ``follow`` waits for more images in a folder; ``sensor`` is as of :func:`camera_frames`; ``read`` reads the first image of a
+    folder or a video at once, so that a bad one is reported early; ``masks`` says that a video is of contact masks: what is over
+    half bright in it counts as contact.
     Names that leave the order of a folder's images open bring a warning.
 
     Raises

@@ -11,23 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.options import (
-    Approaches,
-    CacheDir,
-    EffortName,
-    Kind,
-    KindName,
-    MaxPoses,
-    Mirror,
-    Mounting,
-    Rotate,
-    ScorerName,
-    Seed,
-    SensorName,
-    Unit,
-    approach_from,
-    check_name,
-)
+from geomtact.cli import options
 from geomtact.cli.request import Request
 from geomtact.cli.shell import NO_CONTACT, check_folder, tell
 from geomtact.errors import InputError, UsageError
@@ -60,9 +44,9 @@ def localize(
             help="Object (see 'geomtact objects') or mesh file. For object identification: names with commas, or a folder.",
         ),
     ] = None,
-    unit: Unit = None,
-    sensor: SensorName = None,
-    kind: KindName = Kind.auto.value,
+    unit: options.Unit = None,
+    sensor: options.SensorName = None,
+    kind: options.KindName = options.Kind.auto.value,
     background: Annotated[
         list[Path] | None,
         typer.Option(help="Tactile image of the untouched sensor. Repeat the option to give one for each image."),
@@ -74,12 +58,12 @@ def localize(
         ),
     ] = None,
     prior: Annotated[Path | None, typer.Option(help="Prior: posterior.npz of earlier touches, or its folder.")] = None,
-    approach: Approaches = None,
-    effort: EffortName = None,
-    scorer: ScorerName = None,
-    seed: Seed = 0,
-    rotate: Rotate = None,
-    mirror: Mirror = None,
+    approach: options.Approaches = None,
+    effort: options.EffortName = None,
+    scorer: options.ScorerName = None,
+    seed: options.Seed = 0,
+    rotate: options.Rotate = None,
+    mirror: options.Mirror = None,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -95,8 +79,8 @@ def localize(
         typer.Option(metavar="|".join(Report), help="Report to write into --out, both by default.", show_default=False),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print only result.json to standard output.")] = False,
-    max_poses: MaxPoses = None,
-    cache_dir: CacheDir = None,
+    max_poses: options.MaxPoses = None,
+    cache_dir: options.CacheDir = None,
 ) -> None:
     """Localize an object from one image, or one image per sensor: print the most probable poses and write a report.
 
@@ -132,12 +116,12 @@ def localize(
         metadata[0] if metadata else {},
         kind,
         prior,
-        approach=approach_from(approach),
+        approach=options.approach_from(approach),
         scorer=scorer,
         seed=seed,
         max_poses=max_poses,
         cache_dir=cache_dir,
-        mounting=Mounting(rotate, mirror),
+        mounting=options.Mounting(rotate, mirror),
     )
     objects = parts_of(request.values["object"])
     if len(objects) > 1 and (live or prior is not None):
@@ -172,7 +156,7 @@ def _reports(report: str | None, out: Path | None) -> list[str]:
     """The reports to write into ``out``."""
     if report is None:
         return [kind.value for kind in Report if kind is not Report.none]
-    check_name("report", report, Report)
+    options.check_name("report", report, Report)
     if report == Report.none:
         return []
     if out is None:

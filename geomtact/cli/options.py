@@ -97,6 +97,22 @@ CacheDir = Annotated[
     ),
 ]
 
+MOTION_MM = 8.0  # the thesis's
+Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="DIR|VIDEO|CAMERA|-",
+        help="Folder of images, video, number of a camera, or - for paths on standard input.",
+    ),
+]
+ObjectName = Annotated[str | None, typer.Option("--object", help="Object (see 'geomtact objects') or mesh file.")]
+MotionMm = Annotated[
+    float,
+    typer.Option(min=0.001, max=1000, help="Largest motion between two frames: mean distance of the object's points."),
+]
+Follow = Annotated[bool, typer.Option("--follow", help="Wait for more images in the folder, until Ctrl-C.")]
+SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Skip images that cannot be read.")]
+
 
 def approach_from(sides: list[str] | None) -> list[tuple[list[float], float]] | None:
     """``approach`` of ``Localizer.prepare``, from what ``--approach`` was given.

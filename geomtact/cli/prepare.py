@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from geomtact.cli.options import Approaches, CacheDir, MaxPoses, ScorerName, SensorName, Unit, approach_from
+from geomtact.cli import options
 from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks
-from geomtact.cli.project import require, resolve
+from geomtact.cli.project import required, resolve
 from geomtact.cli.request import Request, warn_of_size
 from geomtact.cli.shell import tell
 from geomtact.errors import UsageError
@@ -23,12 +23,12 @@ def prepare(
         list[str] | None,
         typer.Argument(metavar="OBJECT...", help="Objects (see 'geomtact objects') or mesh files."),
     ] = None,
-    unit: Unit = None,
-    sensor: SensorName = None,
-    approach: Approaches = None,
-    scorer: ScorerName = None,
-    max_poses: MaxPoses = None,
-    cache_dir: CacheDir = None,
+    unit: options.Unit = None,
+    sensor: options.SensorName = None,
+    approach: options.Approaches = None,
+    scorer: options.ScorerName = None,
+    max_poses: options.MaxPoses = None,
+    cache_dir: options.CacheDir = None,
     jobs: Jobs = None,
     ray: Ray = None,
 ) -> None:
@@ -42,7 +42,7 @@ def prepare(
     given = {"object": objects[0] if objects else None, "unit": unit, "sensor": sensor}
     values, sources = resolve(given)
     began = time.perf_counter()
-    sides = approach_from(approach)
+    sides = options.approach_from(approach)
     request = Request(values, sources, approach=sides, scorer=scorer, max_poses=max_poses, cache_dir=cache_dir)
     if jobs is not None or ray is not None or (objects is not None and len(objects) > 1):
         if sides:
@@ -66,22 +66,19 @@ def _prepare_all(objects: list[str] | None, request: Request, jobs: int | None, 
     from geomtact.batch import prepare_part
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.contact_space.store import DEFAULT_LIMIT, cache_entries, default_cache_dir
-    from geomtact.geometry.catalogue import catalogue
     from geomtact.scoring.catalogue import DEFAULT_SCORER, check_name
-    from geomtact.sensing.sensor import Sensor, bundled_sensors
+    from geomtact.sensing.sensor import Sensor
 
-    values = request.values
-    objects = objects or [require(values, "object", list(catalogue()), "a mesh file with --unit", "OBJECT")]
-    gel = Sensor.load(require(values, "sensor", bundled_sensors(), "a TOML file"))
-    for key, source in request.sources.items():
-        tell(f"{key}: {values[key]} (from {source})")
+    first, sensor = required(request.values, "OBJECT")
+    objects, unit, gel = objects or [first], request.values["unit"], Sensor.load(sensor)
+    request.announce()
     scorer = request.scorer or DEFAULT_SCORER
     check_name(scorer)
-    _warn_of_first_size(objects, values["unit"], gel)
+    _warn_of_first_size(objects, unit, gel)
     # named, so that what is prepared first is not removed to make room for the last
     folder = (request.cache_dir or default_cache_dir()).absolute()
     how = (gel, everywhere(scorer), request.max_poses or MAX_POSES, folder)
-    tasks = [(*part, *how) for part in parts_of_tasks(objects, values["unit"])]
+    tasks = [(*part, *how) for part in parts_of_tasks(objects, unit)]
     try:
         do_all(prepare_part, tasks, [f"{part} on {gel.name}" for part in objects], "prepared", jobs, ray)
     finally:

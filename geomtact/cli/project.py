@@ -52,22 +52,27 @@ def resolve(
     return values, sources
 
 
-def require(
-    values: Mapping[str, str | None], option: str, choices: list[str], other: str, given: str | None = None
-) -> str:
-    """``values[option]``, or an error that names the option, or how else it is ``given``, and lists the choices.
+def required(values: Mapping[str, str | None], object_given: str | None = None) -> tuple[str, str]:
+    """The object and the sensor; ``object_given`` is how the command line names the object, if not by --object.
 
     Raises
     ------
     UsageError
+        One is missing; its choices are listed.
     """
-    value = values.get(option)
-    if value is None:
+    from geomtact.geometry.catalogue import catalogue
+    from geomtact.sensing.sensor import bundled_sensors
+
+    object_name, sensor = values.get("object"), values.get("sensor")
+    if object_name is None or sensor is None:
+        missing, given, choices, other = "sensor", "--sensor NAME", bundled_sensors(), "a TOML file"
+        if object_name is None:
+            missing, given = "object", object_given or "--object NAME"
+            choices, other = list(catalogue()), "a mesh file with --unit"
         raise UsageError(
-            f"no {option} given; give {given or f'--{option} NAME'}, one of {', '.join(choices)}; or {other}; or set "
-            f"{option} in {FILE}"
+            f"no {missing} given; give {given}, one of {', '.join(choices)}; or {other}; or set {missing} in {FILE}"
         )
-    return value
+    return object_name, sensor
 
 
 def find(start: Path) -> Path | None:

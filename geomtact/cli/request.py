@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from geomtact.cli.options import Effort, Kind, Mounting, check_name
-from geomtact.cli.project import require, resolve
+from geomtact.cli.project import required, resolve
 from geomtact.cli.shell import posterior_file, progress_bar, tell
 
 if TYPE_CHECKING:
@@ -73,6 +73,11 @@ class Request:
         """The effort, balanced where none is given."""
         return self.values["effort"] or Effort.balanced.value
 
+    def announce(self) -> None:
+        """Print where values come from that the command line did not give."""
+        for key, source in self.sources.items():
+            tell(f"{key}: {self.values[key]} (from {source})")
+
     def mounted(self, sensor: str | None = None) -> Sensor | None:
         """``sensor``, else the one asked for, mounted as the command line says; None where none is given."""
         name = sensor or self.values["sensor"]
@@ -101,14 +106,10 @@ class Request:
             The object or the sensor is missing.
         InputError, MeshError, SensorError
         """
-        from geomtact.geometry.catalogue import catalogue
-        from geomtact.sensing.sensor import bundled_sensors
-
         values = {**self.values, **(own or {})}
-        object_name = require(values, "object", list(catalogue()), "a mesh file with --unit", argument)
-        sensor = require(values, "sensor", bundled_sensors(), "a TOML file")
-        for key, source in self.sources.items() if announce else ():
-            tell(f"{key}: {self.values[key]} (from {source})")
+        object_name, sensor = required(values, argument)
+        if announce:
+            self.announce()
 
         from geomtact.contact_space.resolution import MAX_POSES
         from geomtact.geometry.mesh_file import load_mesh

@@ -56,19 +56,17 @@ def simulate(
 
     The images carry object and sensor in their metadata, so 'geomtact localize OBJECT_1.png' needs no options.
     """
-    from geomtact.cli.project import require, resolve
+    from geomtact.cli.project import required, resolve
     from geomtact.contact_space.space import ContactSpace
-    from geomtact.geometry.catalogue import catalogue
     from geomtact.geometry.mesh_file import load_mesh
     from geomtact.sensing import noise as noises
-    from geomtact.sensing.sensor import Sensor, bundled_sensors
+    from geomtact.sensing.sensor import Sensor
 
     check_folder(out)
     if pose is not None and n is not None:
         raise UsageError("--pose simulates one touch, --n touches at random poses; give one of them")
     values, _ = resolve({"object": object_name, "unit": unit, "sensor": sensor})
-    named = require(values, "object", list(catalogue()), "a mesh file with --unit", "OBJECT")
-    sensor_named = require(values, "sensor", bundled_sensors(), "a TOML file")
+    named, sensor_named = required(values, "OBJECT")
     pressed = Sensor.load(sensor_named)
     mesh = load_mesh(named, values["unit"], sensor=pressed)
     for warning in mesh.warnings:

@@ -9,22 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from geomtact.cli import options
 from geomtact.cli.frames import Frame, all_frames, listed
-from geomtact.cli.options import (
-    Background,
-    CacheDir,
-    EffortName,
-    Kind,
-    KindName,
-    MaxPoses,
-    Mirror,
-    Mounting,
-    Rotate,
-    ScorerName,
-    Seed,
-    SensorName,
-    Unit,
-)
 from geomtact.cli.request import Request
 from geomtact.cli.shell import NO_CONTACT, check_file, tell
 from geomtact.errors import InputError, UsageError
@@ -35,52 +21,34 @@ if TYPE_CHECKING:
     from geomtact.localizer import Localizer
 
 
-Source = Annotated[
-    str,
-    typer.Argument(
-        metavar="DIR|VIDEO|CAMERA|-",
-        help="Folder of images, video, number of a camera, or - for paths on standard input.",
-    ),
-]
-ObjectName = Annotated[str | None, typer.Option("--object", help="Object (see 'geomtact objects') or mesh file.")]
-MotionMm = Annotated[
-    float,
-    typer.Option(min=0.001, max=1000, help="Largest motion between two frames: mean distance of the object's points."),
-]
-Follow = Annotated[bool, typer.Option("--follow", help="Wait for more images in the folder, until Ctrl-C.")]
-SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Skip images that cannot be read.")]
-MOTION_MM = 8.0  # the thesis's
-UNTOUCHED = "no contact found in any image; give --background, or the kind of the images by --kind"
-
-
 def track(
-    source: Source,
-    object_name: ObjectName = None,
-    unit: Unit = None,
-    sensor: SensorName = None,
-    kind: KindName = Kind.auto.value,
-    background: Background = None,
+    source: options.Source,
+    object_name: options.ObjectName = None,
+    unit: options.Unit = None,
+    sensor: options.SensorName = None,
+    kind: options.KindName = options.Kind.auto.value,
+    background: options.Background = None,
     prior: Annotated[
         Path | None, typer.Option(help="Prior of the first frame: a posterior.npz, or its folder.")
     ] = None,
-    effort: EffortName = None,
-    scorer: ScorerName = None,
-    motion_mm: MotionMm = MOTION_MM,
+    effort: options.EffortName = None,
+    scorer: options.ScorerName = None,
+    motion_mm: options.MotionMm = options.MOTION_MM,
     max_cells: Annotated[
         int | None, typer.Option(min=1, help="Largest number of grid cells kept between frames. Fewer are faster.")
     ] = None,
-    follow: Follow = False,
-    skip_broken: SkipBroken = False,
-    rotate: Rotate = None,
-    mirror: Mirror = None,
+    follow: options.Follow = False,
+    skip_broken: options.SkipBroken = False,
+    rotate: options.Rotate = None,
+    mirror: options.Mirror = None,
     tum: Annotated[
         Path | None, typer.Option(help="Write the first modes as a TUM trajectory: timestamp tx ty tz qx qy qz qw.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML file that plays the sequence.")] = None,
     fps: Annotated[float, typer.Option(min=1e-6, help="Images per second, for the timestamps of a folder.")] = 1.0,
-    seed: Seed = 0,
-    max_poses: MaxPoses = None,
-    cache_dir: CacheDir = None,
+    seed: options.Seed = 0,
+    max_poses: options.MaxPoses = None,
+    cache_dir: options.CacheDir = None,
 ) -> None:
     """Track an object through a sequence of images: print one JSON line per image.
 
@@ -104,7 +72,7 @@ def track(
         seed=seed,
         max_poses=max_poses,
         cache_dir=cache_dir,
-        mounting=Mounting(rotate, mirror),
+        mounting=options.Mounting(rotate, mirror),
     )
 
     from geomtact.report.exchange import tum_line
@@ -134,8 +102,13 @@ def track(
             from geomtact.report.sequence_page import sequence_page
 
             write_text(report, sequence_page(localizer.mesh.name, localizer.sensor.name, shown))
+    exit_untouched(touched)
+
+
+def exit_untouched(touched: bool) -> None:
+    """Exit with the status of no contact, unless any image was ``touched``."""
     if not touched:
-        tell(UNTOUCHED)
+        tell("no contact found in any image; give --background, or the kind of the images by --kind")
         raise typer.Exit(NO_CONTACT)
 
 
@@ -146,17 +119,17 @@ def open_track(
     motion_mm: float,
     given: Mapping[str, str | Path | None],
     max_cells: int | None = None,
-    **options: Any,
+    **asked: Any,
 ) -> tuple[Localizer, Iterator[tuple[float | None, Posterior]]]:
     """The localizer, and each frame's time, if the source has one, and posterior.
 
-    Parameters as of :func:`track`; ``given`` and ``options`` as of :meth:`Request.of`.
+    Parameters as of :func:`track`; ``given`` and what else is ``asked`` as of :meth:`Request.of`.
     """
     from geomtact.sensing.reading import read_observation
 
     if follow and not Path(source).is_dir():
         raise UsageError(f"--follow: expected a folder to watch, got {source}")
-    request = Request.of(given, _metadata(source), **options)
+    request = Request.of(given, _metadata(source), **asked)
     sensor, background = request.mounted(), request.values["background"]
 
     def read(image: Any) -> Any:
@@ -164,7 +137,7 @@ def open_track(
             return image  # opening the index reports a missing sensor; broken images are skipped in their turn
         return read_observation(image, sensor, request.kind, background)
 
-    frames = all_frames(source, follow, sensor, read, masks=request.kind == Kind.mask.value)
+    frames = all_frames(source, follow, sensor, read, masks=request.kind == options.Kind.mask.value)
     localizer = request.open()
 
     from geomtact.inference.motion import UniformBall

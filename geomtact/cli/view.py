@@ -7,56 +7,33 @@ from typing import Annotated
 
 import typer
 
-from geomtact.cli.options import (
-    Background,
-    CacheDir,
-    EffortName,
-    Kind,
-    KindName,
-    MaxPoses,
-    Mirror,
-    Mounting,
-    Rotate,
-    ScorerName,
-    Seed,
-    SensorName,
-    Unit,
-)
-from geomtact.cli.shell import NO_CONTACT, tell
-from geomtact.cli.track import (
-    MOTION_MM,
-    UNTOUCHED,
-    Follow,
-    MotionMm,
-    ObjectName,
-    SkipBroken,
-    Source,
-    open_track,
-)
+from geomtact.cli import options
+from geomtact.cli.shell import tell
+from geomtact.cli.track import exit_untouched, open_track
 
 
 def view(
-    source: Source,
-    object_name: ObjectName = None,
-    unit: Unit = None,
-    sensor: SensorName = None,
-    kind: KindName = Kind.auto.value,
-    background: Background = None,
-    effort: EffortName = None,
-    scorer: ScorerName = None,
-    motion_mm: MotionMm = MOTION_MM,
-    follow: Follow = False,
-    skip_broken: SkipBroken = False,
-    rotate: Rotate = None,
-    mirror: Mirror = None,
+    source: options.Source,
+    object_name: options.ObjectName = None,
+    unit: options.Unit = None,
+    sensor: options.SensorName = None,
+    kind: options.KindName = options.Kind.auto.value,
+    background: options.Background = None,
+    effort: options.EffortName = None,
+    scorer: options.ScorerName = None,
+    motion_mm: options.MotionMm = options.MOTION_MM,
+    follow: options.Follow = False,
+    skip_broken: options.SkipBroken = False,
+    rotate: options.Rotate = None,
+    mirror: options.Mirror = None,
     host: Annotated[
         str, typer.Option(help="Address of the page; 0.0.0.0 serves it to other machines, too.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port; if it is taken, the next free one.")] = 8080,
     stay: Annotated[bool, typer.Option(help="Serve the page after the last image, until Ctrl-C.")] = True,
-    seed: Seed = 0,
-    max_poses: MaxPoses = None,
-    cache_dir: CacheDir = None,
+    seed: options.Seed = 0,
+    max_poses: options.MaxPoses = None,
+    cache_dir: options.CacheDir = None,
 ) -> None:
     """Track an object as 'geomtact track' does, and show its pose distribution live in the browser.
 
@@ -77,7 +54,7 @@ def view(
         seed=seed,
         max_poses=max_poses,
         cache_dir=cache_dir,
-        mounting=Mounting(rotate, mirror),
+        mounting=options.Mounting(rotate, mirror),
     )
 
     viewer, touched = Viewer(localizer.mesh, host, port), False
@@ -94,6 +71,4 @@ def view(
         tell("stopped")
     finally:
         viewer.stop()
-    if not touched:
-        tell(UNTOUCHED)
-        raise typer.Exit(NO_CONTACT)
+    exit_untouched(touched)

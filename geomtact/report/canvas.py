@@ -45,6 +45,12 @@ def rgb(colour: str) -> Array:
     return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
 
 
+def to_pixels(image: Any) -> NDArray[np.uint8]:
+    """Any image as read, (H, W) or (H, W, 3), as RGB (H, W, 3)."""
+    shown = np.round(255 * np.clip(displayable(image), 0, 1)).astype(np.uint8)
+    return shown if shown.ndim == 3 else np.repeat(shown[..., None], 3, 2)
+
+
 def displayable(image: Any) -> Array:
     """Any image as read, (H, W) or (H, W, 3), brought to 0..1."""
     shown = np.asarray(image)

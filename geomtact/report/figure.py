@@ -70,7 +70,7 @@ def draw(
         words = _touch(bands["touch"], posterior, summaries, shown)
         if modes:
             _modes(bands["modes"], posterior, modes, views, part, shown)
-            _marginals(bands["marginals"], marginals(posterior, np.asarray(modes[0].T)))
+            draw_marginals(bands["marginals"], marginals(posterior, np.asarray(modes[0].T)))
         canvas.draw()
         words_start = int(words.get_window_extent().x0)
         pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -95,7 +95,8 @@ def _touch(
         how = f"read as {'depth map' if kind == 'height' else kind}"
         if kind == "reading":
             how = f"{one.observation.method} method" + " with depths" * (contact.height is not None)
-        title = f"The contact{of} ({_area_mm2(contact, one.sensor):.1f} mm², {how})"
+        area_mm2 = 1e6 * contact.mask.sum() * one.sensor.pixel_area(contact.mask.shape)
+        title = f"The contact{of} ({area_mm2:.1f} mm², {how})"
         _in_window(axes, one.sensor, np.where(contact.mask, 0.75, 0.97), title)
     words = band.add_subplot(grid[:, 2])
     words.axis("off")
@@ -142,7 +143,8 @@ def _over(posterior: Posterior, shown: Sequence[SensorImage]) -> str:
     return f"over {name}" if name else ""
 
 
-def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
+def draw_marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
+    """Draw the distribution of each coordinate; a ball has neither turn nor tilt."""
     from matplotlib.ticker import MultipleLocator
 
     grid = band.subplots(1, 5)
@@ -156,12 +158,11 @@ def _marginals(band: SubFigure, all_samples: Sequence[Samples]) -> None:
         if samples.most == 180 and np.ptp(axes.get_xlim()) > 150:
             axes.xaxis.set_major_locator(MultipleLocator(90))
         axes.ticklabel_format(useOffset=False)
-    for axes in grid[len(all_samples) :]:
+    empty = grid[len(all_samples) :]
+    for axes in empty:
         axes.axis("off")
+    for axes in empty[:1]:
         axes.text(0.5, 0.5, "a ball has\nno turn", ha="center", va="center", transform=axes.transAxes)
-        break
-    for axes in grid[len(all_samples) + 1 :]:
-        axes.axis("off")
     grid[0].set_ylabel("probability [%]")
     band.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", frameon=False)
 
@@ -208,8 +209,8 @@ def _in_window(axes: Axes, sensor: Sensor, image: Array, title: str, small: bool
 def _draw_frame(axes: Axes, sensor: Sensor, place: Callable[[Any], Array]) -> None:
     """The window's border and the sensor's x and y axes, over the picture of the object."""
     x, y = 1e3 * sensor.half_window
-    border = place(np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [-x, -y, 0]]))
-    axes.plot(*border.T, color=BARS, lw=0.8)
+    corners = 1e3 * sensor.corners
+    axes.plot(*place(np.concatenate([corners, corners[:1]])).T, color=BARS, lw=0.8)
     for name, tip in (("x", (x, 0, 0)), ("y", (0, y, 0))):
         start, end = place(np.array([[0, 0, 0], tip]))
         axes.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": BARS, "lw": 1.0})
@@ -231,8 +232,3 @@ def _words(posterior: Posterior, summaries: Sequence[ModeSummary]) -> list[str]:
             s.in_words(),
         ]
     return lines
-
-
-def _area_mm2(contact: Contact, sensor: Sensor) -> float:
-    window = 4e6 * float(np.prod(sensor.half_window))
-    return float(contact.mask.mean()) * window

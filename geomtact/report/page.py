@@ -11,28 +11,6 @@ from typing import Any
 
 from geomtact.report.summary import HEADINGS, percent
 
-STYLE = """
-:root { color-scheme: light dark; --text: #1b1f24; --back: #ffffff; --line: #d0d7de; --soft: #f6f8fa;
-        --warn: #8a4b00; --warn-back: #fff3e0; }
-@media (prefers-color-scheme: dark) { :root { --text: #e6edf3; --back: #0d1117; --line: #30363d; --soft: #161b22;
-        --warn: #ffc680; --warn-back: #2d1f0a; } }
-body { font: 16px/1.5 system-ui, sans-serif; color: var(--text); background: var(--back); max-width: 72rem;
-       margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
-img { max-width: 100%; background: #ffffff; border: 1px solid var(--line); border-radius: 6px; }
-.table { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; padding: .3rem .9rem .3rem 0; border-bottom: 1px solid var(--line); white-space: nowrap; }
-td:last-child { white-space: normal; min-width: 14rem; }
-.warning { color: var(--warn); background: var(--warn-back); border-left: 4px solid; padding: .5rem .8rem; margin: .6rem 0; }
-details { margin: 1rem 0; } summary { cursor: pointer; }
-#scene canvas { width: 100%; height: min(60vh, 34rem); border: 1px solid var(--line); border-radius: 6px; touch-action: none; }
-#scene button { font: inherit; color: inherit; background: var(--soft); border: 1px solid var(--line); border-radius: 6px;
-                padding: .2rem .7rem; margin: 0 .4rem .5rem 0; cursor: pointer; }
-#scene button[aria-selected=true] { color: #ffffff; background: #0072b2; border-color: #0072b2; }
-#scene :focus-visible { outline: 3px solid #e69f00; }
-pre { background: var(--soft); padding: .8rem; overflow-x: auto; font-size: .85rem; border-radius: 6px; }
-"""
-
 _AXES = {
     "sensor": ": x along image columns, y along image rows downwards, z out of the sensor towards the object",
     "world": " of the sensors' poses",
@@ -82,18 +60,24 @@ def page(
         ]
     parts += _folded("Poses T (object to " + content["frame"] + " frame, metres)", [m["T"] for m in content["modes"]])
     timing = {stage: f"{ms:,.1f}" for stage, ms in content["timing_ms"].items()}
-    for title, entries in (
-        ("Settings", content["settings"]),
-        ("Timing [ms]", timing),
-        ("Versions", content["versions"]),
-    ):
-        parts += _folded(title, entries)
-    body = "\n".join(parts)
+    parts += _folded("Settings", content["settings"])
+    parts += _folded("Timing [ms]", timing)
+    parts += _folded("Versions", content["versions"])
+    return document(f"{name} on {sensor}", "\n".join(parts))
+
+
+def document(title: str, body: str, style: str = "") -> str:
+    """The text of an HTML file with a ``title`` and ``body`` in HTML, and ``style`` besides that of all pages."""
     return (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{name} on {sensor}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}</style>\n</head>\n'
-        f"<body>\n{body}\n</body>\n</html>\n"
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<style>\n{asset('page.css')}{style}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
     )
+
+
+def asset(name: str) -> str:
+    """A script or style that stands beside this module."""
+    return files("geomtact.report").joinpath(name).read_text("utf-8")
 
 
 def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -104,7 +88,6 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _turnable(content: dict[str, Any], probabilities: Sequence[float]) -> list[str]:
     tabs = [f'<button role="tab" type="button">mode {k}: {percent(p)}</button>' for k, p in enumerate(probabilities, 1)]
-    script = files("geomtact.report").joinpath("turnable.js").read_text("utf-8")
     return [
         "<h2>The object at each mode</h2>",
         '<section id="scene">',
@@ -116,7 +99,7 @@ def _turnable(content: dict[str, Any], probabilities: Sequence[float]) -> list[s
         "probable (yellow)</label></p>",
         "</section>",
         f'<script id="scene-data" type="application/json">{json.dumps(content)}</script>',
-        f"<script>\n{script}</script>",
+        f"<script>\n{asset('turnable.js')}</script>",
     ]
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.json_values import plain
-from geomtact.report.canvas import OBSERVED, SIMULATED, displayable, png_of, rgb
-from geomtact.report.page import STYLE
+from geomtact.report.canvas import OBSERVED, SIMULATED, png_of, rgb, to_pixels
+from geomtact.report.page import asset, document
 from geomtact.report.summary import percent
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact
@@ -23,48 +23,6 @@ if TYPE_CHECKING:
 
 _WIDTH = 320  # px of the pictures, at most
 _CURVE = 640, 160  # width and height of the entropy's curve, in units of its own
-_EXTRA = """
-.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(16rem, 1fr)); gap: 1rem; margin: 1rem 0; }
-figure { margin: 0; } figure img { width: 100%; image-rendering: pixelated; } figcaption { font-size: .9rem; }
-.player { display: flex; gap: .8rem; align-items: center; } .player input { flex: 1; }
-.player button { font: inherit; width: 5rem; } svg { width: 100%; height: auto; overflow: visible; }
-svg text { font-size: 12px; fill: currentColor; } #summary { min-height: 3.2rem; font-variant-numeric: tabular-nums; }
-"""
-_SCRIPT = """
-const slider = document.getElementById("frame"), play = document.getElementById("play");
-const element = id => document.getElementById(id);
-let timer = null;
-function show(i) {
-  const f = FRAMES[i];
-  slider.value = i;
-  element("number").textContent = `frame ${f.frame} of ${FRAMES.length}`;
-  for (const name of ["image", "contact"]) {
-    element(name).style.visibility = f[name] ? "visible" : "hidden";
-    if (f[name]) element(name).src = "data:image/png;base64," + f[name];
-  }
-  element("summary").textContent = f.summary;
-  element("mark").setAttribute("x1", f.x);
-  element("mark").setAttribute("x2", f.x);
-  element("warnings").replaceChildren(...f.warnings.map(text => {
-    const p = document.createElement("p");
-    p.className = "warning";
-    p.textContent = text;
-    return p;
-  }));
-}
-function stop() { clearInterval(timer); timer = null; play.textContent = "Play"; }
-slider.oninput = () => { stop(); show(Number(slider.value)); };
-play.onclick = () => {
-  if (timer) return stop();
-  if (Number(slider.value) === FRAMES.length - 1) show(0);
-  play.textContent = "Pause";
-  timer = setInterval(() => {
-    const next = Number(slider.value) + 1;
-    if (next < FRAMES.length) show(next); else stop();
-  }, 300);
-};
-show(0);
-"""
 
 
 def sequence_frame(
@@ -81,9 +39,7 @@ def sequence_frame(
     out: dict[str, Any] = {key: line[key] for key in ("frame", "entropy_nats", "surprise_nats", "warnings")}
     out |= {"image": None, "contact": None, "summary": _summary(line)}
     for observation in posterior.observations[:1]:
-        shown = displayable(observation.image)
-        colours = np.repeat(shown[..., None], 3, 2) if shown.ndim == 2 else shown
-        out["image"] = _png(colours)
+        out["image"] = _png(observation.image)
         mask = observation.contact.mask
         drawn = np.ones((*mask.shape, 3))
         if line["T"] is not None:
@@ -112,12 +68,8 @@ def sequence_page(name: str, sensor: str, frames: Sequence[Mapping[str, Any]]) -
 <h2>Information gain by frame</h2>
 {curve}"""
     # a closing tag inside a string would end the script
-    script = f"const FRAMES = {data.replace('</', '<' + chr(92) + '/')};{_SCRIPT}"
-    return (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{title}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}{_EXTRA}</style>\n'
-        f"</head>\n<body>\n{body}\n<script>\n{script}</script>\n</body>\n</html>\n"
-    )
+    script = f"const FRAMES = {data.replace('</', '<' + chr(92) + '/')};\n{asset('sequence_page.js')}"
+    return document(title, f"{body}\n<script>\n{script}</script>", "\n" + asset("sequence_page.css"))
 
 
 def _summary(line: Mapping[str, Any]) -> str:
@@ -167,10 +119,10 @@ def _border(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(border.astype(np.uint8), np.ones((2, 2), np.uint8)), bool)
 
 
-def _png(colours: Array) -> str:
-    """A picture (H, W, 3) in 0..1, made small enough, as base64."""
+def _png(image: NDArray[Any]) -> str:
+    """An image as read, or a picture (H, W, 3) in 0..1, made small enough, as base64."""
     from PIL import Image
 
-    image = Image.fromarray(np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8))
-    image.thumbnail((_WIDTH, _WIDTH))
-    return base64.b64encode(png_of(np.asarray(image), optimize=True)).decode("ascii")
+    picture = Image.fromarray(to_pixels(image))
+    picture.thumbnail((_WIDTH, _WIDTH))
+    return base64.b64encode(png_of(np.asarray(picture), optimize=True)).decode("ascii")

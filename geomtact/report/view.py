@@ -57,7 +57,7 @@ class Painter:
         placed = apply(T_sensor_object, self.mesh.vertices)
         distance = np.linalg.norm(placed, axis=1)
         near, far = placed[distance < _SHOWN * window], 2 * float(distance.max()) + window
-        corners = np.concatenate([near, self._window_corners()]) @ plane.T
+        corners = np.concatenate([near, self.sensor.corners]) @ plane.T
         middle = 0.5 * (corners.min(0) + corners.max(0))
         half = 0.53 * float(np.ptp(corners, axis=0).max())
         steps = (np.arange(self.pixels) + 0.5) / self.pixels * 2 - 1
@@ -65,10 +65,6 @@ class Painter:
         image = self._shade(T_sensor_object, u.ravel(), v.ravel(), plane, back, far)
         extent = tuple(1e3 * np.array([middle[0] - half, middle[0] + half, middle[1] - half, middle[1] + half]))
         return PartView(image.reshape(self.pixels, self.pixels, 3), extent, plane)
-
-    def _window_corners(self) -> Array:
-        x, y = self.sensor.half_window
-        return np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
 
     def _shade(self, T: Array, u: Array, v: Array, plane: Array, back: Array, far: float) -> Array:
         start = u[:, None] * plane[0] + v[:, None] * plane[1] + far * back

@@ -7,12 +7,12 @@ import socket
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from geomtact.errors import UsageError
 from geomtact.geometry.mesh import Mesh, coarser
-from geomtact.report.canvas import COLOURS
+from geomtact.report.canvas import COLOURS, rgb, to_pixels
 from geomtact.report.turnable import outlines_of
 from geomtact.se3 import Array, apply
 
@@ -54,7 +54,7 @@ class Viewer:
         self._image = self._server.gui.add_image(np.zeros((1, 1, 3), np.uint8), label="image")
         mesh = coarser(mesh, _FACES)
         shape = _CM * mesh.vertices, np.asarray(mesh.faces)
-        colours = [np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) for colour in COLOURS[:2]]
+        colours = [np.round(255 * rgb(colour)).astype(int) for colour in COLOURS[:2]]
         scene = self._server.scene
         at = np.tile([1.0, 0, 0, 0], (_POSES, 1)), np.zeros((_POSES, 3))
         self._drawn = scene.add_batched_meshes_simple("/drawn", *shape, *at, batched_colors=colours[0], opacity=_FAINT)
@@ -75,7 +75,7 @@ class Viewer:
         seen = posterior.observation
         if seen is not None:
             lines += [_around(_CM * apply(T, line)) for line in outlines_of(seen.contact.mask, sensor)]
-            picture = _picture(seen.contact.mask if seen.kind == "mask" else seen.image)
+            picture = to_pixels(seen.contact.mask if seen.kind == "mask" else seen.image)
         self._image.image = picture
         scene.add_line_segments(
             "/contact", np.concatenate(lines), _CONTACT, thickness=2 * _LINES, thickness_units="screen"
@@ -88,7 +88,7 @@ class Viewer:
             self._drawn.batched_wxyzs = _wxyz(some)
             self._drawn.batched_positions = np.float32(_CM) * some[:, :3, 3].astype(np.float32)
             self._mode.wxyz, self._mode.position = _wxyz(first.T), _CM * first.T[:3, 3]
-            gain = max(0.0, -posterior.entropy_nats)
+            gain = max(0.0, posterior.information_gain_nats)
             summary = f"mode 1: {100 * first.probability:.1f} %, information gain {gain:.1f} nats"
         self._summary.content = "\n\n".join(
             [f"**{posterior.mesh.name}, frame {number}**", summary, *posterior.warnings]
@@ -126,14 +126,3 @@ def _wxyz(T: Array) -> NDArray[np.float32]:
 def _around(line: Array) -> Array:
     """The segments (n, 2, 3) of the closed ``line`` (n, 3)."""
     return np.stack([line, np.roll(line, -1, 0)], 1)
-
-
-def _picture(image: ArrayLike) -> NDArray[np.uint8]:
-    """A mask, or an image as it was given, (H, W) or (H, W, 3), for the page."""
-    values = np.asarray(image)
-    if values.dtype == bool:
-        values = np.where(values, 255, 0).astype(np.uint8)
-    if values.dtype != np.uint8:  # depths
-        values = values.astype(float)
-        values = np.asarray(255 * (values - values.min()) / max(float(np.ptp(values)), 1e-12), np.uint8)
-    return values if values.ndim == 3 else np.repeat(values[..., None], 3, 2)
