@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from geomtact.errors import GeomtactError, UsageError
 
@@ -38,7 +38,7 @@ def prepare_part(
 
 
 def run_all(
-    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int = 1, ray: str | None = None
+    work: Callable[..., object], tasks: Sequence[tuple[object, ...]], jobs: int = 1, ray: str | None = None
 ) -> Iterator[tuple[int, GeomtactError | None]]:
     """Call ``work(*task)`` for each task: yields its number as soon as it is done, and what was wrong with it, if anything was.
 
@@ -65,7 +65,7 @@ def run_all(
         yield from _by_processes(work, tasks, jobs)
 
 
-def _done(work: Callable[..., Any], task: tuple[Any, ...]) -> GeomtactError | None:
+def _done(work: Callable[..., object], task: tuple[object, ...]) -> GeomtactError | None:
     """Do a task; what was wrong with it."""
     try:
         work(*task)
@@ -90,7 +90,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def _by_processes(
-    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int
+    work: Callable[..., object], tasks: Sequence[tuple[object, ...]], jobs: int
 ) -> Iterator[tuple[int, GeomtactError | None]]:
     waiting, lost = list(range(len(tasks)))[::-1], list[int]()
     while waiting:
@@ -106,7 +106,7 @@ def _by_processes(
 
 
 def _in_a_pool(
-    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], waiting: list[int], jobs: int, lost: list[int]
+    work: Callable[..., object], tasks: Sequence[tuple[object, ...]], waiting: list[int], jobs: int, lost: list[int]
 ) -> Iterator[tuple[int, GeomtactError | None]]:
     """Do the tasks ``waiting``, from the last, until one's process dies: it and those under way then are added to ``lost``."""
     with _one_thread_each(), ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
@@ -143,7 +143,7 @@ def _one_thread_each() -> Iterator[None]:
 
 
 def _by_ray(
-    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], address: str
+    work: Callable[..., object], tasks: Sequence[tuple[object, ...]], address: str
 ) -> Iterator[tuple[int, GeomtactError | None]]:
     try:
         import ray
@@ -159,7 +159,7 @@ def _by_ray(
             f"--ray: no cluster at {address!r} ({str(error).splitlines()[0]}); run 'ray start --head' there, or give auto"
         ) from None
     remote = ray.remote(num_cpus=1, max_retries=_TRIES - 1)(_done)
-    waiting, running = list(range(len(tasks)))[::-1], dict[Any, int]()
+    waiting, running = list(range(len(tasks)))[::-1], dict[object, int]()
     while waiting or running:
         while waiting and len(running) < _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1))):
             number = waiting.pop()

@@ -6,10 +6,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass
+from itertools import chain, starmap
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from geomtact.cli.frame_order import doubt, in_order
 from geomtact.cli.shell import tell
@@ -17,7 +17,16 @@ from geomtact.errors import InputError, UsageError
 from geomtact.files import printable
 
 if TYPE_CHECKING:
+    import cv2
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from geomtact.sensing.reading import Observation
     from geomtact.sensing.sensor import Sensor
+
+    Pixels = NDArray[np.generic]  # (H, W, 3) RGB, or a mask (H, W)
+    Unread = str | Pixels  # a path, or pixels
+    Image = Unread | Observation
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy")
 State = tuple[int, int]  # when a file was last written to [ns], and its size
@@ -35,7 +44,7 @@ class Frame:
     skipped : images that came since the one before, and are not given
     """
 
-    image: Any
+    image: Image
     time: float | None = None
     skipped: int = 0
 
@@ -44,7 +53,7 @@ def all_frames(
     source: str,
     follow: bool = False,
     sensor: Sensor | None = None,
-    read: Callable[[Any], Any] = lambda image: image,
+    read: Callable[[Unread], Image] = lambda image: image,
     masks: bool = False,
 ) -> Iterator[Frame]:
     """The frames of a folder, a video, a camera or, for -, of paths on standard input, in order; a camera's newest.
@@ -81,11 +90,11 @@ def all_frames(
         )
     if path.suffix.lower() in _IMAGES:
         raise UsageError(f"{path}: is one image; give its folder, or use 'geomtact localize'")
-    frames = _filmed(path, masks)
-    start = next(frames, None)
+    filmed = _filmed(path, masks)
+    start = next(filmed, None)
     if start is None:
         raise InputError(f"{path}: no image in this video; give another, or a folder of images")
-    return chain([replace(start, image=read(start.image))], frames)
+    return chain([Frame(read(start[0]), start[1])], starmap(Frame, filmed))
 
 
 def listed(folder: Path) -> list[Path]:
@@ -145,14 +154,14 @@ def camera_frames(source: str, sensor: Sensor | None = None) -> Generator[Frame,
     if sensor is not None:
         _check_camera(first[0], sensor, source)
 
-    def read() -> Any:
+    def read() -> Pixels | None:
         image = first.pop() if first else _next_rgb(capture)
         return image if image is None or sensor is None else sensor.driven(image)
 
     return newest(read, capture.release)
 
 
-def _check_camera(image: Any, sensor: Sensor, source: str) -> None:
+def _check_camera(image: Pixels, sensor: Sensor, source: str) -> None:
     """Refuse a camera's image (H, W, 3) of another size than the sensor's; report whether it is turned."""
     from geomtact.sensing.change import check_size
 
@@ -164,10 +173,10 @@ def _check_camera(image: Any, sensor: Sensor, source: str) -> None:
         )
 
 
-def newest(read: Callable[[], Any], close: Callable[[], None] = lambda: None) -> Generator[Frame, None, None]:
+def newest(read: Callable[[], Pixels | None], close: Callable[[], None] = lambda: None) -> Generator[Frame, None, None]:
     """What ``read`` gave last, whenever the next frame is asked for, until it gives None; meanwhile it is called again and again.
     At last ``close`` is called."""
-    held: deque[Any] = deque(maxlen=1)
+    held: deque[tuple[Pixels, float]] = deque(maxlen=1)
     changed, ended, came, given = threading.Condition(), False, 0, 0
 
     def keep_reading() -> None:
@@ -239,8 +248,9 @@ def _named() -> Iterator[Frame]:
             yield Frame(line.strip())
 
 
-def _filmed(path: Path, masks: bool) -> Iterator[Frame]:
-    """The frames of a video (H, W, 3) RGB, or the ``masks`` (H, W) in them, where they are nearly black and white."""
+def _filmed(path: Path, masks: bool) -> Iterator[tuple[Pixels, float]]:
+    """The images of a video (H, W, 3) RGB, or the ``masks`` (H, W) in them, where they are nearly black and white; and their
+    times [s]."""
     import cv2
 
     from geomtact.sensing.drawn import bright_half
@@ -249,10 +259,10 @@ def _filmed(path: Path, masks: bool) -> Iterator[Frame]:
     if not video.isOpened():
         raise InputError(f"{path}: OpenCV cannot read this video; give another, or a folder of images")
 
-    def frames() -> Iterator[Frame]:
+    def frames() -> Iterator[tuple[Pixels, float]]:
         while (image := _next_rgb(video)) is not None:
             half = bright_half(image) if masks else None
-            yield Frame(image if half is None else half, 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC))
+            yield image if half is None else half, 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
         video.release()
 
     return frames()
@@ -270,7 +280,7 @@ def _name_for_opencv(name: str) -> str:
     return name
 
 
-def _next_rgb(capture: Any) -> Any:
+def _next_rgb(capture: cv2.VideoCapture) -> Pixels | None:
     """The next image (H, W, 3) of an OpenCV capture, or None."""
     ok, image = capture.read()
     return image[..., ::-1] if ok else None

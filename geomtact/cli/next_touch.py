@@ -101,7 +101,7 @@ def read_actions(path: Path) -> list[Touch | Probe]:
     return found
 
 
-def _action(entry: Any) -> Touch | Probe:
+def _action(entry: object) -> Touch | Probe:
     from geomtact.planning.actions import Probe, Touch
 
     if not isinstance(entry, Mapping) or ("T_world_sensor" in entry) == ("probe" in entry):

@@ -24,7 +24,7 @@ Command = Callable[..., None]
 
 def do_all(
     work: Command,
-    tasks: Sequence[tuple[Any, ...]],
+    tasks: Sequence[tuple[object, ...]],
     names: Sequence[str],
     done: str,
     jobs: int | None = None,

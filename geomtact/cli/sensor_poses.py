@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -89,7 +88,7 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
     )
 
 
-def _beside(path: Path, name: Any) -> str:
+def _beside(path: Path, name: object) -> str:
     """A sensor's TOML file named relative to ``path``, or a bundled sensor's name."""
     name = str(name)
     return str(path.parent / name) if (path.parent / name).is_file() and not is_bundled("sensor", name) else name

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import typer
 
@@ -52,7 +51,7 @@ def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
     """``command`` with geomtact's and the system's errors reported in one line, and the exit status that fits."""
 
     @functools.wraps(command)
-    def run(*args: Any, **kwargs: Any) -> None:
+    def run(*args: object, **kwargs: object) -> None:
         try:
             command(*args, **kwargs)
         except GeomtactError as error:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +14,9 @@ from geomtact.cli.shell import check_folder, tell
 from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from geomtact.contact_space.space import ContactSpace
     from geomtact.contact_space.touches import Touch
     from geomtact.se3 import Array
@@ -151,13 +155,12 @@ def _touch_at(space: ContactSpace, T: Array, seed: int, elastic: bool, noise: No
     return Touch(T, float(space.caster.penetration(space.sensor, T)[0]), mask, elastic)
 
 
-def _write(stem: Path, mask: Any, truth: dict, metadata: dict) -> None:
+def _write(stem: Path, image: NDArray[np.generic], truth: Mapping[str, object], metadata: Mapping[str, str]) -> None:
     """Write STEM.png, with ``metadata`` as text entries, and STEM.json."""
     from geomtact.files import write_text
     from geomtact.json_values import plain, to_text
     from geomtact.sensing.image_file import write_image
 
-    metadata = {**metadata, "T_sensor_object": truth["T_sensor_object"]}
-    write_image(stem.with_name(stem.name + ".png"), mask, metadata)
-    text = to_text(plain(truth))
-    write_text(stem.with_name(stem.name + ".json"), text)
+    pose = {"T_sensor_object": truth["T_sensor_object"]}
+    write_image(stem.with_name(f"{stem.name}.png"), image, {**metadata, **pose})
+    write_text(stem.with_name(f"{stem.name}.json"), to_text(plain(truth)))

@@ -17,6 +17,7 @@ from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text
 
 if TYPE_CHECKING:
+    from geomtact.cli.frames import Image, Unread
     from geomtact.inference.posterior import Posterior
     from geomtact.localizer import Localizer
 
@@ -132,7 +133,7 @@ def open_track(
     request = Request.of(given, _metadata(source), **asked)
     sensor, background = request.mounted(), request.values["background"]
 
-    def read(image: Any) -> Any:
+    def read(image: Unread) -> Image:
         if sensor is None or skip_broken:
             return image  # opening the index reports a missing sensor; broken images are skipped in their turn
         return read_observation(image, sensor, request.kind, background)
@@ -168,7 +169,7 @@ def _metadata(source: str) -> dict[str, Any]:
         return {}  # reported with its number when its turn comes
 
 
-def _images(frames: Iterator[Frame], times: deque[float | None]) -> Iterator[Any]:
+def _images(frames: Iterator[Frame], times: deque[float | None]) -> Iterator[Image]:
     """The images alone; their times are put into ``times``."""
     for frame in frames:
         times.append(frame.time)

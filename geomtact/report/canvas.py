@@ -5,12 +5,15 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable, Iterator
 from itertools import cycle
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.se3 import Array
+
+if TYPE_CHECKING:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 _T = TypeVar("_T")
 
@@ -24,7 +27,7 @@ def coloured(what: Iterable[_T]) -> Iterator[tuple[_T, str]]:
     return zip(what, cycle(COLOURS), strict=False)
 
 
-def png(canvas: Any) -> bytes:
+def png(canvas: FigureCanvasAgg) -> bytes:
     """What a matplotlib ``canvas`` shows."""
     out = io.BytesIO()
     canvas.print_png(out, metadata={"Software": None})

@@ -206,7 +206,7 @@ def _in_window(axes: Axes, sensor: Sensor, image: Array, title: str, small: bool
         spine.set_visible(True)
 
 
-def _draw_frame(axes: Axes, sensor: Sensor, place: Callable[[Any], Array]) -> None:
+def _draw_frame(axes: Axes, sensor: Sensor, place: Callable[[Array], Array]) -> None:
     """The window's border and the sensor's x and y axes, over the picture of the object."""
     x, y = 1e3 * sensor.half_window
     corners = 1e3 * sensor.corners

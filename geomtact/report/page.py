@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from typing import Any
@@ -110,10 +110,10 @@ def _picture(title: str, description: str, png: bytes | None) -> list[str]:
     return [f"<h2>{escape(title)}</h2>", f'<img alt="{escape(description)}" src="data:image/png;base64,{data}">']
 
 
-def _folded(title: str, value: Any) -> list[str]:
+def _folded(title: str, value: Mapping[str, object] | Sequence[Sequence[Sequence[float]]]) -> list[str]:
     if not value:
         return []
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         text = "\n".join(
             f"{key}: {entry if isinstance(entry, str) else json.dumps(entry)}" for key, entry in value.items()
         )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact
+from geomtact.sensing.reading import Observation
 from geomtact.sensing.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ class SensorImage:
 
     sensor: Sensor
     T_frame_sensor: Array
-    observation: Any
+    observation: Observation
     simulate: Callable[[Array], Contact]
     name: str = ""
 

@@ -93,5 +93,5 @@ def _mm(T: Array) -> Array:
     return out
 
 
-def _packed(array: ArrayLike, kind: Any) -> str:
+def _packed(array: ArrayLike, kind: type[np.generic]) -> str:
     return base64.b64encode(np.ascontiguousarray(array, np.dtype(kind).newbyteorder("<")).tobytes()).decode("ascii")
