@@ -50,7 +50,7 @@ app = typer.Typer(
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
-    help="Localize an object from tactile images: from its mesh and the image of a contact to the distribution of its pose.",
+    help="Localize an object: from its mesh and tactile images to the distribution of its pose.",
     epilog=EXAMPLES
     + "\n\n'geomtact localize --help' shows the form of poses.json. 'geomtact sensors' lists the sensors.",
 )

@@ -31,7 +31,7 @@ def calibrate(
         typer.Option("--pitch-mm", help="Millimetres per pixel on the membrane, along x and along y."),
     ] = None,
     pins: Annotated[
-        Path | None, typer.Option(help="Instead of --pitch-mm: image of a pressed square pin board.")
+        Path | None, typer.Option(help="Instead of --pitch-mm: image of a square pin board pressed into the gel.")
     ] = None,
     pin_spacing_mm: Annotated[
         float | None, typer.Option("--pin-spacing-mm", help="Distance between neighbouring pins of that board.")
@@ -45,12 +45,12 @@ def calibrate(
     mirror: Mirror = None,
     name: Annotated[str | None, typer.Option(help="Name of the new sensor.")] = None,
     out: Annotated[Path, typer.Option(help="Sensor file to write.")] = Path("sensor.toml"),
-    plot: Annotated[Path | None, typer.Option(help="PNG to write: the fit of the presses.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG to write that shows how well the presses fit.")] = None,
 ) -> None:
     """Calibrate a sensor's colours from presses of a ball of known diameter, so that its images measure indentation depth.
 
-    Give --pitch-mm, --pins or --sensor, whose geometry is kept. Use a dozen presses, spread over the window. They take
-    half a minute.
+    Give a dozen presses, spread over the window; they take half a minute. The pixel pitch comes from --pitch-mm, from
+    --pins, or from --sensor, whose geometry is kept.
     """
     from geomtact.report.calibration_plot import draw_calibration
     from geomtact.sensing.calibrate import calibrate_sensor

@@ -49,11 +49,13 @@ def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Remove all cached contact indexes.")] = False,
     limit_gb: Annotated[
         float | None,
-        typer.Option("--limit-gb", min=0, help="Remove the least recently used ones until at most this is left."),
+        typer.Option("--limit-gb", min=0, help="Remove the least recently used indexes until this size is left."),
     ] = None,
     remove: Annotated[
         list[str] | None,
-        typer.Option("--remove", metavar="OBJECT|KEY", help="Remove those of an object or a key. May be repeated."),
+        typer.Option(
+            "--remove", metavar="OBJECT|KEY", help="Remove all of an object, or one by its key. May be repeated."
+        ),
     ] = None,
     cache_dir: CacheDir = None,
 ) -> None:

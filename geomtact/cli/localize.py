@@ -41,7 +41,7 @@ def localize(
         str | None,
         typer.Option(
             "--object",
-            help="Object (see 'geomtact objects') or mesh file. For object identification: names with commas, or a folder.",
+            help="Object (see 'geomtact objects') or mesh file. To identify one of several: names with commas, or a folder.",
         ),
     ] = None,
     unit: options.Unit = None,
@@ -67,16 +67,20 @@ def localize(
     camera: Annotated[
         str | None,
         typer.Option(
-            help="Instead of images: number, device or URL of a camera. Prints a JSON line for its newest image, repeatedly."
+            help="Camera to use instead of images: its number, device or URL. Prints one JSON line per image."
         ),
     ] = None,
-    watch: Annotated[bool, typer.Option("--watch", help="The same for the newest image in a folder.")] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="The same for the newest image of a folder, given as IMAGE.")
+    ] = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder for result.json, posterior.npz, report.html and report.png.")
     ] = None,
     report: Annotated[
         str | None,
-        typer.Option(metavar="|".join(Report), help="Report to write into --out, both by default.", show_default=False),
+        typer.Option(
+            metavar="|".join(Report), help="Report to write into --out; html and png by default.", show_default=False
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print only result.json to standard output.")] = False,
     max_poses: options.MaxPoses = None,

@@ -34,10 +34,10 @@ def next_touch(
     as_json: Annotated[bool, typer.Option("--json", help="Print only next_touch.json to standard output.")] = False,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Rank the next touches by their expected information gain about the pose per cost.
+    """Rank possible next touches by expected information gain per cost.
 
-    Actions are in the posterior's frame, in metres: {"actions": LIST}. Each is {"T_world_sensor": 4x4, "travel": 0.1,
-    "cost": 1} or {"probe": {"point": XYZ, "direction": XYZ}}.
+    The file of --actions holds {"actions": LIST}. A touch is {"T_world_sensor": 4x4, "travel": 0.1, "cost": 1}, a probe
+    {"probe": {"point": XYZ, "direction": XYZ}}. All are in the posterior's frame, in metres.
     """
     from geomtact.inference.posterior import Posterior
     from geomtact.planning import next_touch as planning

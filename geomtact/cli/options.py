@@ -38,7 +38,7 @@ MaxPoses = Annotated[
     typer.Option(
         "--max-poses",
         min=1000,
-        help="Number of poses in the contact index, 1.2 million by default. Plane faces add up to 75 %.",
+        help="Number of poses in the contact index, 1.2 million by default. Objects with plane faces get up to 75 % more.",
         show_default=False,
     ),
 ]
@@ -47,8 +47,8 @@ Approaches = Annotated[
     typer.Option(
         "--approach",
         metavar="X,Y,Z[:DEGREES]",
-        help="Known contact face, as the direction from the object to the sensor in the object's frame. With DEGREES, every "
-        "direction within that angle. May be repeated.",
+        help="Known contact face: direction from the object to the sensor, in the object's frame. DEGREES allows all directions "
+        "within that angle. May be repeated.",
         show_default=False,
     ),
 ]
@@ -108,7 +108,9 @@ Source = Annotated[
 ObjectName = Annotated[str | None, typer.Option("--object", help="Object (see 'geomtact objects') or mesh file.")]
 MotionMm = Annotated[
     float,
-    typer.Option(min=0.001, max=1000, help="Largest motion between two frames: mean distance of the object's points."),
+    typer.Option(
+        min=0.001, max=1000, help="Largest motion between two images: mean displacement of the object's points."
+    ),
 ]
 Follow = Annotated[bool, typer.Option("--follow", help="Wait for more images in the folder, until Ctrl-C.")]
 SkipBroken = Annotated[bool, typer.Option("--skip-broken", help="Skip images that cannot be read.")]

@@ -43,7 +43,10 @@ def simulate(
     seed: Seed = 0,
     elastic: Annotated[
         bool,
-        typer.Option("--elastic/--rigid", help="Contact of an elastic gel, by pressure, or a threshold on the depth."),
+        typer.Option(
+            "--elastic/--rigid",
+            help="Contact by the pressure of an elastic gel, or by a threshold on depth.",
+        ),
     ] = False,
     noise: Annotated[NoiseName, typer.Option(help="Strength of the noise on the mask.")] = NoiseName.none,
     tactile_image: Annotated[

@@ -30,13 +30,13 @@ def track(
     kind: options.KindName = options.Kind.auto.value,
     background: options.Background = None,
     prior: Annotated[
-        Path | None, typer.Option(help="Prior of the first frame: a posterior.npz, or its folder.")
+        Path | None, typer.Option(help="Prior of the first image: a posterior.npz, or its folder.")
     ] = None,
     effort: options.EffortName = None,
     scorer: options.ScorerName = None,
     motion_mm: options.MotionMm = options.MOTION_MM,
     max_cells: Annotated[
-        int | None, typer.Option(min=1, help="Largest number of grid cells kept between frames. Fewer are faster.")
+        int | None, typer.Option(min=1, help="Largest number of grid cells kept from image to image. Fewer are faster.")
     ] = None,
     follow: options.Follow = False,
     skip_broken: options.SkipBroken = False,

@@ -29,29 +29,32 @@ def train(
         typer.Option(
             "--object",
             metavar="OBJECT",
-            help="Train for this object or mesh file; for each of several by a folder, or names with commas.",
+            help="Object or mesh file to train for; for several: names with commas, or a folder.",
         ),
     ],
     out: Annotated[
-        Path, typer.Option(help="Weights file to write, a folder for several; the card and curves go beside it.")
+        Path,
+        typer.Option(help="Weights file to write, with its card beside it; a folder if there are several objects."),
     ] = Path("encoder.safetensors"),
     unit: Unit = None,
-    sensor: Annotated[str, typer.Option(help="Name or TOML file.")] = "gelslim",
-    scenes: Annotated[int | None, typer.Option(min=50, help="Simulated scenes of an encoder; 80 by default.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps of an encoder; 600 by default.")] = None,
+    sensor: Annotated[str, typer.Option(help="Sensor (see 'geomtact sensors') or TOML file.")] = "gelslim",
+    scenes: Annotated[
+        int | None, typer.Option(min=50, help="Simulated scenes to train the encoder on; 80 by default.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Training steps of the encoder; 600 by default.")] = None,
     start: Annotated[
-        Path | None, typer.Option(help="Weights that an encoder starts from; the bundled ones by default.")
+        Path | None, typer.Option(help="Weights that the encoder starts from; the bundled ones by default.")
     ] = None,
     architecture: Annotated[
         str, typer.Option(help="encoder: fine-tune the shared encoder; resnet50: train the thesis's network.")
     ] = "encoder",
     pairs: Annotated[
-        int | None, typer.Option(min=32, help="Pairs of contacts that a resnet50 learns from; 100,000 by default.")
+        int | None, typer.Option(min=32, help="Pairs of contacts to train resnet50 on; 100,000 by default.")
     ] = None,
     side: Annotated[
-        int | None, typer.Option(min=32, help="Pixels along the side of a resnet50's images; 224 by default.")
+        int | None, typer.Option(min=32, help="Side of resnet50's input images in pixels; 224 by default.")
     ] = None,
-    rate: Annotated[float | None, typer.Option(min=1e-9, help="Learning rate, where the usual one diverges.")] = None,
+    rate: Annotated[float | None, typer.Option(min=1e-9, help="Learning rate, if the default diverges.")] = None,
     seed: Seed = 0,
     work: Annotated[
         Path | None, typer.Option(help="Folder for scenes and state; by default one named after --out.")
@@ -59,10 +62,11 @@ def train(
     jobs: Jobs = None,
     ray: Ray = None,
 ) -> None:
-    """Train the network that compares contacts for an object. A stopped run goes on where it was.
+    """Train a score for an object: fine-tune the shared encoder, or train the thesis's network.
 
-    The shared encoder is fine-tuned on simulated touches of the object, or of each of several, one for each core at a time.
-    Use the result as Localizer.prepare(..., scorer="FILE.safetensors").
+    The network learns from simulated touches of the object. Of several objects, each gets its own weights; they are
+    trained in parallel, one on each core. The same command resumes a stopped run. Use the result by --scorer
+    FILE.safetensors, or in Python by Localizer.prepare(..., scorer="FILE.safetensors").
     """
     options = dict(locals())
     parts = parts_of(object_name)
@@ -71,7 +75,7 @@ def train(
         return
     if jobs is not None or ray is not None:
         raise UsageError(
-            "--jobs and --ray train for several objects: give them with --object, with commas between them"
+            "--jobs and --ray train for several objects; give their names by --object, with commas between them"
         )
     if out.suffix != ".safetensors":
         raise UsageError(f"--out {out}: expected a name that ends in .safetensors")

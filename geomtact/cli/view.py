@@ -26,9 +26,7 @@ def view(
     skip_broken: options.SkipBroken = False,
     rotate: options.Rotate = None,
     mirror: options.Mirror = None,
-    host: Annotated[
-        str, typer.Option(help="Address of the page; 0.0.0.0 serves it to other machines, too.")
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address of the page; 0.0.0.0 serves it to other machines.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port; if it is taken, the next free one.")] = 8080,
     stay: Annotated[bool, typer.Option(help="Serve the page after the last image, until Ctrl-C.")] = True,
     seed: options.Seed = 0,
@@ -37,7 +35,7 @@ def view(
 ) -> None:
     """Track an object as 'geomtact track' does, and show its pose distribution live in the browser.
 
-    The page shows the sensor, the contact and the object at its most probable pose. Faint copies are at poses drawn
+    The page shows the sensor, the contact and the object at its most probable pose. Faint copies show poses drawn
     from the posterior. Needs viser: pip install 'geomtact\\[viz]'. Exit status as of 'geomtact track'.
     """
     from geomtact.report.viewer import Viewer, check_viewer
