@@ -240,7 +240,7 @@ def test_several_parts_are_trained_for_each_into_a_folder(tmp_path):
 def test_options_of_training_that_do_not_go_together_are_refused():
     words = ["train", "--object", "ball,hex_nut", "--architecture", "resnet50", "--pairs", "32", "--side", "32"]
     for wrong, said in (
-        ([*words, "--out", "one.safetensors"], "--out one.safetensors: expected a folder for the weights of 2 parts"),
+        ([*words, "--out", "one.safetensors"], "--out one.safetensors: expected a folder for the weights of 2 objects"),
         ([*words[:1], "--object", "ball", *words[3:], "--jobs", "2"], "--jobs and --ray train for several objects"),
         (
             ["train", "--object", "ball", *words[3:], "--steps", "64"],

@@ -143,15 +143,15 @@ def _train_thesis(
 
 
 def _train_each(parts: list[str], options: dict[str, Any]) -> None:
-    """For each of several parts, weights of its own in the folder ``out``."""
+    """For each of several objects, its own weights in the folder ``out``."""
     from geomtact.cli.shell import check_folder
 
     jobs, ray = options.pop("jobs"), options.pop("ray")
     folder: Path = options["out"]
     if folder.suffix:
-        raise UsageError(f"--out {folder}: expected a folder for the weights of {len(parts)} parts")
+        raise UsageError(f"--out {folder}: expected a folder for the weights of {len(parts)} objects")
     if options["work"] is not None:
-        raise UsageError("--work: with several parts each has its own, beside its weights; leave it out")
+        raise UsageError("--work: of several objects, each has its own folder beside its weights; leave it out")
     check_folder(folder)
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
