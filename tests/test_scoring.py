@@ -14,13 +14,13 @@ from geomtact.contact_space.store import open_index
 from geomtact.errors import MeshError, UsageError
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.log_mass import normalised
 from geomtact.scoring import calibration
 from geomtact.scoring.calibration import (
     FLOORS,
     Calibration,
     CalibrationTouches,
     fit_calibration,
-    normalised,
     posterior_log_prob,
     simulate_touches,
 )

@@ -8,7 +8,6 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from geomtact.errors import InputError
@@ -16,6 +15,7 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry, about
 from geomtact.inference.posterior import Posterior
+from geomtact.log_mass import log_mean_of_counted
 from geomtact.se3 import Array, check_pose, exp, hat, inverse, log
 
 LogDensity = Callable[[Array], Array]
@@ -109,7 +109,7 @@ class OfAllImages:
         told = self.prior
         if isinstance(told, GaussianPrior):
             told = over_images(told, self.symmetry)
-        return mean_density([checked(told(T @ S), len(T)) for S in images(self.symmetry)])
+        return log_mean_of_counted([checked(told(T @ S), len(T)) for S in images(self.symmetry)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,12 +205,3 @@ def likeliest_images(density: LogDensity, T: Array, posterior: Posterior) -> Arr
             better = found > most
             images[better], most[better] = turned[better], found[better]
     return images
-
-
-def mean_density(each: ArrayLike, counts: NDArray[np.bool_] | None = None) -> Array:
-    """Log of the mean density (n,) over images, of the log density (m, n) of ``each``, or of those that count (m, n)."""
-    each = np.asarray(each, float)
-    counts = np.ones(each.shape, bool) if counts is None else counts
-    with np.errstate(invalid="ignore"):  # NaN is told of later
-        total = np.logaddexp.reduce(np.where(counts, each, -np.inf), 0)
-    return np.asarray(total - np.log(np.maximum(counts.sum(0), 1)))

@@ -31,7 +31,7 @@ from geomtact.inference.mode_refiner import ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.search import SensorView
-from geomtact.scoring.calibration import normalised
+from geomtact.log_mass import normalised
 from geomtact.se3 import Array, inverse
 
 # Of what two sensors show, at least: what a cell's width hides of the pose it hides from all of them

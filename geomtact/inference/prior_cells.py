@@ -15,12 +15,11 @@ from geomtact.inference.densities import (
     OfAllImages,
     checked,
     images,
-    mean_density,
     over_images,
 )
 from geomtact.inference.distribution import cell_densities, cell_log_density
 from geomtact.inference.posterior import Posterior
-from geomtact.scoring.calibration import normalised
+from geomtact.log_mass import log_mean_of_counted, normalised
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.sensor import Sensor
 
@@ -204,7 +203,7 @@ def _over_images(index: Index, density: LogDensity) -> Array:
             image = T @ S
             allowed[i] = ok = index.space.approaches(image)
             each[i, ok] = density(image[ok])
-        return mean_density(each, allowed)
+        return log_mean_of_counted(each, allowed)
 
     return _by_chunks(index, density if len(symmetric) == 1 else mean)
 

@@ -232,10 +232,3 @@ def posterior_log_prob(
 def chunks(n: int) -> list[slice]:
     """``n`` rows in parts that are worth a thread's time."""
     return [slice(start, start + _CHUNK) for start in range(0, n, _CHUNK)]
-
-
-def normalised(log_mass: NDArray[np.floating]) -> NDArray[np.floating]:
-    """``log_mass`` (N,) less the log of its sum, in its own precision: a log density is given up to a constant, however large."""
-    top = log_mass.max()
-    out: NDArray[np.floating] = log_mass - (top + np.log(np.exp(log_mass - top).sum(dtype=np.float64)))
-    return out

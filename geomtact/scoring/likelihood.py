@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
+from geomtact.log_mass import log_mean_exp
 from geomtact.scoring.overlap import overlaps, to_grid
 from geomtact.se3 import Array
 from geomtact.sensing.contact import SoftMask
@@ -111,9 +112,3 @@ def _felt(below: NDArray[np.floating], softness: float) -> NDArray[np.floating]:
 def _independent(area: float) -> float:
     """How much of an observation a pixel of ``area`` [m^2] is."""
     return min(1.0, area / _CORRELATED)
-
-
-def log_mean_exp(x: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Log of the mean over the columns of exp(``x``) (n, K)."""
-    top = x.max(1)
-    return top + np.log(np.exp(x - top[:, None]).mean(1))

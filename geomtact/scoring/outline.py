@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.scoring.likelihood import log_mean_exp
+from geomtact.log_mass import log_mean_exp
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
