@@ -190,7 +190,7 @@ def test_unit_is_never_guessed(tmp_path):
     refused("metres by definition.*re-export it in metres, or save it as STL", save(box(), tmp_path / "a.glb"), "mm")
     refused("unit is likely wrong; .*re-export it in metres", tmp_path / "a.glb", sensor=Sensor.load("gelslim"))
     assert load_mesh(stl, "MM").sha256 == load_mesh(stl, "mm").sha256
-    refused("catalogue says mm", "pin", "m")
+    refused("catalogue.s unit is mm", "pin", "m")
     assert load_mesh(catalogue()["pin"].file).sha256 == load_mesh("pin").sha256
 
 

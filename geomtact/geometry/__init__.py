@@ -1,1 +1,1 @@
-"""Parts: their mesh in metres, their units, their own symmetry, and grids of rotations."""
+"""Objects: their mesh in metres, their units, their own symmetry, and grids of rotations."""

@@ -1,4 +1,4 @@
-"""The bundled objects: ``meshes/catalogue.toml`` says each one's file, unit, hash, licence and symmetry."""
+"""The bundled objects: ``meshes/catalogue.toml`` lists each one's file, unit, hash, licence and symmetry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plane faces that an object can be put down on: the directions about which a little tilt changes much of what is felt.
+"""Plane faces that an object can be put down on: the directions about which a little tilt changes much of the contact.
 
 Triangles are gathered by their normals (the extended Gaussian image, Horn 1984), then by the plane in which they lie.
 """
@@ -16,7 +16,7 @@ from geomtact.se3 import Array
 
 _NSIDE = 64  # HEALPix pixels of normals, about a degree wide
 _SAME_NORMAL = np.cos(np.deg2rad(0.5))
-_SAME_PLANE = 2e-5  # m: what lies no higher or lower is felt as one face
+_SAME_PLANE = 2e-5  # m: what lies no higher or lower touches as one face
 _LEAST = 0.002  # share of the surface from which a face counts
 
 

@@ -1,4 +1,4 @@
-"""A part's surface in metres, in the frame of its own file."""
+"""An object's surface in metres, in the frame of its own file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A part's mesh from its file, checked before anything is computed from it."""
+"""An object's mesh from its file, checked before anything is computed from it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _SMALLEST, _LARGEST = 1e-4, 1e3
 
 
 class _SensorLike(Protocol):
-    """What the scale check needs to know of a sensor, which is a later stage."""
+    """What the scale check needs of a sensor, which is a later stage."""
 
     @property
     def name(self) -> str: ...
@@ -103,7 +103,7 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
         entry = objects[name]
         if unit is not None and unit != entry.unit:
             raise MeshError(
-                f"{text}: the catalogue says {entry.unit}, but the unit {unit} was given; leave the unit out"
+                f"{text}: the catalogue's unit is {entry.unit}, but the unit {unit} was given; leave the unit out"
             )
         return name, entry.file, entry.unit, entry.symmetry
     suffix = path.suffix.lower()
@@ -206,7 +206,7 @@ def _tidy(vertices: Array, faces: NDArray, path: Path, unit: str) -> tuple[Array
 
 
 def _check_folds(vertices: Array, faces: NDArray[np.int32], path: Path) -> tuple[str, ...]:
-    """Refuse a surface that is folded back onto itself where a sensor would feel it; of less, a warning."""
+    """Refuse a surface that is folded back onto itself where a sensor would touch it; of less, a warning."""
     folded = folded_faces(vertices, faces)
     if not len(folded):
         return ()

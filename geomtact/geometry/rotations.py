@@ -3,7 +3,7 @@
 A rotation is its approach (``geometry.approach``) and its *turn*, what is left: a rotation about the sensor's z. Haar
 measure is solid angle times turn. Directions are HEALPix pixels (Gorski et al. 2005), so level l has 12 * 4^l directions
 and 6 * 2^l turns, nested and of equal volume (Yershova et al. 2010): 576, 4,608, 36,864 and 294,912 rotations for l = 1
-to 4. About plane faces, where a little tilt changes much of what is felt, directions may be finer (``disks``).
+to 4. About plane faces, where a little tilt changes much of the contact, directions may be finer (``disks``).
 
 What the object's symmetry makes equal is kept once, and what the scene rules out (``approach``) not at all: every
 allowed direction is mapped to one canonical image of its orbit, and a pixel's weight is the solid angle that lands in it.

@@ -1,4 +1,4 @@
-"""STL, in binary or as text: its triangles, as many as are there without doubt."""
+"""STL, in binary or as text: its triangles, as many as are complete."""
 
 from __future__ import annotations
 

@@ -149,7 +149,7 @@ class _Body:
         )
 
     def candidates(self) -> tuple[list[Array], list[Array]]:
-        """Directions (3,) that may be axes of turns of any order, and further rotations (3, 3) worth a test."""
+        """Directions (3,) that may be axes of turns of any order, and further rotations (3, 3) to test."""
         axes = list(self.principal)
         low, mid, high = self.moments
         # What the tolerance can do to second moments, generously: too many candidates only cost time.
