@@ -136,7 +136,7 @@ def test_whole_numbers_of_a_reading_are_0_to_255(background):
     assert np.array_equal(*same)
     wide[3, 4, 1] = 1000
     with pytest.raises(
-        ImageError, match=r"a reading of int32 must lie in 0\.\.255, got \d+ to 1000; give uint8 or uint16"
+        ImageError, match=r"a tactile image of int32 must lie in 0\.\.255, got \d+ to 1000; give uint8 or uint16"
     ):
         read_observation(wide, MINI, background=background)
 
@@ -175,7 +175,7 @@ def test_three_channels_are_a_reading_in_rgb_order(tmp_path, background, rng):
 def test_other_grey_is_a_reading_with_a_warning(background, rng):
     grey = press(background, 120, 100, 40, rng)[..., 1]
     seen = read_observation(grey, MINI, background=background[..., 1])
-    assert seen.kind == "reading" and "grey image with many values is taken as a reading" in seen.warnings[0]
+    assert seen.kind == "reading" and "grey image with many values is read as a tactile image" in seen.warnings[0]
     assert np.hypot(*(np.argwhere(seen.contact.mask).mean(0) - [100, 120])) < 20
 
 
@@ -252,7 +252,7 @@ def test_a_background_for_a_mask_is_said_to_be_unused(background):
         (np.where(MASK, np.inf, 0), "values are NaN or infinite"),
         (HEIGHT - 2e-4, "depths of the gel's indentation are >= 0; the lowest is -0.0002 m"),
         (HEIGHT * 1e3, "expected depths in metres up to about 0.002, the largest is 0.52"),
-        (np.dstack([*np.mgrid[:240, :320], MASK]) / 1.0, "a float reading must lie in 0..1, got 0 to 319; divide by"),
+        (np.dstack([*np.mgrid[:240, :320], MASK]) / 1.0, "a float tactile image must lie in 0..1, got 0 to 319; divide by"),
     ],
 )  # fmt: skip
 def test_arrays_that_make_no_sense_are_refused(array, message):

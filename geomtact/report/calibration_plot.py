@@ -48,7 +48,7 @@ def draw_calibration(found: SensorCalibration, ball_diameter: float) -> bytes:
             )
         image.set(xlim=(-0.5, shown.shape[1] - 0.5), ylim=(shown.shape[0] - 0.5, -0.5), xlabel="column [px]")
         image.set_title(press.name.rsplit("/", 1)[-1][-24:], fontsize=9)
-        depth = relief(press.change, press.felt, colour, pitch)[round(float(np.clip(v, 0, len(shown) - 1)))]
+        depth = relief(press.change, press.changed, colour, pitch)[round(float(np.clip(v, 0, len(shown) - 1)))]
         x = (np.arange(len(depth)) - u) * pitch[0]
         profile.plot(1e3 * x, 1e3 * depth, color=COLOURS[0], label="from colours")
         ball = 0.5 * ball_diameter

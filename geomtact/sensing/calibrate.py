@@ -46,7 +46,7 @@ class SensorCalibration:
     presses : that were used
     left_out : why others were not, by their names
     diameters : (n,) of the ball [m], measured on each press by a table that was fitted to the others
-    warnings : what speaks against it, one line each
+    warnings : signs of a poor calibration, one line each
     """
 
     sensor: Sensor
@@ -138,19 +138,21 @@ def calibrate_sensor(
             f"calibrate: {len(found)} presses contradict each other: colours fitted to all but one measure the ball "
             f"{100 * abs(off):.0f} % wrongly on that one; press one ball in a dozen times, all over the window"
         )
-    unlike = sum(why != SAME for why in left_out.values())
-    doubts = []
+    without_ball = sum(why != SAME for why in left_out.values())
+    warnings = []
     if pitch[0] > most:
-        doubts = [
+        warnings = [
             f"some imprints are wider than the ball, which allows a pitch of {1e3 * most:.4f} mm at most; {1e3 * pitch[0]:.4f} "
             "was given: measure it, and the ball"
         ]
-    return SensorCalibration(sensor, found, left_out, diameters, [*doubts, *_doubts(found, unlike, diameters, off)])
+    return SensorCalibration(
+        sensor, found, left_out, diameters, [*warnings, *_warnings(found, without_ball, diameters, off)]
+    )
 
 
 def _check_rest(presses: Sequence[Press]) -> None:
     """Refuse presses of which nearly all change one place, as they do against a background in which something is pressed in."""
-    everywhere = np.mean([press.felt for press in presses], axis=0) >= _EVERYWHERE
+    everywhere = np.mean([press.changed for press in presses], axis=0) >= _EVERYWHERE
     if everywhere.sum() > np.pi * np.median([press.radius for press in presses]) ** 2:
         v, u = (int(np.median(each)) for each in np.nonzero(everywhere))
         raise InputError(
@@ -171,13 +173,16 @@ def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor
     return replace(sensor, colour=colour, height_noise=height_noise), diameters
 
 
-def _doubts(presses: Sequence[Press], unlike: int, diameters: Array, off: float) -> list[str]:
-    """What speaks against a calibration by these presses, beside which ``unlike`` others show no ball of that size. On each the
-    others measure the ball's ``diameters`` (n,) [m], NaN where they see none, wrongly by a share ``off`` in the median."""
+def _warnings(presses: Sequence[Press], without_ball: int, diameters: Array, off: float) -> list[str]:
+    """The warnings of a calibration by these presses; ``without_ball`` further images show no ball of that size.
+
+    The other presses measure the ball's ``diameters`` (n,) [m] on each, NaN where they see none, wrongly by a share ``off`` in
+    the median.
+    """
     out = []
-    if unlike > len(presses):
+    if without_ball > len(presses):
         out.append(
-            f"on {unlike} presses no ball of that size was found, on {len(presses)} it was: depths may be worthless; see why "
+            f"on {without_ball} presses no ball of that size was found, on {len(presses)} it was: depths may be wrong; see why "
             "each is left out, and press one ball in a dozen times, not deeper than to its middle, wholly within the window"
         )
     window = np.array(presses[0].mask.shape[::-1])
@@ -238,7 +243,7 @@ def _left_one_out(
         weights = weights_of([s for k, s in enumerate(samples) if k != i])
         x, y = (tuple(map(float, row)) for row in weights)
         on = OnBall.within(press, sensor, INNER)
-        depths = relief(press.change, press.felt, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)
+        depths = relief(press.change, press.changed, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)
         beside.append(float((depths[on.at] - on.height(radius)).std()))
         features, true = samples[i]
         sloping = true.any(1)
@@ -267,12 +272,12 @@ def diameter_from_colours(press: Press, sensor: Sensor, weights: Array) -> float
 
 
 def _at_rest(presses: Sequence[Press], colour: ColourTable, pitch: tuple[float, float]) -> tuple[float, float]:
-    """How far (rms) from 0 the depth is where nothing is felt, and how deep it is at the border of the contact [m]: medians."""
+    """How far (rms) from 0 the depth is outside of the contact, and how deep it is at the border of the contact [m]: medians."""
     noise, depth = [], []
     for press in presses:
-        below = relief(press.change, press.felt, colour, pitch)
+        below = relief(press.change, press.changed, colour, pitch)
         border = press.mask & ~binary_erosion(press.mask, border_value=1)
         depth.append(float(np.median(below[border])))
-        if not press.felt.all():
-            noise.append(float(np.sqrt((below[~press.felt] ** 2).mean())))
+        if not press.changed.all():
+            noise.append(float(np.sqrt((below[~press.changed] ** 2).mean())))
     return float(np.median(noise)) if noise else 0.0, max(0.0, float(np.median(depth)))

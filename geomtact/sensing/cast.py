@@ -1,4 +1,4 @@
-"""What the sensor would feel at a pose, by ray casting (thesis 6.1.3).
+"""Where an object touches a sensor at a pose, by ray casting (thesis 6.1.3).
 
 A camera with the sensor's own optics looks through the gel; a pixel is in contact where the object comes nearer than
 the membrane. Rays are cast in the object frame, so one Embree scene serves every pose.

@@ -1,4 +1,4 @@
-"""What has changed in a tactile image since its background: colours, where that is felt, and images that do not compare."""
+"""What has changed in a tactile image since its background: colours, where these changed, and images that do not compare."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ _STRONG, _WEAK = 8.0, 3.0  # in units of the image's own noise
 
 
 def colour_change(image: Image, background: Image) -> tuple[Array, Mask]:
-    """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it is felt."""
-    change, felt, _, _ = change_from(image, background, min(image.shape[:2]) / GRID)
-    return change, felt
+    """The smoothed change (H, W, 3) of an image 0..1 from its background, and where (H, W) it exceeds the noise."""
+    change, changed, _, _ = change_from(image, background, min(image.shape[:2]) / GRID)
+    return change, changed
 
 
 def change_from(
     image: Image, background: Image, sigma: float, estimated: bool = False
 ) -> tuple[Array, Mask, Mask, float]:
-    """The smoothed change (H, W, 3) from the background, which may be ``estimated``, where it is felt and where strongly so, and
-    its noise."""
+    """The smoothed change (H, W, 3) from the background, which may be ``estimated``, where it exceeds the noise, where
+    strongly so, and its noise."""
     change = _without_light_drift(blurred(image, sigma), blurred(background, sigma), 2 * round(0.5 * sigma - 0.5) + 1)
     # an estimated background is off by more than the noise: what most pixels are off by counts as noise too
     floor = median_of(size_of(change).ravel()) if estimated else 0.0
-    return change, *_felt(change, sigma, floor)
+    return change, *_changed(change, sigma, floor)
 
 
 def smooth_background(image: Array) -> Array:
@@ -80,7 +80,7 @@ def _without_light_drift(image: Array, reference: Array, step: int) -> Array:
     return image - gains * reference - offsets
 
 
-def _felt(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]:
+def _changed(change: Array, sigma: float, floor: float) -> tuple[Mask, Mask, float]:
     """The regions (H, W) that stand out of the noise somewhere, those places, and the noise: hysteresis."""
     step, apart = max(1, round(3 * sigma)), pixels_apart(sigma)
     noise2 = 0.0

@@ -24,7 +24,9 @@ _BORDER, _NEAR_HIGHEST = 0.8, 0.1  # share of the border, and of the range of de
 
 
 def depths_of(array: NDArray[Any], name: str, sensor: Sensor, warnings: list[str]) -> NDArray[np.float32]:
-    """How deep the gel is pressed in (H, W) [m], of a depth map in float metres or 16-bit micrometres; doubts go to ``warnings``.
+    """How deep the gel is pressed in (H, W) [m], of a depth map in float metres or 16-bit micrometres.
+
+    Doubtful values are reported in ``warnings``.
 
     Raises
     ------

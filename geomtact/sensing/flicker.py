@@ -43,7 +43,7 @@ class Evened(NamedTuple):
 
     @property
     def warnings(self) -> list[str]:
-        """What a user should know about the light: one line at most."""
+        """The warning, if any, about the light."""
         seen = f"grey stripes, off the background's brightness by {100 * self.stripes:.1f} % rms"
         do = "keep other lamps off the gel, or expose for whole periods of the mains"
         if self.unsure:

@@ -29,8 +29,8 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
 
     Returns
     -------
-    (H, W) metres, >= 0, in the sensor frame; 0 where nothing is felt. Where image and background are darker or brighter than when
-    the sensor was calibrated, that is made up for
+    (H, W) metres, >= 0, in the sensor frame; 0 where no colour changed. Where image and background are darker or brighter than
+    when     the sensor was calibrated, that is made up for
 
     Raises
     ------
@@ -54,13 +54,13 @@ def contact_height(image: Any, background: Any, sensor: Sensor | str) -> NDArray
 def height_of(image: Array, background: Array, sensor: Sensor) -> NDArray[np.float32]:
     """As :func:`contact_height`, of images (H, W, 3) of 0..1 in the frame of a calibrated sensor, without flickering light."""
     assert sensor.colour is not None
-    change, felt = colour_change(image, background)
+    change, changed = colour_change(image, background)
     change = change / sensor.colour.brighter(background)
-    return (np.maximum(relief(change, felt, sensor.colour, sensor.pixel_pitch), 0) * felt).astype(np.float32)
+    return (np.maximum(relief(change, changed, sensor.colour, sensor.pixel_pitch), 0) * changed).astype(np.float32)
 
 
-def relief(change: Array, felt: NDArray[np.bool_], colour: ColourTable, pitch: tuple[float, float]) -> Array:
-    """Depth (H, W) [m] of the gel below where it rests, of a change of colour (H, W, 3) that is ``felt`` where it is (H, W)."""
+def relief(change: Array, changed: NDArray[np.bool_], colour: ColourTable, pitch: tuple[float, float]) -> Array:
+    """Depth (H, W) [m] of the gel below its rest, of a ``change`` of colour (H, W, 3), present where ``changed`` (H, W)."""
     depth = integrate(colour.slopes(change), np.asarray(pitch))
-    rest = np.median(depth[~felt]) if (~felt).mean() > _SOME else depth.min()
+    rest = np.median(depth[~changed]) if (~changed).mean() > _SOME else depth.min()
     return np.asarray(depth - rest)

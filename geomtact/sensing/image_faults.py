@@ -13,7 +13,7 @@ _DARK, _DARK_SHARE = 0.02, 0.5  # all channels below this, in more than this sha
 _BRIGHT, _BRIGHT_SHARE = 0.995, 0.4  # any channel above this
 # of colour (0..1), by which half of the pixels are off at most, but for a gain and one offset a channel: of 103 real images
 # with their own backgrounds 0.062, with those of other sensors 0.109 or more
-_UNLIKE = 0.085
+_MISMATCH = 0.085
 _BETTER = 0.5  # of what a tactile image is off as it is, that it is off otherwise, where it was meant to be so
 _LEAST = 0.02  # off by less is no fault
 # widths [px] of structure, fine and less so (moved markers are fine alone, a board of pins is neither), and the share of the
@@ -57,7 +57,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
         ]
     if other:
         return [f"the image fits the background {_TURNS[other]}; give both as the camera made them"]
-    if off > _UNLIKE:
+    if off > _MISMATCH:
         return [
             f"the background seems to be of another sensor or light: half of the image is off by more than {100 * off:.0f} % of "
             "full brightness; take one with this sensor, untouched, now"
@@ -65,7 +65,7 @@ def faults(image: Array, background: Array | None) -> list[str]:
     return _background_outdated(rest, seen, gain)
 
 
-def unlike_calibrated(background: Array, colour: ColourTable) -> list[str]:
+def calibration_mismatches(background: Array, colour: ColourTable) -> list[str]:
     """What seems wrong with images of a calibrated sensor whose background is (H, W, 3), 0..1, in the sensor frame: it is
     compared with the one that the ``colour`` was fitted with, where that was kept."""
     if colour.rest is None:
@@ -82,9 +82,9 @@ def unlike_calibrated(background: Array, colour: ColourTable) -> list[str]:
             f"image and background seem to be {_TURNS[other]} since the sensor was calibrated: give them as the presses were, or "
             "say how the camera is mounted (--rotate, --mirror, or camera_rotation_deg in the sensor's file)"
         ]
-    if off > _UNLIKE:
+    if off > _MISMATCH:
         return [
-            f"the background is unlike that of the sensor's calibration: half of it is off by more than {100 * off:.0f} % of "
+            f"the background differs from that of the sensor's calibration: half of it is off by more than {100 * off:.0f} % of "
             "full brightness; calibrate the sensor again, with this gel and light"
         ]
     if abs(gain - 1) <= _DRIFT:

@@ -24,7 +24,7 @@ from geomtact.sensing.pixels import Mask, blurred, filled, median_of, opened, si
 from geomtact.sensing.sensor import CONTACT_METHODS, Sensor
 from geomtact.sensing.slope import integrate, of_gradient, slope_field
 
-BySlope = Callable[[Array, Mask, Mask, float, Array], tuple[Array, Mask]]  # slope, felt, strong, sigma, pitch
+BySlope = Callable[[Array, Mask, Mask, float, Array], tuple[Array, Mask]]  # slope, changed, strong, sigma, pitch
 
 _NOISE_SHARE = 0.03  # noise over signal above which the image is smoothed more
 _PRESSED = 0.3  # of the largest pressure, that counts as contact: the best in simulated images of many gels and lamps
@@ -32,8 +32,8 @@ _ONE_COLOUR = 0.03  # power of the second colour over that of the first, under w
 _EITHER_WAY = 0.6  # of what gets darker over what gets brighter, or the reverse, from which on slopes are seen
 _HARDLY_LESS = 0.1  # of the fastest fall, by which others fall less fast that count too
 _SURELY = 0.501  # probability of what counts as contact, at least
-# Brightness from which on a camera shows no change, or less than elsewhere; and the share of what is felt that is so bright, more
-# than a glint, from which on colours are no linear image of slopes
+# Brightness above which a camera shows less change than elsewhere. And the share of changed pixels so bright, more than a glint,
+# above which colours are no linear image of slopes.
 _NEARLY_WHITE, _BLOWN_OUT = 0.95, 0.01
 
 
@@ -127,28 +127,28 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
     reference = smooth_background(image) if reference is None else on_grid(reference)
     # a second look smooths more where noise asks for it
     sigma = min(image.shape[:2]) / GRID
-    change, felt, strong, noise = change_from(image, reference, sigma, estimated)
-    if felt.any():
-        noise_share = noise / float(np.quantile(size_of(change)[felt], 0.9))
+    change, changed, strong, noise = change_from(image, reference, sigma, estimated)
+    if changed.any():
+        noise_share = noise / float(np.quantile(size_of(change)[changed], 0.9))
         if noise_share > _NOISE_SHARE:
             sigma *= min(noise_share / _NOISE_SHARE, 2.0)
-            change, felt, strong, _ = change_from(image, reference, sigma, estimated)
-    if not felt.any():
+            change, changed, strong, _ = change_from(image, reference, sigma, estimated)
+    if not changed.any():
         return FoundContact(np.zeros(size[::-1], bool), None, "classical" if method == "auto" else method)
     if method == "auto":
-        method = "learned" if _blown_out(felt, image, reference) > _BLOWN_OUT else "classical"
-    colours = _colours(change, felt)
+        method = "learned" if _blown_out(changed, image, reference) > _BLOWN_OUT else "classical"
+    colours = _colours(change, changed)
     if colours.one:
         method = "classical"
     if method == "learned":
-        probability = _by_network(change, image, felt)
+        probability = _by_network(change, image, changed)
         mask = _components(filled(probability > 0.5), probability, strong, sigma)
         # what is no contact by its size or for want of change is none by its probability either
         probability = np.where(mask, np.maximum(probability, _SURELY), np.where(probability > 0.5, 0, probability))
         full = np.asarray(cv2.resize(probability, size, interpolation=cv2.INTER_LINEAR), np.float32)
         return FoundContact(full > 0.5, full, method)
     by_slope = _by_pressure if method == "pressure" else _by_rim
-    pressed, mask = _by_colour(change, colours, felt, strong, sigma, pitch, by_slope)
+    pressed, mask = _by_colour(change, colours, changed, strong, sigma, pitch, by_slope)
     mask = _components(mask, pressed, strong, sigma)
     mask = np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5)
     return FoundContact(mask, None, method)
@@ -161,93 +161,93 @@ def on_grid(image: Array) -> Array:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def _blown_out(felt: Mask, *images: Array) -> float:
-    """Share of what is ``felt`` (H, W) where a channel of one of the ``images`` (H, W, 3) is about as bright as it can be."""
+def _blown_out(changed: Mask, *images: Array) -> float:
+    """Share of what is ``changed`` (H, W) where a channel of one of the ``images`` (H, W, 3) is about as bright as it can be."""
     bright = [(image >= _NEARLY_WHITE).any(-1) for image in images]
-    return float(np.logical_or.reduce(bright)[felt].mean())
+    return float(np.logical_or.reduce(bright)[changed].mean())
 
 
-def _colours(change: Array, felt: Mask) -> _Colours:
-    """Those along which all that is felt changes."""
-    values = change[felt]
+def _colours(change: Array, changed: Mask) -> _Colours:
+    """Those along which the changed pixels vary."""
+    values = change[changed]
     power, directions = np.linalg.eigh(values.T @ values / len(values))
     return _Colours(power, directions, bool(power[1] <= _ONE_COLOUR * power[2]))
 
 
 def _by_colour(
-    change: Array, colours: _Colours, felt: Mask, strong: Mask, sigma: float, pitch: Array, by_slope: BySlope
+    change: Array, colours: _Colours, changed: Mask, strong: Mask, sigma: float, pitch: Array, by_slope: BySlope
 ) -> tuple[Array, Mask]:
     """How much the gel is pressed in (H, W), up to a factor, and the contact: by its slope, where colours give that."""
     if colours.one:
-        return _half_as_large(_one_way(change @ colours.directions[:, 2], felt), felt)
+        return _half_as_large(_one_way(change @ colours.directions[:, 2], changed), changed)
     plane = transformed(change, (colours.directions[:, 1:] / np.sqrt(colours.power[1:])).T)
-    slope = slope_field(plane, felt, sigma, pitch)
+    slope = slope_field(plane, changed, sigma, pitch)
     if slope is None:
-        return _half_as_large(size_of(change), felt)
-    return by_slope(slope, felt, strong, sigma, pitch)
+        return _half_as_large(size_of(change), changed)
+    return by_slope(slope, changed, strong, sigma, pitch)
 
 
-def _by_rim(slope: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
+def _by_rim(slope: Array, changed: Mask, strong: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
     """The gel's indentation (H, W), up to a factor, and the contact: within the rim where it is steepest."""
     height = integrate(slope, pitch)
-    height = _indentation(_inwards(height, felt) * height, felt)
-    return height, _inside_rim(height, slope, felt, sigma)
+    height = _indentation(_inwards(height, changed) * height, changed)
+    return height, _inside_rim(height, slope, changed, sigma)
 
 
-def _by_pressure(slope: Array, felt: Mask, strong: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
+def _by_pressure(slope: Array, changed: Mask, strong: Mask, sigma: float, pitch: Array) -> tuple[Array, Mask]:
     """The pressure (H, W), up to a factor, that gives an elastic half-space this ``slope``, and the contact: where there is any.
 
     A wave of pressure of number k sinks in by 1/k of it (Johnson 1985, 13.2), so pressure is k times the height: the Riesz
     transform of the gradient, as noisy as that and no more.
     """
     height, pressed = of_gradient(slope, pitch, 2, 1)
-    pressed *= _inwards(height, felt)
-    mask = (pressed > _PRESSED * np.quantile(pressed[strong], 0.98)) & felt
+    pressed *= _inwards(height, changed)
+    mask = (pressed > _PRESSED * np.quantile(pressed[strong], 0.98)) & changed
     mask = opened(filled(mask), max(1, round(sigma)))
-    return np.maximum(pressed, 0) * felt, mask
+    return np.maximum(pressed, 0) * changed, mask
 
 
-def _one_way(along: Array, felt: Mask) -> Array:
+def _one_way(along: Array, changed: Mask) -> Array:
     """By how much (H, W) a gel of one colour changes that gets brighter ``along`` (H, W) or darker: a white one as it does where
     it is pressed in most, a grey picture of lit slopes either way."""
-    brighter, darker = (max(float(np.quantile(way * along[felt], 0.98)), 0.0) for way in (1, -1))
+    brighter, darker = (max(float(np.quantile(way * along[changed], 0.98)), 0.0) for way in (1, -1))
     if min(brighter, darker) > _EITHER_WAY * max(brighter, darker):
         return np.abs(along)
     return np.maximum(along if brighter > darker else -along, 0)
 
 
-def _half_as_large(size: Array, felt: Mask) -> tuple[Array, Mask]:
-    """``size`` (H, W) where it is felt, and where it is more than half of the largest."""
-    size = size * felt
-    return size, filled(size > 0.5 * np.quantile(size[felt], 0.95))
+def _half_as_large(size: Array, changed: Mask) -> tuple[Array, Mask]:
+    """``size`` (H, W) where ``changed``, and where it is more than half of the largest."""
+    size = size * changed
+    return size, filled(size > 0.5 * np.quantile(size[changed], 0.95))
 
 
-def _by_network(change: Array, image: Array, felt: Mask) -> Array:
-    """The probability (H, W) of contact, none where nothing is felt."""
+def _by_network(change: Array, image: Array, changed: Mask) -> Array:
+    """The probability (H, W) of contact, 0 where no colour changed."""
     from geomtact.sensing.mask_network import contact_probability
 
-    return np.asarray(contact_probability(change, image) * felt, float)
+    return np.asarray(contact_probability(change, image) * changed, float)
 
 
-def _inwards(height: Array, felt: Mask) -> float:
+def _inwards(height: Array, changed: Mask) -> float:
     """1 where the gel is pressed in towards larger ``height`` (H, W), else -1."""
-    if (~felt).mean() > 0.15:
-        depth = cv2.distanceTransform(felt.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)[felt]
-        inward = ((height[felt] - height[felt].mean()) * depth).sum()
+    if (~changed).mean() > 0.15:
+        depth = cv2.distanceTransform(changed.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)[changed]
+        inward = ((height[changed] - height[changed].mean()) * depth).sum()
     else:
         # a contact that fills the window: the dome's difference from the object is curved downwards over most of it
-        inward = -median_of(cv2.Laplacian(height, -1)[felt])
+        inward = -median_of(cv2.Laplacian(height, -1)[changed])
     return -1.0 if inward < 0 else 1.0
 
 
-def _indentation(height: Array, felt: Mask) -> Array:
-    """``height`` (H, W) with its zero set: the gel rests where nothing is felt, pressed in elsewhere."""
-    unfelt = float((~felt).mean())
-    rest = median_of(height[~felt]) if unfelt > 0.05 else np.quantile(height, 0.02)
-    return np.maximum(height - rest, 0) * felt
+def _indentation(height: Array, changed: Mask) -> Array:
+    """``height`` (H, W) with its zero set: the gel rests where no colour changed, pressed in elsewhere."""
+    unchanged = float((~changed).mean())
+    rest = median_of(height[~changed]) if unchanged > 0.05 else np.quantile(height, 0.02)
+    return np.maximum(height - rest, 0) * changed
 
 
-def _inside_rim(height: Array, slope: Array, felt: Mask, sigma: float) -> Mask:
+def _inside_rim(height: Array, slope: Array, changed: Mask, sigma: float) -> Mask:
     """Where the walk uphill to the deepest indentation no longer meets a slope much steeper than the one underfoot.
 
     Inside a contact the gel takes the object's shape; outside it relaxes, and the slope dies away from the rim on.
@@ -256,16 +256,16 @@ def _inside_rim(height: Array, slope: Array, felt: Mask, sigma: float) -> Mask:
     ahead = blurred(_uphill_maximum(height, steep), 2 * sigma)
     share = steep / np.maximum(ahead, 1e-12)
     share[height > 0.6 * float(height.max())] = 1.0
-    inside = (height > 0.1 * float(height.max())) & (share >= _steepest_fall(share, felt))
+    inside = (height > 0.1 * float(height.max())) & (share >= _steepest_fall(share, changed))
     return opened(filled(inside), max(1, round(2 * sigma)))
 
 
-def _steepest_fall(share: Array, felt: Mask) -> float:
+def _steepest_fall(share: Array, changed: Mask) -> float:
     """The level of ``share`` (H, W) on whose contour it falls fastest in the mean: the mean of those where it hardly falls less
     fast, so that of two alike neither wins by a rounding error."""
     edges = np.linspace(0.4, 0.9, 21)
-    fall = np.hypot(*np.gradient(share))[felt]
-    bins = np.searchsorted(edges, share[felt], side="right")
+    fall = np.hypot(*np.gradient(share))[changed]
+    bins = np.searchsorted(edges, share[changed], side="right")
     count = np.bincount(bins, minlength=22)[1:-1]
     mean = np.bincount(bins, fall, minlength=22)[1:-1] / np.maximum(count, 1)
     mean = np.convolve(np.pad(mean, 2, mode="edge"), np.ones(5) / 5, mode="valid")

@@ -14,10 +14,10 @@ from geomtact.sensing.calibrate import SensorCalibration, diameter_from_colours,
 from geomtact.sensing.press import Press
 from geomtact.sensing.sensor import Sensor
 
-_UNLIKE = 1.3  # times as large has one of two balls to be
+_LEAST_SIZE_RATIO = 1.3  # of the diameters of the two balls
 _BEND = 5.0  # half diagonals of the window: radius of a membrane that is tried
 _STEPS = 3  # towards the one that is found
-_HOLLOW = 4.0  # standard deviations by which a curvature is negative beyond doubt
+_HOLLOW = 4.0  # standard deviations by which a curvature must be below 0 to count as negative
 _LEAST_BEND = 1.1  # half diagonals that the membrane's radius has at least
 _RESAMPLED = 400
 
@@ -41,13 +41,13 @@ def membrane_curvature(
     InputError
         The balls are of nearly one size, which determines nothing; or give a bulge that no window of this size has, or a hollow.
     """
-    if max(first_ball, second_ball) < _UNLIKE * min(first_ball, second_ball):
+    if max(first_ball, second_ball) < _LEAST_SIZE_RATIO * min(first_ball, second_ball):
         raise InputError(
             f"balls of {1e3 * first_ball:g} and {1e3 * second_ball:g} mm determine nothing of the membrane: one should be "
-            f"{_UNLIKE:g} times as large as the other, or larger"
+            f"{_LEAST_SIZE_RATIO:g} times as large as the other, or larger"
         )
     balls = ((first.presses, 0.5 * first_ball), (second.presses, 0.5 * second_ball))
-    flat = _told_by_the_other(balls, replace(first.sensor, membrane_radius=0.0))
+    flat = _cross_measured(balls, replace(first.sensor, membrane_radius=0.0))
     half_diagonal = float(np.hypot(*first.sensor.half_window))
     bend = gained = _BEND * half_diagonal
 
@@ -56,7 +56,7 @@ def membrane_curvature(
 
     every = [np.arange(len(each)) for each in flat]
     for _ in range(_STEPS):
-        bent = _told_by_the_other(balls, replace(first.sensor, membrane_radius=bend))
+        bent = _cross_measured(balls, replace(first.sensor, membrane_radius=bend))
         a, b = (there - here for here, there in zip(flat, bent, strict=True))
         # by the diameter of the larger ball, for a curvature of one
         gained = float(np.nanmedian(b) - np.nanmedian(a)) * bend
@@ -77,7 +77,7 @@ def membrane_curvature(
     return found, std
 
 
-def _told_by_the_other(balls: Sequence[tuple[Sequence[Press], float]], sensor: Sensor) -> list[Array]:
+def _cross_measured(balls: Sequence[tuple[Sequence[Press], float]], sensor: Sensor) -> list[Array]:
     """For either ball the log of its diameter on each press, by the colours fitted to the other's presses, over its own."""
     weights = [weights_of([samples_on(press, sensor, radius) for press in presses]) for presses, radius in balls]
     return [

@@ -28,7 +28,7 @@ class Press:
     Attributes
     ----------
     name : of its image
-    change, felt : (H, W, 3) of colour from the background, and (H, W) where it is felt
+    change, changed : (H, W, 3) of colour from the background, and (H, W) where that exceeds the noise
     mask : (H, W) its imprint
     centre : (column, row) of the imprint's circle [px]
     radius : and its radius along x [px]
@@ -36,7 +36,7 @@ class Press:
 
     name: str
     change: Array
-    felt: NDArray[np.bool_]
+    changed: NDArray[np.bool_]
     mask: NDArray[np.bool_]
     centre: Array
     radius: float
@@ -57,7 +57,7 @@ def find_presses(
             continue
         seen.append(image)
         image = without_flicker(image, reference).image
-        change, felt = colour_change(image, reference)
+        change, changed = colour_change(image, reference)
         mask = contact_of(image, reference, "auto", np.array([1.0, stretch]) / min(1.0, stretch)).mask
         if not mask.any():
             left_out[name] = "no contact was found"
@@ -66,7 +66,7 @@ def find_presses(
         if isinstance(circle, str):
             left_out[name] = circle
         else:
-            found.append(Press(name, change, felt, mask, *circle))
+            found.append(Press(name, change, changed, mask, *circle))
     return found, left_out
 
 

@@ -1,4 +1,4 @@
-"""What one image of the sensor says: a mask, a depth map or an RGB image becomes a contact."""
+"""The contact in one image of the sensor: a mask, a depth map or an RGB image becomes a contact."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from geomtact.sensing.depth_map import depths_of
 from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
 from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.height import height_of
-from geomtact.sensing.image_faults import faults, unlike_calibrated
+from geomtact.sensing.image_faults import calibration_mismatches, faults
 from geomtact.sensing.image_file import read_image, read_metadata, write_image
 from geomtact.sensing.local_shape import contact_mask, find_contact, on_grid
 from geomtact.sensing.sensor import Sensor
@@ -153,7 +153,7 @@ def _in_sensor_frame(
     array: NDArray[Any], source: Any, name: str, kind: str, sensor: Sensor, warnings: list[str]
 ) -> NDArray[Any]:
     """An image (H, W, ...) of a ``source``, turned as the sensor's camera is mounted. Masks and depth maps are in the sensor
-    frame already, unless the sensor says that they are not; so is what ``simulate`` wrote."""
+    frame already, unless the sensor's file states otherwise; so is what ``simulate`` wrote."""
     straight = sensor.straight_from_camera(array)
     if not (sensor.turned or straight):
         return array
@@ -224,11 +224,12 @@ def _decide(array: NDArray[Any], name: str, beside_background: bool, warnings: l
             return "height"
     if (half := bright_half(array)) is not None and half.any():
         warnings.append(
-            f"{name}: nearly black and white, taken as a reading; for a mask give --kind mask (and PNG, which keeps it exact)"
+            f"{name}: nearly black and white, read as a tactile image; "
+            "for a mask give --kind mask (and PNG, which keeps it exact)"
         )
     elif array.ndim == 2:
         warnings.append(
-            f"{name}: a grey image with many values is taken as a reading; for a mask or height give --kind"
+            f"{name}: a grey image with many values is read as a tactile image; for a mask or height give --kind"
         )
     return "reading"
 
@@ -295,7 +296,7 @@ def _reading(
             warnings.append(f"{name}: the image is grey, so the sensor's colours give no depth map: give it in colour")
         else:
             height = height_of(seen, reference, sensor)
-            warnings.extend(f"{name}: {fault}" for fault in unlike_calibrated(reference, sensor.colour))
+            warnings.extend(f"{name}: {fault}" for fault in calibration_mismatches(reference, sensor.colour))
     return Contact(touch.mask, height, probability=touch.probability), touch.method
 
 
@@ -314,7 +315,7 @@ def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:
     elif array.dtype.kind in "ui" and array.dtype != np.uint8:
         if array.min() < 0 or array.max() > 255:
             raise ImageError(
-                f"{name}: a reading of {array.dtype} must lie in 0..255, got {array.min()} to {array.max()}; give uint8 or "
+                f"{name}: a tactile image of {array.dtype} must lie in 0..255, got {array.min()} to {array.max()}; give uint8 or "
                 "uint16, or depths as uint16 (micrometres) with --kind height"
             )
         array = array.astype(np.uint8)
@@ -322,6 +323,6 @@ def _rgb(array: NDArray[Any], name: str) -> NDArray[Any]:
         array = array.astype(float)
     if array.dtype.kind == "f" and (array.min() < 0 or array.max() > 1):
         raise ImageError(
-            f"{name}: a float reading must lie in 0..1, got {array.min():.4g} to {array.max():.4g}; divide by 255"
+            f"{name}: a float tactile image must lie in 0..1, got {array.min():.4g} to {array.max():.4g}; divide by 255"
         )
     return np.repeat(array[..., None], 3, -1) if array.ndim == 2 else array

@@ -41,7 +41,7 @@ class Lamps:
 
 
 def render(height: ArrayLike, pitch: tuple[float, float], background: ArrayLike, lamps: Lamps) -> NDArray[np.float32]:
-    """The reading (H, W, 3), RGB 0..1, of a gel that is pressed in.
+    """The tactile image (H, W, 3), RGB 0..1, of a gel that is pressed in.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def render(height: ArrayLike, pitch: tuple[float, float], background: ArrayLike,
 def example_reading(
     height: ArrayLike, pitch: tuple[float, float], noise: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """A reading (H, W, 3), RGB, of a gel between three lamps that is pressed in by ``height`` (H, W) [m]; ``noise`` is of each
-    pixel."""
+    """A tactile image (H, W, 3), RGB, of a gel between three lamps, pressed in by ``height`` (H, W) [m]; ``noise`` is
+    of each pixel."""
     h, w = np.shape(height)
     x, y = np.meshgrid(np.linspace(-1, 1, w), np.linspace(-1, 1, h))
     lamps = Lamps.around()

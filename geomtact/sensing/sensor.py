@@ -22,7 +22,7 @@ from geomtact.se3 import Array
 from geomtact.sensing.colour import ColourTable
 from geomtact.sensing.sensor_file import toml_text, toml_values
 
-_FOREIGN = (".yaml", ".yml", ".json")  # of files that other makers' programs read
+_OTHER_FORMATS = (".yaml", ".yml", ".json")  # of files that other makers' programs read
 HEIGHT_NOISE = 0.1e-3  # m, of a sensor whose file does not state it
 CONTACT_METHODS = (
     "auto",
@@ -152,14 +152,14 @@ class Sensor:
             return cls.from_toml(_folder().joinpath(f"{text}.toml").read_text("utf-8"), text)
         path = Path(text)
         suffix = path.suffix.lower()
-        if suffix in (".toml", *_FOREIGN) or path.is_file():
+        if suffix in (".toml", *_OTHER_FORMATS) or path.is_file():
             try:
                 content = read_text(path)
             except FileNotFoundError:
                 raise SensorError(f"sensor file {path}: no such file; give a TOML file or a bundled sensor") from None
             except (OSError, ValueError) as error:
                 raise SensorError(f"sensor file {path}: cannot be read ({error}); give a TOML file") from None
-            if suffix not in _FOREIGN:
+            if suffix not in _OTHER_FORMATS:
                 return cls.from_toml(content, str(path))
             from geomtact.sensing.foreign_sensor_files import BASE, foreign_values
 

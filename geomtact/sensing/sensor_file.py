@@ -55,7 +55,7 @@ def toml_values(text: str, origin: str, fields: Fields) -> dict[str, Any]:
     missing = [repr(key) for key, f in keys.items() if f.default is MISSING and key not in data]
     if missing:
         which = f"the key {missing[0]} is" if len(missing) == 1 else f"the keys {', '.join(missing)} are"
-        raise SensorError(f"{origin}: {which} missing; add what docs/formats.md says of a sensor's file")
+        raise SensorError(f"{origin}: {which} missing; add what docs/formats.md lists for a sensor's file")
     try:
         return {keys[key].name: _value(key, keys[key].name, value) for key, value in data.items()}
     except SensorError as error:

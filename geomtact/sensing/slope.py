@@ -10,11 +10,11 @@ from geomtact.sensing.pixels import Mask, blurred, transformed
 _CURL_LIMIT = 0.45  # share of curl above which the colours do not behave like slopes
 
 
-def slope_field(plane: Array, felt: Mask, sigma: float, pitch: Array) -> Array | None:
+def slope_field(plane: Array, changed: Mask, sigma: float, pitch: Array) -> Array | None:
     """The gel's slope (H, W, 2) up to a factor, of a change in two colours (H, W, 2); None where these do not determine it."""
     plane = blurred(plane, sigma)
     along_y, along_x = (np.gradient(plane, axis=axis) / pitch[1 - axis] for axis in (0, 1))
-    curl = np.concatenate([along_y, -along_x], -1)[felt]
+    curl = np.concatenate([along_y, -along_x], -1)[changed]
     residual, maps = np.linalg.eigh(curl.T @ curl)
     if residual[0] > _CURL_LIMIT * residual[-1]:
         return None

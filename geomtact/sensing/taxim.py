@@ -18,7 +18,7 @@ from geomtact.sensing.colour import ColourTable, fit_weights, terms
 
 _NAMES = ("bins", "grad_r", "grad_g", "grad_b")
 _STEEPEST = np.radians(30)  # that is fitted: beyond, colours hardly change any more
-_PLACES = 60_000  # all over the image, half of them fitted to and half judged
+_PLACES = 60_000  # all over the image, half of them fitted to and half held out
 
 
 def read_table(path: str | Path) -> Array:
