@@ -1,11 +1,10 @@
-"""A contact as registration sees it: its outline on the membrane, points inside and outside it, and heights where known.
+"""A contact as registration sees it: its outline on the membrane, points inside and outside it, and depths where measured.
 
 Along the outline the object's surface crosses the membrane, so the outline is a curve on the surface. An elastic gel sinks
-around the object: its outline lies a little above the surface. That offset along z looks exactly like a smaller
-penetration, so the outline cannot tell the two apart: its expected size is given (``sink``), and what is not known of it
-(``sink_std``) is taken off what the outline tells about z. Membrane inside the outline lies within the object, membrane
-outside of it does not. Where the reading has heights, the gel lies on the object's surface all over the contact, and nowhere
-in the object.
+around the object: its outline lies a little above the surface. That offset along z equals a smaller penetration, so the
+outline cannot separate the two. Its expected size is given (``sink``); its uncertainty (``sink_std``) limits what the outline
+constrains of z. Membrane inside the outline lies within the object, membrane outside of it does not. Where depths are
+measured, the gel lies on the object's surface all over the contact, and nowhere in the object.
 """
 
 from __future__ import annotations
@@ -19,13 +18,14 @@ from geomtact.se3 import Array, apply, inverse, unit
 from geomtact.sensing.contact import Contact, SoftMask
 from geomtact.sensing.sensor import Sensor
 
-SINK, SINK_STD = 0.2e-3, 0.35e-3  # m that a gel, rigid or elastic, is taken to sink around the object, give or take
-_FEWEST = 4  # points on a contour; shorter ones are specks
-FLAT = 0.05  # sine of the slope under which a surface does not cross the membrane
-_STEEP = 1.0  # slope of the gel beside a wall
-_MARGIN = 2  # px beside missing heights that are not used
-_CLEAR = 0.5e-3  # m that a point is off the outline to count as inside or outside of it
-_AROUND = 4e-3  # m from the contact within which points outside of it are taken
+# All constants are hand-set.
+SINK, SINK_STD = 0.2e-3, 0.35e-3  # depth that a gel, rigid or elastic, sinks around the object: mean and std [m]
+_FEWEST = 4  # least number of points on a contour; shorter ones are specks
+FLAT = 0.05  # sine of the slope below which a surface does not cross the membrane
+_STEEP = 1.0  # slope of the gel above which a wall is near
+_MARGIN = 2  # margin around missing depths that is not used [px]
+_CLEAR = 0.5e-3  # least distance from the outline of a point inside or outside of it [m]
+_AROUND = 4e-3  # largest distance from the contact of a point outside of it [m]
 
 
 def make_problem(
@@ -47,15 +47,15 @@ def make_problem(
     mask : (H, W) bool, on any grid over the sensor's window; or the probability of contact at each pixel, by which its outline
         is the less sure the more slowly that falls
     sensor : whose membrane the contact lies on
-    height : (H, W) how deep the gel is pressed in [m], where the reading tells; NaN tells nothing. The contact is then taken
-        to be where it is more than half of the deepest, and ``sink`` is not used
-    max_points : of the outline, of the heights, and of what lies inside and outside, at most
+    height : (H, W) how deep the gel is pressed in [m], NaN where it is not measured. The contact is then where it is more than
+        half of the deepest, and ``sink`` is not used
+    max_points : of the outline, of the depths, and of what lies inside and outside, at most
     outline_noise : how far the outline of a real mask strays, standard deviation along its normal [m]
-    height_noise : standard deviation of heights [m]; the sensor's by default
+    height_noise : standard deviation of depths [m]; the sensor's by default
     correlation : over what length both stray the same way [m]: to 1/e in a Gaussian field, as ``Noise.correlation``
     sink : how far below the membrane the object's surface lies at the outline [m]: 0 for a rigid gel, about 0.55 of the deepest
         for an elastic one
-    sink_std : and how much more or less it may be [m]; by default both gels may be
+    sink_std : standard deviation of ``sink`` [m]; the default spans both gels
     """
     shown = np.asarray(mask)
     contact: NDArray[np.bool_] = shown if shown.dtype == bool else shown > 0.5
@@ -78,7 +78,7 @@ def make_problem(
         inside, outside = inside + sink * _down(inside, sensor), outside + (sink + sink_std) * _down(outside, sensor)
     else:
         sink_std = 0.0
-        depth, known, clear = _depths(height)
+        depth, measured, clear = _depths(height)
         lying = Contact(contact, depth.astype(np.float32))
         half, deep = lying.sure_depth, lying.sure
         uv, outward, _, spacing = _outline(deep, pitch_xy, max_points)
@@ -88,7 +88,7 @@ def make_problem(
         rim = _on_outline(
             lifted(uv[steep]), outward[steep], half, outline_noise, spacing / (np.sqrt(np.pi) * correlation), sensor
         )
-        uv, apart = _spaced(deep & known, pitch_xy, max_points)
+        uv, apart = _spaced(deep & measured, pitch_xy, max_points)
         gel = lifted(uv, _at(depth, uv))
         met = _joined(rim, _on_gel(gel, height_noise, (apart / correlation) ** 2 / np.pi, sensor))
         uv = _inside_and_outside(contact, pitch_xy, max_points)[1]
@@ -128,7 +128,7 @@ def _on_outline(
 
 
 def _on_gel(gel: Array, noise: float, weight: float, sensor: Sensor) -> dict[str, Array]:
-    """Fields of a ``Problem`` for points (n, 3) of a gel of known height that lie on the object."""
+    """Fields of a ``Problem`` for points (n, 3) of a gel of measured depth that lie on the object."""
     return {
         "points": gel,
         "facing": unit(_down(gel, sensor)),
@@ -144,7 +144,7 @@ def _joined(*parts: dict[str, Array]) -> dict[str, Array]:
 
 
 def _depths(height: ArrayLike) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Heights (H, W) without lone faults, 0 where they are missing; where (H, W) they are known; and where all around too."""
+    """Depths (H, W) without single outliers, 0 where missing; where (H, W) they are measured; and where all around too."""
     height = np.asarray(height, np.float32)
     missing = ~np.isfinite(height)
     depth = cv2.medianBlur(np.where(missing, 0, height).astype(np.float32), 3).astype(float)

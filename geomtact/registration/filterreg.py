@@ -20,12 +20,13 @@ from geomtact.registration.observability import Spread, jacobian, moved
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.se3 import Array, apply, check_transforms, inverse, unit
 
-_A_THREAD = 2000  # points whose nearest surface is worth a thread of its own
-_FEWER = 2  # around points that are only inside or outside
+# All constants are hand-set.
+_A_THREAD = 2000  # points per thread in queries of the nearest surface
+_FEWER = 2  # surface points around each point that is only inside or outside
 _OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
-_STEPS_AT_END = 8  # with the narrowest filter, at most
-_REST = 1.0  # standard deviations that the last step may be
-_SLOPE_NOISE = 0.45  # noise across the membrane, as a share of that along it: a gel does not sink alike all around
+_STEPS_AT_END = 8  # largest number of steps with the narrowest filter
+_REST = 1.0  # largest last step of a converged pose, in its standard deviations
+_SLOPE_NOISE = 0.45  # noise across the membrane, as a share of that along it: a gel sinks unevenly around a contact
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class FilterReg:
                 information[:, :6, :6] += pull[0]
                 slope[:, :6] += pull[1]
             step = np.linalg.solve(information, slope[..., None])[..., 0]
-            expected = (step * slope).sum(1)[supported]  # the square of the step in units of what it is known by
+            expected = (step * slope).sum(1)[supported]  # the square of the step in its standard deviations
             going, step = going[supported], step[supported]
             state[going] += step
             T[going] = moved(T[going], step[:, :6], problem)

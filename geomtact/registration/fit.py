@@ -1,4 +1,4 @@
-"""How what was observed lies on the surface at some poses, and which of them can be believed."""
+"""The fit of the observed points to the surface at refined poses, and which of these poses are accepted."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from geomtact.registration.observability import Spread, motion_of, moved, observ
 from geomtact.registration.protocol import Problem, Refinement
 from geomtact.se3 import Array
 
-FEWEST = 6  # points on the surface without which no pose is believed
-_SHARE = 0.3  # of the points that must lie on it
-_LOOSE = 1.5  # residual, in units of the noise, beyond which a pose is not believed
-_RAN = 4.0  # standard deviations of the start that a pose may move
+# All constants are hand-set; FEWEST is the number of degrees of freedom.
+FEWEST = 6  # least number of points on the surface for which a pose is accepted
+_LEAST_SUPPORT = 0.3  # least share of the points on the surface for which a pose is accepted
+_MOST_RESIDUAL = 1.5  # largest residual for which a pose is accepted, in units of the noise
+_MOST_MOTION = 4.0  # largest motion from the start for which a pose is accepted, in standard deviations of the starts
 
 
 @dataclass(frozen=True, eq=False)
 class Meeting:
-    """How what was observed lies on the surface at k poses, with c contacts.
+    """The fit of the observed points to the surface at k poses, with c contacts.
 
     Attributes
     ----------
@@ -48,27 +49,27 @@ def keep_observable(start: Array, T: Array, meeting: Meeting, spread: Spread, pr
 def accept_or_revert(
     start: Array, T: Array, meeting: Meeting, at_rest: NDArray[np.bool_], spread: Spread, problem: Problem
 ) -> Refinement:
-    """``T`` (k, 4, 4) where it can be believed: the starts (k, 4, 4) elsewhere.
+    """``T`` (k, 4, 4) where it is accepted: the starts (k, 4, 4) elsewhere.
 
-    A pose is believed that came to rest near its start, with what was observed on the surface.
+    A pose is accepted that came to rest near its start, with the observed points on the surface.
     """
     zeta = motion_of(start, T, problem) / spread.metres(problem.length)
     ran = np.linalg.norm(zeta.reshape(-1, 2, 3), axis=2)
-    believed = (
+    accepted = (
         at_rest
         & np.isfinite(T).all((1, 2))
         & np.isfinite(meeting.information).all((1, 2))
-        & (meeting.support >= max(FEWEST, _SHARE * len(problem.points)))
-        & (meeting.residual < _LOOSE)
-        & (ran < _RAN).all(1)
+        & (meeting.support >= max(FEWEST, _LEAST_SUPPORT * len(problem.points)))
+        & (meeting.residual < _MOST_RESIDUAL)
+        & (ran < _MOST_MOTION).all(1)
     )
-    out = np.where(believed[:, None, None], T, start)
+    out = np.where(accepted[:, None, None], T, start)
     covariance, observable = np.zeros((len(T), 6, 6)), []
     for i in range(len(T)):
         information = np.zeros((6, 6))
-        if believed[i]:
+        if accepted[i]:
             # noise larger than assumed gives less information
             information = without_sinks(meeting.information[i], problem.sink_std) / max(1.0, meeting.residual[i]) ** 2
         covariance[i], rows = summary(out[i], information, spread, problem)
         observable.append(rows)
-    return Refinement(out, believed, covariance, observable, meeting.residual, meeting.support, problem.length)
+    return Refinement(out, accepted, covariance, observable, meeting.residual, meeting.support, problem.length)

@@ -19,7 +19,7 @@ from geomtact.registration.observability import Spread
 from geomtact.registration.protocol import Problem, Refinement, Surface
 from geomtact.se3 import Array, check_transforms, inverse
 
-_MAX_ITERATIONS = 20
+_MAX_ITERATIONS = 20  # of Open3D at each distance; hand-set
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def _register(problem: Problem, points: Array, normals: Array, reach: float) -> 
             registration.ICPConvergenceCriteria(1e-4, 1e-4, _MAX_ITERATIONS),
         )
         if result.fitness == 0:
-            break  # it ran off; Open3D says so in no other way
+            break  # it diverged; Open3D reports that in no other way
         motion, found = np.array(result.transformation), True
     if not found:
         return None

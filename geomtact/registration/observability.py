@@ -17,8 +17,9 @@ from geomtact.geometry.approach import NO_TILT, Approach
 from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array, apply, exp, hat, inverse, log, transform
 
-_LEAST_TURN = 0.02  # rad
-# information over that of the start poses, both [1/m^2], from which a direction is observable: to a quarter of the grid's step
+_LEAST_TURN = 0.02  # least spread of start rotations, before it is divided by sqrt(12) [rad]; hand-set
+# Information over that of the start poses, both [1/m^2], above which a direction is observable. Derived: the contact alone then
+# fixes it to a quarter of the grid's step.
 GAIN = 4 / 3
 
 
@@ -75,8 +76,8 @@ def without_sinks(information: Array, sink_std: float) -> Array:
     A sink acts as a shift of the object along the membrane's normal does, so that one contact's information about that shift
     is capped at 1 / sink_std^2.
     """
-    mixed, sinks = information[:6, 6:], information[6:, 6:]
-    return information[:6, :6] - mixed @ np.linalg.solve(sinks + np.eye(len(sinks)) / sink_std**2, mixed.T)
+    cross, sinks = information[:6, 6:], information[6:, 6:]
+    return information[:6, :6] - cross @ np.linalg.solve(sinks + np.eye(len(sinks)) / sink_std**2, cross.T)
 
 
 def observable_subspace(information: Array, spread: Spread, length: float) -> tuple[Array, Array, Array]:

@@ -1,4 +1,4 @@
-"""What a refiner is given, what it gives back, and the protocol that every refiner follows."""
+"""The input and output of a refiner, and the protocol that every refiner follows."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from geomtact.se3 import Array, unit
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-_LEAST = 2  # points, between which there is a gap
-_FEWEST_POINTS = 2000  # by which a surface is made coarser still
+# All constants are hand-set.
+_LEAST = 2  # least number of points of a surface
+_FEWEST_POINTS = 2000  # number of points above which a surface can be made coarser
 _DENSE = 1.5  # points per width of a filter, along a line
-_TURN = 2.0  # gaps between points that count as much as a normal which differs by 1
-_DEEP = 1e-3  # m that this counts as at least: so deep below the membrane, faces parallel to it lie
+_TURN = 2.0  # distance that a difference of 1 between normals counts as, in gaps between points
+_DEEP = 1e-3  # least value of that distance [m]: faces parallel to the membrane lie about so deep below it
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +82,13 @@ class Problem:
 
     Attributes
     ----------
-    points : (n, 3) where the object's surface was met: contact outlines on the membrane, and where heights are known the gel
+    points : (n, 3) where the object's surface was met: contact outlines on the membrane, and where depths are measured the gel
     facing : (n, 3) unit vectors that the surface looks along there: out of the contact, parallel to the membrane, on an
         outline; towards the camera within a contact
     across : (n, 3) unit vectors along which it may lean freely: along the membrane and along the outline; 0 within a contact
-    sinking : (n, 3) how a point moves for each metre that the gel sinks around the object; 0 where heights are known
+    sinking : (n, 3) how a point moves for each metre that the gel sinks around the object; 0 where depths are measured
     noise : (n,) standard deviation of each point along ``facing``
-    weight : (n,) share of each point that tells something new: neighbours err alike
+    weight : (n,) share of each point that is independent: neighbours err alike
     contact : (n,) which contact it belongs to
     around : (m, 3) points of the membranes that lie inside the object where ``side`` (m,) is 1, outside where it is -1
     outwards : (3,) unit vector from the camera out of the membrane, in the mean over all contacts
@@ -124,7 +125,7 @@ class Problem:
 
     @staticmethod
     def joined(problems: list[Problem], T_world_sensor: Array) -> Problem:
-        """All contacts as one, from the frames of their sensors (c, 4, 4) in the world: what one does not tell another may."""
+        """All contacts as one, from the frames of their sensors (c, 4, 4) in the world."""
 
         def along(name: str) -> Array:
             turned = (getattr(p, name) @ T[:3, :3].T for p, T in zip(problems, T_world_sensor, strict=True))
@@ -163,14 +164,14 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """Refined poses with what is known about them. Where ``converged`` is False, ``T`` is the start.
+    """Refined poses with their uncertainty. Where ``converged`` is False, ``T`` is the start.
 
     Attributes
     ----------
     T : (k, 4, 4) of the object in the problem's frame
     converged : (k,) bool: enough of what was observed lies on the surface, and the pose has stopped moving
     covariance : (k, 6, 6) of xi = (rx, ry, rz, tx, ty, tz) in T exp(xi^), radians and metres
-    observable : k arrays (r, 6) of orthonormal rows: the directions of xi that the contact tells, rotations times length
+    observable : k arrays (r, 6) of orthonormal rows: the observable directions of xi, rotations times length
     residual : (k,) rms distance of the points from the surface, in units of their noise; inf without support
     support : (k,) how many points lie on the surface
     length : by which rotations are scaled in ``observable`` [m]
