@@ -1,4 +1,4 @@
-"""Actions that measure the pose: touch with the sensor, or probe with a thin finger; and what either would show."""
+"""Actions that measure the pose: touch with the sensor, or probe with a thin finger; and their outcomes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from geomtact.se3 import Array, check_pose, inverse, transform
 from geomtact.sensing.moments import moments
 from geomtact.sensing.sensor import Sensor
 
-# The share of the penetration that is pressed at each pose of a cell: first in the touch that is evaluated, then in those that
-# it is compared with. The localizer is not given it either.
+# Penetration at each pose of a cell, as a share of the largest: first of the touch that is evaluated, then of those that it is
+# compared with, because the localizer does not know the penetration. Hand-set.
 PRESSED = (0.5, 0.2, 0.4, 0.6, 0.8)
-_SHAPE = (24, 32)  # of the casts
-_FARTHEST = 3.0  # m that a sensor travels at most: more is meant in millimetres
+_SHAPE = (24, 32)  # pixels of the casts
+_FARTHEST = 3.0  # largest travel of a sensor [m]: a larger number is probably in millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +62,14 @@ class Touch:
         sensor = space.sensor
         pressed = sensor.max_penetration * np.repeat(PRESSED[:d], n)
         advance, below = _advance(space, T, self.travel, pressed)
-        felt = below.max((1, 2)) > 0
-        if sensor.housing_depth is not None and felt.any():
-            stopped = _along_z(-advance[felt]) @ T[felt]
-            felt[felt] = space.caster.lowest_outside(sensor, stopped) >= -sensor.housing_depth
+        touches = below.max((1, 2)) > 0
+        if sensor.housing_depth is not None and touches.any():
+            stopped = _along_z(-advance[touches]) @ T[touches]
+            touches[touches] = space.caster.lowest_outside(sensor, stopped) >= -sensor.housing_depth
         shown = np.zeros((d * n, 7))
-        shown[felt, 0] = advance[felt] / np.hypot(*sensor.half_window)
-        shown[felt, 1:] = moments(below[felt] > 0, sensor)
-        return felt.reshape(d, n), shown.reshape(d, n, 7)
+        shown[touches, 0] = advance[touches] / np.hypot(*sensor.half_window)
+        shown[touches, 1:] = moments(below[touches] > 0, sensor)
+        return touches.reshape(d, n), shown.reshape(d, n, 7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +106,8 @@ class Probe:
         """Whether it meets the object (d, n) at ``T_world_object`` (d, n, 4, 4), and nothing else (d, n, 0)."""
         T = inverse(self.T_world_sensor) @ T_world_object.reshape(-1, 4, 4)
         straight = replace(_straight(space.sensor), membrane_radius=0.0)
-        felt = space.caster.ray_depths(straight, T, np.zeros((1, 2)))[:, 0] >= 0
-        return felt.reshape(T_world_object.shape[:2]), np.zeros((*T_world_object.shape[:2], 0))
+        touches = space.caster.ray_depths(straight, T, np.zeros((1, 2)))[:, 0] >= 0
+        return touches.reshape(T_world_object.shape[:2]), np.zeros((*T_world_object.shape[:2], 0))
 
 
 def _check_cost(cost: float) -> None:

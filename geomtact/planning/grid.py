@@ -13,8 +13,8 @@ from geomtact.planning.actions import Touch
 from geomtact.planning.draws import check_contact, draw_cells
 from geomtact.se3 import Array, apply, check_pose, inverse, transform
 
-_SAME_DIRECTION = np.radians(15)  # within which touches from one place are taken for the same
-_POSES = 128  # drawn from the posterior to find the region of the object
+_SAME_DIRECTION = np.radians(15)  # angle [rad] within which touches at one place count as the same; hand-set
+_POSES = 128  # poses drawn from the posterior to find the region of the object; hand-set
 
 
 def grid_of_touches(
@@ -35,7 +35,7 @@ def grid_of_touches(
     side : (3,) middle of the half-sphere, towards the sensor, in the posterior's frame; by default away from the first
         sensor, along its +z
     reachable : whether the robot can bring the sensor to a pose (4, 4); asked of where it starts and of where it ends
-    made : T_world_sensor (4, 4) of touches made before; what is nearly the same is left out, for it errs in the same way
+    made : T_world_sensor (4, 4) of touches made before; touches near these are left out, because they err alike
     seed : of the poses that give the region
     """
     check_contact(posterior)

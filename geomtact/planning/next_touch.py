@@ -22,22 +22,23 @@ from geomtact.planning.grid import grid_of_touches
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
-LEAST = 0.05  # nats of expected information below which an action does not help
-_CELLS = 128  # drawn from the posterior
-# Of many actions, those tried at all poses: the best at some of the poses of one cell in a few
+LEAST = 0.05  # expected information gain below which an action does not help [nats]; hand-set
+_CELLS = 128  # cells drawn from the posterior; hand-set
+# Of many actions, the best ``_CLOSELY`` are evaluated at all poses. They are chosen at ``_WITHIN`` poses in each of every
+# ``_ONE_IN``-th cell, where at least ``_LEAST_CELLS`` cells are drawn. Hand-set, for speed.
 _CLOSELY, _WITHIN, _ONE_IN = 24, 3, 4
-_LEAST_CELLS = 32  # of which that is done
-# Standard deviations at one pose: of where the sensor stops and of the contact's centre [m], and of the contact's log area,
-# log size and stretches. Those of touches with the calibration's noise, half of them elastic, on five parts.
-_BLUR, _NOISE = 0.3e-3, (0.4, 0.15, 0.17, 0.17)
-_FREEDOM = 5.0  # of the Student t, as in scoring.moments
-_WRONG = 0.01  # share of actions that report a contact where there is none, or none where there is one
-_RULED_OUT = 0.05  # of the likelihood of the likeliest pose: below it a pose is discarded
+_LEAST_CELLS = 32
+# Standard deviations at one pose: of the sensor's stop and of the contact's centre [m], and of the contact's log area, log size
+# and stretches. Measured on simulated touches of five objects with the calibration's noise, half of them elastic.
+_POSITION_STD, _MOMENTS_STD = 0.3e-3, (0.4, 0.15, 0.17, 0.17)
+_FREEDOM = 5.0  # degrees of freedom of the Student t, as in scoring.moments
+_WRONG = 0.01  # probability that a contact is reported wrongly, or missed; hand-set
+_RULED_OUT = 0.05  # likelihood relative to the best pose's below which a pose is discarded; hand-set
 
 
 @dataclass(frozen=True, eq=False)
 class Action:
-    """What is expected of an action.
+    """The expected outcome of an action.
 
     Attributes
     ----------
@@ -111,20 +112,20 @@ def _ranked(actions: Iterable[Action]) -> list[Action]:
 def evaluate(space: ContactSpace, action: Touch | Probe, T_world_object: Array, number: int = 1) -> Action:
     """What is expected of ``action`` where the object is equally likely at each of n places, of which d poses
     ``T_world_object`` (d, n, 4, 4) are given, d >= 2."""
-    felt, shown = action.shows(space, T_world_object)
-    likelihood = likelihoods(felt, shown, _noise(space.sensor)[: shown.shape[-1]])
+    touches, shown = action.shows(space, T_world_object)
+    likelihood = likelihoods(touches, shown, _noise(space.sensor)[: shown.shape[-1]])
     return Action(
         action.T_world_sensor,
         information(likelihood),
         float(action.cost),
         discarded(likelihood),
-        float(felt.mean()),
+        float(touches.mean()),
         number,
         action,
     )
 
 
-def likelihoods(felt: NDArray[np.bool_], shown: Array, noise: Array) -> Array:
+def likelihoods(touches: NDArray[np.bool_], shown: Array, noise: Array) -> Array:
     """How likely each of n outcomes is at each of n places (n, n), relative to chance; a row an outcome.
 
     The outcomes are those at the first pose of each place; its other poses say what is to be expected there. What is
@@ -132,25 +133,25 @@ def likelihoods(felt: NDArray[np.bool_], shown: Array, noise: Array) -> Array:
 
     Parameters
     ----------
-    felt : (d, n) whether the action touches at each of the d poses of n places
+    touches : (d, n) whether the action touches at each of the d poses of n places
     shown : (d, n, k) what it shows there
     noise : (k,) standard deviation of what is shown, at one pose
     """
-    touched, felt, seen, shown = felt[0], felt[1:], shown[0], shown[1:]
+    touched, touches, seen, shown = touches[0], touches[1:], shown[0], shown[1:]
     seen = seen + noise * np.random.default_rng(0).normal(size=seen.shape)
-    count = felt.sum(0)
-    mean = (shown * felt[..., None]).sum(0) / np.maximum(count, 1)[:, None]
-    off = (shown - mean)[felt]
+    count = touches.sum(0)
+    mean = (shown * touches[..., None]).sum(0) / np.maximum(count, 1)[:, None]
+    off = (shown - mean)[touches]
     covariance = np.diag(noise**2) + off.T @ off / max(1, np.maximum(count - 1, 0).sum())
     whiten = np.linalg.inv(np.linalg.cholesky(covariance)).T
     square = (((seen @ whiten)[:, None, None] - shown @ whiten) ** 2).sum(-1)  # outcomes, poses, places
-    log_t = np.where(felt, -0.5 * (_FREEDOM + len(noise)) * np.log1p(square / _FREEDOM), -np.inf)
-    alike = np.exp(log_t - log_t.max((1, 2), keepdims=True)) if felt.any() else np.zeros(log_t.shape)
-    chance = alike.sum((1, 2), keepdims=True) / max(1, felt.sum())
-    both = touched[:, None, None] & felt
+    log_t = np.where(touches, -0.5 * (_FREEDOM + len(noise)) * np.log1p(square / _FREEDOM), -np.inf)
+    alike = np.exp(log_t - log_t.max((1, 2), keepdims=True)) if touches.any() else np.zeros(log_t.shape)
+    chance = alike.sum((1, 2), keepdims=True) / max(1, touches.sum())
+    both = touched[:, None, None] & touches
     with np.errstate(invalid="ignore"):
         ratio = np.where(both, alike / chance, 1.0)
-    right = touched[:, None, None] == felt
+    right = touched[:, None, None] == touches
     return (np.where(right, 1 - _WRONG, _WRONG) * ratio).mean(1)
 
 
@@ -158,7 +159,7 @@ def information(likelihood: Array) -> float:
     """Expected information [nats] about which of n equally likely places is the right one, of ``likelihood`` (n, n).
 
     H(place) - E[-log P(place | outcome)], each outcome evaluated by what other poses of its place show: 0 to log(n). An
-    outcome that misleads in the mean is worth nothing, for it can be ignored.
+    outcome that misleads in the mean counts 0, because it can be ignored.
     """
     right = np.diag(likelihood) / likelihood.mean(1)
     return float(max(0.0, np.log(np.maximum(right, 1e-12)).mean()))
@@ -170,7 +171,7 @@ def discarded(likelihood: Array) -> float:
 
 
 def ambiguity(ranked: Sequence[Action]) -> str | None:
-    """Why none of the actions helps, in words; None where one does."""
+    """The message why none of the actions helps; None where one does."""
     most = max(action.expected_nats for action in ranked if not action.roughly)
     if most >= LEAST:
         return None
@@ -184,6 +185,6 @@ def ambiguity(ranked: Sequence[Action]) -> str | None:
 
 
 def _noise(sensor: Sensor) -> Array:
-    """Standard deviation (7,) of what a touch shows."""
-    blur = _BLUR / np.hypot(*sensor.half_window)
-    return np.array([blur, blur, blur, *_NOISE])
+    """Standard deviation (7,) of the outcome of a touch."""
+    blur = _POSITION_STD / np.hypot(*sensor.half_window)
+    return np.array([blur, blur, blur, *_MOMENTS_STD])
