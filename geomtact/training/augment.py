@@ -1,6 +1,6 @@
 """Sensor noise for training: what a real gel and camera do to a contact that a simulation does not show.
 
-Every augmentation takes masks (n, 1, h, w), 0 or 1, the pixel [m] and a generator, and draws its strength anew for every
+Every augmentation takes masks (n, 1, h, w), 0 or 1, the pixel [m] and a generator, and draws its strength for every
 mask; only how far the outline's warp is correlated is drawn once a batch, and the blur is cut off at four pixels. The
 elastic shrink, the unknown penetration and the shifts, turns and tilts below the grid's step are not here: they come
 with the scenes, as touches solved with an elastic gel at poses drawn within the cells.

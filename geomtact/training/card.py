@@ -32,7 +32,7 @@ def write_encoder(
 ) -> None:
     """Write ``path`` (safetensors, half precision), and beside it the card (.json) and the curves (.png).
 
-    ``data`` says where the scenes come from; weights for one ``part`` on one ``sensor`` say so in their metadata too.
+    ``data`` states where the scenes come from; weights for one ``part`` on one ``sensor`` state so in their metadata too.
     """
     keys = ("part", "part_sha256", "sensor", "sensor_sha256")
     meta = {"architecture": ARCHITECTURE} | {key: str(data[key]) for key in keys if key in data}

@@ -2,7 +2,7 @@
 
 A scene is one object on one sensor with the grid that a localizer would choose, but for the disks about its faces: what is
 distinguished in a wide cell is in a narrow one, too. Of its rotations a few are drawn. Their
-stored contacts are what the network has to tell apart; the touches are drawn within the cells, tilted, turned, shifted
+stored contacts are what the network has to separate; the touches are drawn within the cells, tilted, turned, shifted
 and pressed by up to half a grid step, rigid and elastic.
 """
 
@@ -43,7 +43,7 @@ class TrainingScene:
     stored : (n, words) contacts of ``KEY_SHAPE`` at the poses of the grid
     weight : (n,) share of the uniform measure of each, among these
     touches : (m, words) contacts of ``TOUCH_SHAPE``, each with the least area that touches have
-    elastic : (m,) whether an elastic gel felt each; such a touch follows the rigid one at the same pose
+    elastic : (m,) whether each is on an elastic gel; such a touch follows the rigid one at the same pose
     true : (m,) the stored contact whose cell holds each touch
     pixel : of ``TOUCH_SHAPE`` [m]
     cell : (2,) the grid's, as ``scoring.encoder.cell_size`` gives it
@@ -92,7 +92,7 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
                 depth = view.depth(maps[t], tilted[t], psi, int(cell[i]), int(p), rng)
                 if depth is None:
                     continue
-                for soft, mask in enumerate(view.felt(depth)):
+                for soft, mask in enumerate(view.contact_masks(depth)):
                     if mask.sum() * view.pixel**2 >= LEAST_CONTACT:
                         touches.append(pack(view.lying(mask[None]).reshape(1, -1))[0])
                         elastic.append(bool(soft))
@@ -112,7 +112,7 @@ def make_scene(mesh: Mesh, sensor: Sensor, max_poses: int, rng: np.random.Genera
 
 
 class _View:
-    """One part over one sensor: height maps of it, and touches cut from them."""
+    """One object over one sensor: height maps of it, and touches cut from them."""
 
     def __init__(self, mesh: Mesh, sensor: Sensor, resolution: Resolution):
         self.mesh, self.sensor, self.resolution = mesh, sensor, resolution
@@ -161,7 +161,7 @@ class _View:
         d = (level + rng.random()) / bins * self.sensor.max_penetration
         return np.asarray(heights - highest + d, float)
 
-    def felt(self, depth: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def contact_masks(self, depth: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """The rigid and the elastic contact (h, w) of a depth field that reaches beyond the window."""
         pitch = (float(self.pitch[0]), float(self.pitch[1]))
         elastic = elastic_in_window(depth, pitch, (self.my, self.mx), self.sensor.max_penetration)

@@ -132,7 +132,7 @@ def resume(
 
 
 def not_a_number(folder: Path, step: int) -> str:
-    """What a training says whose loss is not a number at ``step``."""
+    """The message of a training whose loss is not a number at ``step``."""
     meta = _meta(folder / _FILE)
     kept = f"the state of step {meta['step']} is kept in {folder}" if meta else "no state is kept yet"
     return f"training: the loss is not a number at step {step}; {kept}; go on with a smaller --rate"

@@ -85,7 +85,7 @@ def pair_loss(similarity: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
 def train_thesis(
     space: ContactSpace, settings: Settings, folder: Path, out: Path, progress: Progress | None = None
 ) -> None:
-    """Train for the part of ``space`` and write the weights to ``out``, with a card beside it; ``folder`` keeps the state.
+    """Train for the object of ``space`` and write the weights to ``out``, with a card beside it; ``folder`` keeps the state.
 
     Raises
     ------

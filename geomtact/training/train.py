@@ -37,7 +37,7 @@ class Settings:
 
     steps: int = 4000
     scenes_a_step: int = 3
-    touches: int = 160  # of a scene, at most; half of them felt by an elastic gel
+    touches: int = 160  # of a scene, at most; half of them on an elastic gel
     stored: int = 3000  # contacts of a scene that each touch is compared with, at most
     rate: float = 2e-3
     weight_decay: float = 1e-3
@@ -79,7 +79,7 @@ def train(
         raise InputError(
             f"training: expected more than {settings.validation} scenes, got {len(scenes)}; give more with --scenes"
         )
-    learned, judged = scenes[: -settings.validation], scenes[-settings.validation :]
+    learned, held_out = scenes[: -settings.validation], scenes[-settings.validation :]
     torch.manual_seed(settings.seed)
     network = Encoder(settings.width, settings.dimension)
     if start is not None:
@@ -101,7 +101,7 @@ def train(
         if (step + 1) % check_every == 0 or step + 1 == settings.steps:
             curve.step.append(step + 1)
             curve.training.append(float(np.mean(gains)))
-            curve.validation.append(validate(network, judged, settings))
+            curve.validation.append(validate(network, held_out, settings))
             gains = []
             save_state(folder, network, optimizer, asdict(settings), step + 1, asdict(curve))
         if progress:
