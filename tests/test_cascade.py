@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from geomtact.contact_space.index import spelled_out
+from geomtact.contact_space.index import expand_runs
 from geomtact.geometry.rotations import Directions
 from geomtact.inference.distribution import cell_log_density
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring import fitted
 from geomtact.scoring.calibration import posterior_log_prob
-from geomtact.scoring.cascade import BlockScorer, heaviest
+from geomtact.scoring.cascade import CoarseScorer, heaviest
 from geomtact.scoring.encoder import EncoderScorer
 from geomtact.se3 import transform
 
@@ -35,7 +35,7 @@ def test_runs_are_spelled_out_as_one_by_one(rng):
     counts = rng.integers(0, 5, 30)
     first = rng.integers(0, 1000, 30)
     expected = [f + i for f, n in zip(first, counts, strict=True) for i in range(n)]
-    assert spelled_out(first, counts).tolist() == expected
+    assert expand_runs(first, counts).tolist() == expected
 
 
 def test_a_block_is_a_cell_of_the_next_coarser_grid(localizer):
@@ -56,18 +56,18 @@ def test_a_block_is_a_cell_of_the_next_coarser_grid(localizer):
         assert (low == high).all()
     assert len(np.unique(key, axis=0)) == len(size)
     ids = np.arange(len(index))
-    first, counts = index.block_runs
-    assert (np.repeat(np.arange(len(first)), counts) == index.block_of(ids)).all()
-    assert (index.block_of(ids) % len(size) == block[ids % index.places]).all()
+    first, counts = index.coarse_runs
+    assert (np.repeat(np.arange(len(first)), counts) == index.coarse_cell_of(ids)).all()
+    assert (index.coarse_cell_of(ids) % len(size) == block[ids % index.places]).all()
 
 
 def test_the_mass_of_runs_is_that_of_their_cells(localizer, rng):
     index = localizer.index
     w = np.asarray(index.weight, float).ravel()
-    first, counts = index.block_runs
+    first, counts = index.coarse_runs
     expected = np.add.reduceat(w, first)
     assert index.mass(first, counts) == pytest.approx(expected, abs=1e-12)
-    assert np.exp(index.log_block_weight).sum() == pytest.approx(1, abs=1e-5)
+    assert np.exp(index.log_coarse_weight).sum() == pytest.approx(1, abs=1e-5)
     many = np.flatnonzero(expected > 0)
     some = rng.choice(many, 300)
     hit = index.within_runs(first[some], counts[some], rng.random(300))
@@ -78,7 +78,7 @@ def test_the_mass_of_runs_is_that_of_their_cells(localizer, rng):
 def test_a_blocks_score_is_the_mean_likelihood_of_normal_vectors(localizer, rng):
     index, d, temperature = localizer.index, 3, 0.7
     n = len(index)
-    first, counts = index.block_runs
+    first, counts = index.coarse_runs
     middle = np.repeat(rng.normal(size=(len(first), d)), counts, axis=0)
     spread = np.repeat(rng.uniform(0, 0.4, len(first)), counts)
 
@@ -93,14 +93,14 @@ def test_a_blocks_score_is_the_mean_likelihood_of_normal_vectors(localizer, rng)
         scorer = Given(None, stored)
         score = scorer.score(index, None).ravel() / temperature
         exact.append(np.log(np.add.reduceat(w * np.exp(score), first) / np.add.reduceat(w, first)) * temperature)
-        found.append(BlockScorer.make(scorer, index, temperature).score(index, None))
+        found.append(CoarseScorer.make(scorer, index, temperature).score(index, None))
     found, exact = np.mean(found, 0), np.mean(exact, 0)
     large = counts >= 12
     assert large.sum() > 50
     assert np.corrcoef(found[large], exact[large])[0, 1] > 0.98
     assert abs(np.mean(found[large] - exact[large])) < 0.1
     # without spread it is the cells' own score
-    same = BlockScorer.make(Given(None, middle.astype(np.float32)), index, temperature)
+    same = CoarseScorer.make(Given(None, middle.astype(np.float32)), index, temperature)
     one = Given(None, middle.astype(np.float32)).score(index, None).ravel()[first]
     assert same.score(index, None) == pytest.approx(one, rel=1e-3, abs=1e-3)
 
@@ -119,16 +119,16 @@ def test_scores_that_are_trusted_less_are_those_of_nearer_vectors(localizer, rng
         def trust(self, best):
             return np.float32(1)
 
-    score, trust = BlockScorer.make(Far(None, stored), index, 0.7).trusted(index, seen)
-    scaled = BlockScorer.make(Near(None, np.sqrt(by) * stored), index, 0.7)
+    score, trust = CoarseScorer.make(Far(None, stored), index, 0.7).trusted(index, seen)
+    scaled = CoarseScorer.make(Near(None, np.sqrt(by) * stored), index, 0.7)
     assert trust == by
     assert score == pytest.approx(scaled.trusted(index, np.sqrt(by) * seen)[0], rel=1e-3, abs=1e-3)
 
 
 def test_blocks_are_as_many_poses_as_their_cells(localizer, rng):
     mask, _ = some_mask(localizer, rng)
-    blocks = posterior_of(localizer, localizer.scorer.rows(localizer.index, mask, "blocks"))
-    cells = spelled_out(blocks.cells, blocks.runs)
+    blocks = posterior_of(localizer, localizer.scorer.rows(localizer.index, mask, "coarse"))
+    cells = expand_runs(blocks.cells, blocks.runs)
     w = np.asarray(localizer.index.weight, float).ravel()[cells]
     each = np.repeat(np.exp(blocks.log_prob.astype(float)), blocks.runs)
     total = np.repeat(localizer.index.mass(blocks.cells, blocks.runs), blocks.runs)
@@ -156,10 +156,10 @@ def test_rows_cover_the_grid_and_cells_get_their_full_score(localizer, rng):
     full = scorer.scorer.score(index, mask).ravel()
     possible = np.flatnonzero(np.asarray(index.weight).ravel())
     assert every.runs is None and (every.first == possible).all()
-    first, counts = index.block_runs
-    blocks, some = scorer.rows(index, mask, "blocks"), scorer.cascade.expanded(index, mask)
+    first, counts = index.coarse_runs
+    blocks, some = scorer.rows(index, mask, "coarse"), scorer.cascade.expanded(index, mask)
     for rows in (blocks, some):
-        spelled = spelled_out(rows.first, rows.runs)
+        spelled = expand_runs(rows.first, rows.runs)
         assert (np.diff(spelled) > 0).all() and np.isin(possible, spelled).all()
         assert np.exp(rows.log_prior.astype(float)).sum() == pytest.approx(1, abs=1e-4)
     assert len(blocks.first) < len(some.first) < len(index)
@@ -178,7 +178,7 @@ def test_a_posterior_on_runs_is_the_same_distribution_cell_by_cell(localizer, rn
     mask, T = some_mask(localizer, rng)
     coarse = posterior_of(localizer, localizer.scorer.cascade.expanded(index, mask))
     w = np.asarray(index.weight, float).ravel()
-    ids = spelled_out(coarse.cells, coarse.runs)
+    ids = expand_runs(coarse.cells, coarse.runs)
     share = w[ids] / np.repeat(index.mass(coarse.cells, coarse.runs), coarse.runs)
     with np.errstate(divide="ignore"):
         log_prob = np.repeat(coarse.log_prob, coarse.runs) + np.log(share)

@@ -8,7 +8,7 @@ import pytest
 
 from geomtact import load_mesh
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import felt_height
+from geomtact.contact_space.touch import simulate_depth_map
 from geomtact.errors import ImageError
 from geomtact.sensing.depth_map import depths_of
 from geomtact.sensing.reading import read_observation
@@ -217,7 +217,7 @@ def test_no_simulated_depth_map_raises_a_doubt(elastic):
     for part in ("elbow_pipe", "gear", "hex_nut"):  # whose contacts are the steepest
         space = ContactSpace(load_mesh(part), MINI)
         for T in space.sample(3, np.random.default_rng(4), (0.3e-3, 1.5e-3))[0]:
-            depths_of(felt_height(space, T, elastic), part, MINI, warnings)
+            depths_of(simulate_depth_map(space, T, elastic), part, MINI, warnings)
     step = np.where(ROWS < 120, 1.5e-3, 0)  # a sharp edge, as steep as the pixels allow
     depths_of(step, "step", MINI, warnings)
     assert warnings == []

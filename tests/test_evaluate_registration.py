@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from geomtact import load_mesh, se3
 from geomtact.contact_space.build import choose_resolution
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import felt_mask
+from geomtact.contact_space.touch import simulate_mask
 from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.rotations import Directions
 from geomtact.registration.contact_problem import make_problem
@@ -61,7 +61,7 @@ def pressed_in_the_middle(space, depth=0.8e-3):
 @pytest.mark.parametrize("elastic", [False, True])
 def test_a_ball_tells_where_it_is_and_not_how_it_is_turned(ball, elastic):
     T = pressed_in_the_middle(ball)
-    problem = make_problem(felt_mask(ball, T, elastic), SENSOR)
+    problem = make_problem(simulate_mask(ball, T, elastic), SENSOR)
     spread = Spread(0.8e-3 / problem.length / np.sqrt(12), 0.8e-3 / np.sqrt(12))
     told, rest = split(fisher_information(ball, T, elastic, problem, MODERATE), spread, problem.length)
     assert np.trace(told) == pytest.approx(3) and np.allclose(told @ told, told) and np.allclose(told + rest, np.eye(6))
@@ -77,7 +77,7 @@ def test_information_is_that_of_the_outline(ball):
     """A disk of radius a shifted along x moves its outline by the cosine of the normal, which is a half in mean square: pi a
     over the noise's correlation, sqrt(pi) times its length, is told, per noise variance; to a fifth, at such pixels."""
     T = pressed_in_the_middle(ball)
-    mask = felt_mask(ball, T, False)
+    mask = simulate_mask(ball, T, False)
     problem = make_problem(mask, SENSOR)
     radius = np.sqrt(mask.sum() * SENSOR.pixel_area(mask.shape) / np.pi)
     noise = Noise(outline_rms=0.2e-3, correlation=(1e-3, 3e-3))
@@ -127,14 +127,14 @@ def test_what_a_symmetry_leaves_open_is_not_told(name, turned):
     settled, ok = space.settle(T[None], 0.9e-3)
     assert ok[0]
     T = settled[0]
-    mask = felt_mask(space, T, False)
+    mask = simulate_mask(space, T, False)
     problem = make_problem(mask, space.sensor)
     grid = Grid(
         Directions.make(space.mesh.symmetry, None, 1, 0.25), choose_resolution(space.mesh, space.sensor, None, 20_000)
     )
     told, _ = split(fisher_information(space, T, False, problem, MODERATE), Spread(np.radians(4), 2e-3), problem.length)
     other = T @ se3.exp([*turned, 0, 0, 0])
-    assert (felt_mask(space, other, False) ^ mask).mean() < 1e-3 and grid.spread.rotation > 0
+    assert (simulate_mask(space, other, False) ^ mask).mean() < 1e-3 and grid.spread.rotation > 0
     assert np.linalg.norm(told @ motion_of(T, other, problem)) < 0.15e-3
 
 
@@ -233,7 +233,7 @@ def test_the_thesis_refines_along_the_membrane_only(nut):
     """Mask points to mask points: a shift and a turn in the image's plane, and nothing else, is undone."""
     surface, spread = Surface(*nut.mesh.sample_surface(3000)), Spread(0.1, 1e-3)
     T = touches_of(nut, 1)[0].T_sensor_object
-    mask = felt_mask(nut, T, False)
+    mask = simulate_mask(nut, T, False)
     seen = Seen(mask, make_problem(mask, SENSOR))
     off = moved(T, [0, 0, 0.03 * seen.problem.length, 0.4e-3, -0.3e-3, 0], seen.problem)
     end = own_methods(nut, surface, spread)["thesis"](seen, off)

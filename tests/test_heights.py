@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from geomtact import GaussianPrior, Localizer, Mesh, Sensor, contact_mask
 from geomtact.cli import app
-from geomtact.contact_space.touch import felt_height, felt_mask
-from geomtact.scoring.likelihood import height_log_likelihood
+from geomtact.contact_space.touch import simulate_depth_map, simulate_mask
+from geomtact.scoring.likelihood import depth_map_log_likelihood
 from geomtact.se3 import transform
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.elastic import elastic_contact
@@ -90,17 +90,17 @@ def test_of_all_penetrations_the_true_one_is_likeliest_on_any_gel():
     cast = np.stack([under_ball(d) for d in depths])
     for height in (np.maximum(under_ball(0.8 * MM), 0), elastic_contact(under_ball(0.8 * MM), SENSOR.pixel_pitch)[1]):
         contact = Contact.of_height(height.astype(np.float32))
-        likely = height_log_likelihood(cast, height, contact.sure, SENSOR.pixel_area(height.shape), 0.02 * MM)
+        likely = depth_map_log_likelihood(cast, height, contact.sure, SENSOR.pixel_area(height.shape), 0.02 * MM)
         assert depths[likely.argmax()] == pytest.approx(0.8 * MM, abs=0.03 * MM)
 
 
 def test_gel_that_is_not_touched_speaks_against_what_would_be_in_it_alone():
     height, touched = np.zeros((4, 4)), np.zeros((4, 4), bool)
     above, below = np.full((1, 4, 4), -1 * MM), np.full((1, 4, 4), 1 * MM)
-    free, in_it = (height_log_likelihood(d, height, touched, 1e-6, 0.1 * MM)[0] for d in (above, below))
+    free, in_it = (depth_map_log_likelihood(d, height, touched, 1e-6, 0.1 * MM)[0] for d in (above, below))
     assert free == 0 and in_it < -4
     height[0] = np.nan
-    assert height_log_likelihood(below, height, touched, 1e-6, 0.1 * MM)[0] == pytest.approx(in_it * 3 / 4)
+    assert depth_map_log_likelihood(below, height, touched, 1e-6, 0.1 * MM)[0] == pytest.approx(in_it * 3 / 4)
 
 
 def test_the_sinking_of_a_thin_gel_dies_away_sooner():
@@ -128,13 +128,13 @@ def test_scores_of_a_contour_line_belong_to_deeper_poses(balls):
 def test_heights_tell_how_deep_a_ball_lies_and_how_large_it_is(balls, elastic):
     ball, other = balls
     T = transform(np.eye(3), [1 * MM, -0.7 * MM, BALL - 0.7 * MM])
-    height = felt_height(ball.space, T) if elastic else ball.simulate(T).height
+    height = simulate_depth_map(ball.space, T) if elastic else ball.simulate(T).height
     posterior = ball.localize(height.astype(np.float32))
     assert posterior.observation.kind == "height"
     mode = posterior.modes(1)[0]
     assert mode.T[:3, 3] == pytest.approx(T[:3, 3], abs=0.06 * MM)
     assert posterior.log_evidence > other.localize(height.astype(np.float32)).log_evidence + 1
-    masks = [each.localize(felt_mask(ball.space, T, elastic)).log_evidence for each in (ball, other)]
+    masks = [each.localize(simulate_mask(ball.space, T, elastic)).log_evidence for each in (ball, other)]
     assert abs(masks[0] - masks[1]) < 1  # a mask hardly tells
 
 

@@ -54,7 +54,7 @@ def test_touches_are_told_from_those_of_other_parts(drawer, n, errors):
             {c.name: c for c in identify(drawer, mask, kind="mask", effort="fast").candidates}
             for mask in touches(own, n)
         ]
-        unlike += [each[own.mesh.name].unlike for each in found]
+        unlike += [each[own.mesh.name].is_outlier for each in found]
         for other in drawer:
             gain = [each[own.mesh.name].log_evidence - each[other.mesh.name].log_evidence for each in found]
             assert np.mean(gain) >= -3 * np.std(gain) / np.sqrt(len(gain))
@@ -108,8 +108,8 @@ def test_unlike_all_is_what_is_odd_or_unexplained_of_each(drawer, said, unlike):
 
     image = np.zeros(drawer[0].sensor.image_size_px[::-1], bool)
 
-    assert identify([localizer(said)], image).foreign == unlike
-    assert not identify([localizer(said), localizer({"is_outlier": False})], image).foreign, (
+    assert identify([localizer(said)], image).is_unknown == unlike
+    assert not identify([localizer(said), localizer({"is_outlier": False})], image).is_unknown, (
         "one that it is like is enough"
     )
 
@@ -120,12 +120,12 @@ def test_three_noisy_touches_of_a_part_are_not_unlike_it(drawer, flat, scenes):
     """Rigid and elastic gels in turn; some scenes of each part that has flats."""
     for scene in simultaneous_touches(drawer[flat].space, scenes, 3, 1):
         masks = [touch.mask for touch in scene.touches]
-        assert not identify([drawer[flat]], masks, kind="mask", T_world_sensor=scene.T_world_sensor, seed=1).foreign
+        assert not identify([drawer[flat]], masks, kind="mask", T_world_sensor=scene.T_world_sensor, seed=1).is_unknown
 
 
 def test_no_contact_tells_nothing(drawer):
     found = identify(drawer, np.zeros((320, 427), bool), kind="mask", effort="fast")
-    assert not found.posterior.contact and not found.foreign
+    assert not found.posterior.contact and not found.is_unknown
     assert [c.probability for c in found.candidates] == pytest.approx([1 / 3] * 3)
 
 
@@ -141,7 +141,7 @@ def test_a_part_that_no_pose_of_agrees_is_out(drawer, monkeypatch):
         localize = refuses
 
     found = identify([Refusing(), drawer[1]], mask, kind="mask", effort="fast")
-    assert found.localizer is drawer[1] and found.candidates[1].probability == 0 and found.candidates[1].unlike
+    assert found.localizer is drawer[1] and found.candidates[1].probability == 0 and found.candidates[1].is_outlier
     with pytest.raises(NoPoseAgreesError):
         identify([Refusing()], mask)
 
@@ -150,7 +150,7 @@ def test_a_part_that_no_pose_of_agrees_is_out(drawer, monkeypatch):
 def test_weights_that_do_not_fit_are_refused(drawer, weights):
     with pytest.raises(UsageError, match="identify: expected"):
         identify(drawer, touches(drawer[0])[0], weights, kind="mask", effort="fast")
-    with pytest.raises(UsageError, match="identify: expected a localizer for each part, got int"):
+    with pytest.raises(UsageError, match="identify: expected a localizer for each object, got int"):
         identify(3, None)
     with pytest.raises(UsageError, match="expected parts"):
         identify([], None)

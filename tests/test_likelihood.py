@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from geomtact.contact_space.index import pack
-from geomtact.contact_space.touch import felt_mask
+from geomtact.contact_space.touch import simulate_mask
 from geomtact.scoring.likelihood import SOFTNESS, THRESHOLDS, PixelLikelihood, _felt, cast_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.sensing.sensor import Sensor
@@ -77,7 +77,7 @@ def test_a_cast_at_the_true_pose_is_more_likely_than_beside_it(plug, rng, elasti
     T, _ = space.sample(60, rng, (0.8 * MM, 1.4 * MM))
     better = []
     for pose in T:
-        seen = to_grid(felt_mask(space, pose, elastic), (48, 64))
+        seen = to_grid(simulate_mask(space, pose, elastic), (48, 64))
         if seen.sum() < 12:
             continue
         shift = np.eye(4)

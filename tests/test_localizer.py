@@ -91,7 +91,7 @@ def test_the_same_seed_gives_the_same_result(localizer, a_touch):
 def test_efforts_differ_in_resolution_and_in_what_is_refined(curved, a_touch):
     T, mask = a_touch(curved)
     fast, balanced, exact = (curved.localize(mask, effort=e) for e in ("fast", "balanced", "exact"))
-    held = curved.index.mass(*curved.index.block_runs) > 0  # some blocks are ruled out as a whole
+    held = curved.index.mass(*curved.index.coarse_runs) > 0  # some blocks are ruled out as a whole
     assert len(fast.cells) == held.sum() < len(balanced.cells) == len(exact.cells)
     assert abs(balanced.log_density(T) - exact.log_density(T)) < 2
     assert len(fast.refined) == 0 < len(balanced.refined) <= 5 <= len(exact.refined) <= 5 * 25
@@ -113,7 +113,7 @@ def test_a_contact_unlike_any_touch_is_warned_of(ball):
     """A ball never makes a frame along the border of the window."""
     mask = np.zeros(ball.sensor.image_size_px[::-1], bool)
     mask[:12], mask[-12:], mask[:, :12], mask[:, -12:] = True, True, True, True
-    assert any("unlike any touch" in w for w in ball.localize(mask).warnings)
+    assert any("out-of-distribution contact" in w for w in ball.localize(mask).warnings)
 
 
 @pytest.mark.slow

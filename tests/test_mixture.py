@@ -112,16 +112,20 @@ def fit(request, localizer, contact):
     nearest = [-fit.scorer.score(localizer.index, each).max() for each in (mask, *parts)]
     encoder = replace(fit.scorer, usual=request.param * min(nearest))
     assert len({encoder.trust(-each) for each in nearest}) == 3
-    return replace(fit, scorer=encoder, cascade=replace(fit.cascade, blocks=replace(fit.cascade.blocks, cells=encoder)))
+    return replace(
+        fit,
+        scorer=encoder,
+        cascade=replace(fit.cascade, coarse_scorer=replace(fit.cascade.coarse_scorer, cells=encoder)),
+    )
 
 
 def test_blocks_are_told_by_the_mixture(localizer, fit, contact):
     index, cascade = localizer.index, fit.cascade
     mask, parts, shares = contact
-    rows = fit.rows(index, mask, "blocks")
+    rows = fit.rows(index, mask, "coarse")
     said, weight = density(rows)
-    held = np.exp(index.log_block_weight) > 0
-    scores = [cascade.blocks.score(index, each)[held] for each in (mask, *parts)]
+    held = np.exp(index.log_coarse_weight) > 0
+    scores = [cascade.coarse_scorer.score(index, each)[held] for each in (mask, *parts)]
     assert said == pytest.approx(mixture(shares, scores, weight, cascade.coarse.temperature), rel=1e-3)
 
 
@@ -131,20 +135,20 @@ def test_blocks_are_opened_by_the_mixture_and_their_cells_told_by_it(localizer, 
     mask, parts, shares = contact
     rows = fit.rows(index, mask, "cells")
     said, weight = density(rows)
-    first, counts = index.block_runs
-    blocks = [cascade.blocks.score(index, each) for each in (mask, *parts)]
-    by_block = mixture(shares, blocks, np.exp(index.log_block_weight.astype(float)), cascade.coarse.temperature)
+    first, counts = index.coarse_runs
+    blocks = [cascade.coarse_scorer.score(index, each) for each in (mask, *parts)]
+    by_block = mixture(shares, blocks, np.exp(index.log_coarse_weight.astype(float)), cascade.coarse.temperature)
     whole = np.isin(first, rows.first[rows.runs > 1])
     opened = ~whole & (counts > 1) & (index.mass(first, counts) > 0)
     assert 0 < whole.sum() < len(first) and opened.any()
     # the blocks that were opened are those with the most mass
-    mass = by_block * np.exp(index.log_block_weight)
+    mass = by_block * np.exp(index.log_coarse_weight)
     assert mass[whole].max() <= mass[opened].min() * 1.03
     block = np.searchsorted(first, rows.first, "right") - 1
     scores = []
     for each, whole_score in zip((mask, *parts), blocks, strict=True):
         seen = fit.scorer.seen(index, each)
-        trust = cascade.blocks.trusted(index, seen)[1]
+        trust = cascade.coarse_scorer.trusted(index, seen)[1]
         every = fit.scorer.of(np.arange(len(index)), seen)
         # the best is looked for in some blocks only
         assert trust == pytest.approx(fit.scorer.trust(every.max()), rel=0.05)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geomtact.contact_space.touch import felt_mask, sinking
+from geomtact.contact_space.touch import simulate_mask, sinking
 from geomtact.contact_space.touches import random_touches
 from geomtact.inference.distribution import likeliest_cells
 from geomtact.inference.gels import SHAPE, Gel
@@ -119,7 +119,7 @@ def test_where_the_object_is_deeper_than_the_gel_sinks_it_is_touched(plug, rng):
     T, _ = space.sample(120, rng, (0.5 * MM, 1.4 * MM))
     overlap = []
     for pose in T:
-        felt = felt_mask(space, pose, True, shape)
+        felt = simulate_mask(space, pose, True, shape)
         depth = space.caster.depths(space.sensor, pose[None], shape)[0]
         told = depth > sinking(space, pose, shape) * depth.max()
         if felt.sum() > 40:
@@ -131,9 +131,9 @@ def test_where_the_object_is_deeper_than_the_gel_sinks_it_is_touched(plug, rng):
 def test_a_search_ends_at_likelier_poses_near_by(plug, rng, elastic):
     space = plug.space
     T, _ = space.sample(40, rng, (0.5 * MM, 1.4 * MM))
-    areas = [felt_mask(space, pose, elastic).sum() for pose in T]
+    areas = [simulate_mask(space, pose, elastic).sum() for pose in T]
     true = T[int(np.argsort(areas)[-3])]
-    mask = felt_mask(space, true, elastic)
+    mask = simulate_mask(space, true, elastic)
     gel = Gel.showing(mask, space)
     problem = make_problem(mask, space.sensor)
     width = 0.25 * Spread(0.05, 1 * MM).metres(problem.length)
@@ -151,7 +151,7 @@ def test_the_solved_gel_is_likelier_than_a_rigid_one_where_it_was_felt(plug, rng
     T, _ = space.sample(40, rng, (0.8 * MM, 1.4 * MM))
     more = []
     for pose in T:
-        mask = felt_mask(space, pose, True)
+        mask = simulate_mask(space, pose, True)
         if mask.mean() > 2e-3:
             gel = Gel.showing(mask, space)
             rigid, _, elastic = gel.log_likelihood(pose[None], gel.sinking(pose[None]))[0]

@@ -10,7 +10,7 @@ from scipy.stats import kstest
 from speed import slow_but
 
 from geomtact.contact_space.draw import draw_within
-from geomtact.contact_space.index import spelled_out
+from geomtact.contact_space.index import expand_runs
 from geomtact.errors import InputError, PoseError, UsageError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.distribution import cell_log_density, middle_cells, row_log_density, row_poses
@@ -151,7 +151,7 @@ def test_the_density_of_a_cell_is_its_mass_over_its_measure(localizer, posterior
     expected = posterior.log_prob[rows] - np.log(w)
     agree = np.abs(posterior.log_density(T[found]) - expected[found]) < 1e-5
     assert agree.mean() > 0.95
-    ids = np.setdiff1d(np.arange(len(index)), spelled_out(posterior.cells, runs_of(posterior)))[:5]
+    ids = np.setdiff1d(np.arange(len(index)), expand_runs(posterior.cells, runs_of(posterior)))[:5]
     assert (cell_log_density(posterior, ids) == -np.inf).all()
 
 
@@ -292,7 +292,7 @@ def test_samples_follow_the_probabilities_of_the_cells(localizer, posteriors, sa
     for g, mass in zip(group, p, strict=True):
         groups[g] += mass
     group_of = np.zeros(len(index), int)
-    group_of[spelled_out(posterior.cells, runs_of(posterior))] = np.repeat(group, runs_of(posterior))
+    group_of[expand_runs(posterior.cells, runs_of(posterior))] = np.repeat(group, runs_of(posterior))
     n = inside.sum()
     for g, mass in groups.items():
         got = (group_of[cell] == g).sum()

@@ -198,7 +198,7 @@ def test_it_says_so_when_the_object_slips_and_finds_back(flat_nut):
     for seed in range(3):
         t = random_trajectory(flat_nut.space, 8, seed, slips=(5,))
         posteriors = list(track(flat_nut, t.masks))
-        slipped = [p.diagnostics.frame for p in posteriors if any(w.startswith("slip?") for w in p.warnings)]
+        slipped = [p.diagnostics.frame for p in posteriors if any(w.startswith("possible slip") for w in p.warnings)]
         assert set(slipped) <= {6}
         told += len(slipped)
         found = [p.log_density(T) for p, T in zip(posteriors[6:], t.T_sensor_object[6:], strict=True)]

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from geomtact import Localizer, Sensor, load_mesh
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.store import open_index
-from geomtact.contact_space.touch import felt_mask
+from geomtact.contact_space.touch import simulate_mask
 from geomtact.contact_space.touches import Touch, each_touch, random_touches
 from geomtact.geometry.distance import PoseDistance
 from geomtact.se3 import transform
@@ -59,7 +59,7 @@ def touch_of(rod, x):
     """The rod pressed 1 mm deep, its middle at ``x`` [m] of the sensor."""
     T, ok = rod.space.settle(transform(SIDEWAYS, [x, 0, 0.0])[None], 1 * MM)
     assert ok[0] and np.isfinite(rod.space.penetration(T)[0])
-    return Touch(T[0], 1 * MM, felt_mask(rod.space, T[0], True), True)
+    return Touch(T[0], 1 * MM, simulate_mask(rod.space, T[0], True), True)
 
 
 def test_a_rod_may_lie_anywhere_along_itself_and_not_across(rod, seen):
@@ -78,8 +78,8 @@ def test_a_rod_may_lie_anywhere_along_itself_and_not_across(rod, seen):
 def test_poses_that_feel_the_same_do_and_lie_apart(rod, seen, where):
     touch, T, needed = seen[where]
     assert np.allclose(T[0], touch.T_sensor_object)
-    truth = felt_mask(rod.space, T[0], True, (72, 96))
-    assert all(overlap(truth, felt_mask(rod.space, one, True, (72, 96))) >= needed for one in T)
+    truth = simulate_mask(rod.space, T[0], True, (72, 96))
+    assert all(overlap(truth, simulate_mask(rod.space, one, True, (72, 96))) >= needed for one in T)
     assert np.isfinite(rod.space.penetration(T)).all()
     distance = PoseDistance(rod.mesh)
     for i, j in combinations(range(len(T)), 2):

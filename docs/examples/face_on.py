@@ -13,7 +13,7 @@ import trimesh
 
 from geomtact import Localizer, Mesh, Sensor, load_mesh
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import felt_mask, spoilt
+from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.se3 import exp
 from geomtact.sensing.noise import MODERATE
 
@@ -46,7 +46,7 @@ def touches(mesh, face, tilt, n, rng):
         T[2, 3] += space.caster.penetration(SENSOR, T[None])[0] - 0.8 * MM
         if not np.isfinite(space.penetration(T[None])[0]):  # the housing is in the way
             continue
-        mask = felt_mask(space, T, elastic=i % 2 == 0)
+        mask = simulate_mask(space, T, elastic=i % 2 == 0)
         if mask.sum() >= LEAST:
             found.append((T, spoilt(mask, space, MODERATE, rng)))
     return found

@@ -146,7 +146,7 @@ def localize(
     found, timing_ms = _identified(request, images, sensors, backgrounds, objects, placed)
     for image, made, used in zip(images, metadata, sensors, strict=True):
         _warn_of_metadata(image, made, objects[0] if len(objects) == 1 else None, used)
-    if len(objects) > 1 and found.foreign:
+    if len(objects) > 1 and found.is_unknown:
         tell("warning: the contact is out-of-distribution for every candidate: it may be of another object")
     for warning in found.posterior.warnings:
         tell(f"warning: {warning}")

@@ -79,7 +79,7 @@ def without_contact(request: Request, images: int, kind: str) -> str:
 
 def _print_candidates(found: Identification) -> None:
     rows = [
-        [c.name, f"{100 * c.probability:.1f} %", f"{c.log_evidence:.1f}", "yes" if c.unlike else ""]
+        [c.name, f"{100 * c.probability:.1f} %", f"{c.log_evidence:.1f}", "yes" if c.is_outlier else ""]
         for c in found.candidates
     ]
     print_table(("object", "probability", "log evidence", "outlier"), rows, ("probability", "log evidence"))

@@ -94,13 +94,13 @@ def simulate(
     if tactile_image:
         import numpy as np
 
-        from geomtact.contact_space.touch import felt_height
+        from geomtact.contact_space.touch import simulate_depth_map
         from geomtact.sensing.image_file import write_image
         from geomtact.sensing.render import SPOILT, example_reading
 
         heights = [
             np.zeros(pressed.image_size_px[::-1]),
-            *(felt_height(space, t.T_sensor_object) for t in touches),
+            *(simulate_depth_map(space, t.T_sensor_object) for t in touches),
         ]
         rng = np.random.default_rng([seed, 2])
         background, *shown = (example_reading(h, pressed.pixel_pitch, SPOILT[noise.value], rng) for h in heights)
@@ -151,10 +151,10 @@ def read_pose(path: Path) -> Array:
 def _touch_at(space: ContactSpace, T: Array, seed: int, elastic: bool, noise: Noise) -> Touch:
     import numpy as np
 
-    from geomtact.contact_space.touch import felt_mask, spoilt
+    from geomtact.contact_space.touch import simulate_mask, spoilt
     from geomtact.contact_space.touches import Touch
 
-    mask = spoilt(felt_mask(space, T, elastic), space, noise, np.random.default_rng(seed))
+    mask = spoilt(simulate_mask(space, T, elastic), space, noise, np.random.default_rng(seed))
     return Touch(T, float(space.caster.penetration(space.sensor, T)[0]), mask, elastic)
 
 

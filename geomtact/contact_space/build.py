@@ -86,7 +86,7 @@ def build(
             "widen the approach or check the object's unit"
         )
     return _join(
-        turns, directions, lattice, _blocks(turns, directions.coarser_rotations(resolution.turn_step), lattice)
+        turns, directions, lattice, _coarse_cells(turns, directions.coarser_rotations(resolution.turn_step), lattice)
     )
 
 
@@ -145,12 +145,14 @@ def _touches(there: HeightMap, turn: float, lattice: Lattice, window: Window) ->
     return _Turn(cell, -centres, z, share, packed, masks.sum(2), np.moveaxis(summed, 2, 0))
 
 
-def _join(turns: list[_Turn], directions: Directions, lattice: Lattice, block: NDArray[np.int64]) -> dict[str, NDArray]:
-    """One array of each kind for all rotations, sorted by ``block`` (n,); the weights made a share of the whole."""
+def _join(
+    turns: list[_Turn], directions: Directions, lattice: Lattice, coarse_cell: NDArray[np.int64]
+) -> dict[str, NDArray]:
+    """One array of each kind for all rotations, sorted by ``coarse_cell`` (n,); the weights made a share of the whole."""
     first = np.concatenate([[0], np.cumsum([len(t.cell) for t in turns])])
     some, n = turns[0], int(first[-1])
     rank = np.empty(n, np.int64)
-    rank[np.argsort(block, kind="stable")] = np.arange(n)
+    rank[np.argsort(coarse_cell, kind="stable")] = np.arange(n)
     p, words = some.bits.shape[:2]
     out: dict[str, NDArray] = {
         "rotation": np.zeros(n, np.int32),
@@ -161,7 +163,7 @@ def _join(turns: list[_Turn], directions: Directions, lattice: Lattice, block: N
         "area": np.zeros((p, n), np.uint16),
         "moments": np.zeros((some.moments.shape[0], p, n), np.float32),
         "table": np.zeros((len(turns), *lattice.cells), np.int32),
-        "blocks": np.concatenate([[0], np.cumsum(np.bincount(block))]).astype(np.int32),
+        "blocks": np.concatenate([[0], np.cumsum(np.bincount(coarse_cell))]).astype(np.int32),
     }
     share = np.repeat(directions.weights / directions.turns, directions.turns)
     for r, turn in enumerate(turns):
@@ -184,10 +186,10 @@ def _join(turns: list[_Turn], directions: Directions, lattice: Lattice, block: N
     return out
 
 
-def _blocks(turns: list[_Turn], parent: NDArray[np.int64], lattice: Lattice) -> NDArray[np.int64]:
-    """The block of the next coarser grid that holds each place (n,), counted without gaps.
+def _coarse_cells(turns: list[_Turn], parent: NDArray[np.int64], lattice: Lattice) -> NDArray[np.int64]:
+    """The coarse cell, of the next coarser grid, that holds each place (n,), counted without gaps.
 
-    A block is 2 x 2 lattice cells of the rotations that have the same ``parent`` (M,) rotation.
+    A coarse cell is 2 x 2 lattice cells of the rotations that have the same ``parent`` (M,) rotation.
     """
     y, x = np.divmod(np.concatenate([t.cell for t in turns]), lattice.cells[1])
     owner = np.repeat(parent, [len(t.cell) for t in turns])

@@ -1,7 +1,7 @@
 """Cells of one contact pose space seen from another sensor: which of its cells they fall into, and how much of them touches.
 
-A cell is some degrees and millimetres wide, which moves a part by more at a second sensor than the gel is deep: the cell's
-own pose seldom touches there, though a part of the cell does. So each cell counts by the share of it that touches.
+A cell is some degrees and millimetres wide, which moves an object by more at a second sensor than the gel is deep: the
+cell's own pose seldom touches there, though some of the cell does. So each cell counts by the share of it that touches.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ Placed = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
 # the rotation of the other sensor that each of the one falls into, and a shift (3,) in the other sensor's frame [m]
 Draw = tuple[NDArray[np.int32], NDArray[np.float32]]
 _CHUNK = 1 << 15  # places worked on at a time
-_FAR = 3.0  # standard deviations beyond which nothing of a cell touches
-# share of poses whose height is far from their cell's: where a limb of the object leaves the window, the rest sinks
+_FAR = 3.0  # standard deviations beyond which nothing of a cell touches; hand-set
+# Share of poses whose height is far from their cell's, because a limb of the object leaves the window; hand-set.
 _JUMPS = 0.02
-_BESIDE = 0.3  # steps of the grid by which a cell's neighbours share in it: few poses stand for a cell
-UNFELT = 0.1  # share of touching poses at which a sensor may yet show nothing: a contact too small or too shallow
-_SPREAD = 1.2  # of heights over the other sensor, in units of what the steps of both grids come to
+_BESIDE = 0.3  # std, in steps of the grid, by which neighbours share in a cell, of which few poses are tried; hand-set
+MISSED_CONTACT_SHARE = 0.1  # share of touching poses whose contact is too small or shallow to be seen; hand-set
+_SPREAD = 1.2  # std of heights over the other sensor, relative to the steps of both grids; measured by casting
 
 
 @dataclass(frozen=True)
@@ -91,13 +91,13 @@ class CellTransfer:
         return share
 
     def mean(
-        self, density: NDArray[np.floating], doubtful: NDArray[np.bool_] | None = None
+        self, density: NDArray[np.floating], unlikely: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Mean over each place of ``here`` (n,) of a density (P m,) over the poses of ``there``, 0 where those do not touch; and
         the share (n,) of each place that touches.
 
-        All penetrations of a place count as its middle one: they differ by less than a cell spreads. Where ``doubtful`` (n,), one
-        pose within a place stands for all.
+        All penetrations of a place count as its middle one: they differ by less than a cell spreads. Where ``unlikely`` (n,), one
+        pose within a place is tried.
         """
         n, bins = self.here.places, len(self.there.height)
         # what belongs to one place stands together
@@ -119,15 +119,15 @@ class CellTransfer:
                 total[places] += np.einsum("nl,nl->n", share, weighed) / len(draws)
                 touching[places] += np.einsum("nl,nl->n", share, weight) / len(draws)
 
-        rough = np.zeros(n, bool) if doubtful is None else doubtful
+        rough = np.zeros(n, bool) if unlikely is None else unlikely
         rough = rough[self._within_reach[0]]
         self._in_parts(np.flatnonzero(rough), lambda part: work(part, self._draws[:1]))
         self._in_parts(np.flatnonzero(~rough), lambda part: work(part, self._draws))
         return total, touching
 
-    def nothing_felt(self) -> NDArray[np.float32]:
+    def no_contact_likelihood(self) -> NDArray[np.float32]:
         """How likely (n,) it is for each place of ``here`` that the other sensor shows no contact."""
-        return 1 - np.float32(1 - UNFELT) * self.reached()
+        return 1 - np.float32(1 - MISSED_CONTACT_SHARE) * self.reached()
 
     def reached(self) -> NDArray[np.float32]:
         """The share (n,) of each place of ``here`` at which the object would reach the other sensor's membrane, however deep."""

@@ -29,10 +29,10 @@ def contact_class(space: ContactSpace, T: ArrayLike) -> str:
     scale = _SHAPE / max(wide, high)
     shape = (max(8, round(high * scale)), max(8, round(wide * scale)))
     depth = space.caster.depths(sensor, np.asarray(T, float)[None], shape)[0]
-    felt = depth > 0
-    if len(patches(felt, sensor.pixel_area(shape))) >= 3:
+    touched = depth > 0
+    if len(patches(touched, sensor.pixel_area(shape))) >= 3:
         return "texture"
-    normal, count = _directions(space, np.asarray(T, float), shape, felt)
+    normal, count = _directions(space, np.asarray(T, float), shape, touched)
     return _of_directions(normal, count)
 
 
@@ -53,10 +53,10 @@ def _of_directions(normal: Array, count: NDArray[np.int64]) -> str:
 
 
 def _directions(
-    space: ContactSpace, T: Array, shape: tuple[int, int], felt: NDArray[np.bool_]
+    space: ContactSpace, T: Array, shape: tuple[int, int], touched: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Directions (n, 3) of the faces met where ``felt`` (h, w), and how many rays met each direction (n,)."""
-    face = space.caster.faces_met(space.sensor, T, shape)[felt]
+    """Directions (n, 3) of the faces met where ``touched`` (h, w), and how many rays met each direction (n,)."""
+    face = space.caster.faces_met(space.sensor, T, shape)[touched]
     face = face[face >= 0]
     mesh = space.mesh
     corners = mesh.vertices[mesh.faces]

@@ -2,7 +2,7 @@
 
 A *place* is an approach direction, a turn, and a lattice cell of the object's centre over the window; a *pose* is a
 place at one penetration. Every array is laid out penetration by penetration, so pose ``i`` is penetration
-``i // places`` of place ``i % places``. Places that the next coarser grid holds in one cell, a *block*, stand together.
+``i // places`` of place ``i % places``. Places that the next coarser grid holds in one cell, a *coarse cell*, stand together.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Index:
     area : (P, n) number of contact pixels
     moments : (6, P n) moments of each mask (see ``sensing.moments``)
     table : (rotations, ny, nx) place of each lattice cell, the nearest one where the cell does not touch
-    blocks : (B + 1,) first place of each block, and the number of places
+    blocks : (B + 1,) first place of each coarse cell, and the number of places
     folder : its entry in the cache; None where it is in none
     """
 
@@ -153,7 +153,7 @@ class Index:
         return x, y
 
     def deeper(self, score: NDArray[np.floating], by: float) -> NDArray[np.floating]:
-        """What ``score`` (P, n) says of the cells of all places and penetrations, of those ``by`` [m] deeper: those that are not
+        """``score`` (P, n), of the cells of all places and penetrations, at those ``by`` [m] deeper: those that are not
         as deep get the lowest there is."""
         bins = min(round(by * len(score) / self.sensor.max_penetration), len(score) - 1)
         if not bins:
@@ -269,10 +269,10 @@ class Index:
         return self.log_weight[self.possible]
 
     @cached_property
-    def log_block_weight(self) -> NDArray[np.float32]:
-        """Log of the uniform measure (P B,) of :attr:`block_runs`."""
+    def log_coarse_weight(self) -> NDArray[np.float32]:
+        """Log of the uniform measure (P B,) of :attr:`coarse_runs`."""
         with np.errstate(divide="ignore"):
-            return np.log(np.maximum(self.mass(*self.block_runs), 0)).astype(np.float32)
+            return np.log(np.maximum(self.mass(*self.coarse_runs), 0)).astype(np.float32)
 
     def mass(self, first: ArrayLike, counts: ArrayLike) -> Array:
         """Share of the uniform measure (n,) in runs of poses, each ``counts`` (n,) long from ``first`` (n,)."""
@@ -301,8 +301,8 @@ class Index:
         return np.clip(np.searchsorted(self._mass_before, low + share * (high - low), "right") - 1, first, end - 1)
 
     @cached_property
-    def block_runs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First pose id and number of poses (P B,) of every block at every penetration."""
+    def coarse_runs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First pose id and number of poses (P B,) of every coarse cell at every penetration."""
         first = np.arange(len(self.height))[:, None] * self.places + self.blocks[:-1]
         return first.ravel(), np.tile(np.diff(self.blocks), len(self.height)).astype(np.int64)
 
@@ -335,8 +335,8 @@ class Index:
         found = self.within_runs(0, len(self), (np.arange(_DRAWN) + np.random.default_rng(0).random(_DRAWN)) / _DRAWN)
         return np.ascontiguousarray(self.moments[:, found])
 
-    def block_of(self, ids: ArrayLike) -> NDArray[np.int64]:
-        """Which of :attr:`block_runs` (n,) holds each pose id (n,)."""
+    def coarse_cell_of(self, ids: ArrayLike) -> NDArray[np.int64]:
+        """Which of :attr:`coarse_runs` (n,) holds each pose id (n,)."""
         level, place = np.divmod(np.asarray(ids, np.int64), self.places)
         return level * (len(self.blocks) - 1) + np.searchsorted(self.blocks, place, "right") - 1
 
@@ -346,7 +346,7 @@ class Index:
         return unpack(self.bits[level, :, place], self.resolution.mask_shape)
 
 
-def spelled_out(first: ArrayLike, counts: ArrayLike) -> NDArray[np.int64]:
+def expand_runs(first: ArrayLike, counts: ArrayLike) -> NDArray[np.int64]:
     """The pose ids (sum of counts,) of runs that begin at ``first`` (n,) and are ``counts`` (n,) long."""
     first, counts = np.asarray(first, np.int64), np.asarray(counts, np.int64)
     begins = np.cumsum(counts) - counts

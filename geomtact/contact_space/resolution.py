@@ -26,7 +26,7 @@ _BORDER = 1.3
 _MOST_POSES = 100_000_000
 _FACES = 6  # at most, about which there are disks
 _MOST_MORE = 1.25  # times ``max_poses`` that there may be before the lattice grows coarser for the disks' sake
-_DISK = 0.41  # steps, half angle of a disk: its cells are then a third of a step across, the tilt that a face is felt whole at
+_DISK = 0.41  # steps, half angle of a disk: its cells are then a third of a step across, the tilt at which a whole face touches
 
 
 @dataclass(frozen=True)

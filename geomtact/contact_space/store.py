@@ -165,7 +165,7 @@ def remove_from_cache(names: Sequence[str], cache_dir: str | Path | None = None)
     for name in names:
         if not any(meant(name, entry) for entry in entries):
             near = did_you_mean(name, {entry.object for entry in entries})
-            raise UsageError(f"cache: expected parts or keys that geomtact cache lists, got {name!r}{near}")
+            raise UsageError(f"cache: expected objects or keys that geomtact cache lists, got {name!r}{near}")
     return _removed([entry for entry in entries if any(meant(name, entry) for name in names)])
 
 
@@ -239,7 +239,7 @@ def _write(folder: Path, index: Index) -> None:
 
 
 def _read(folder: Path, mesh: Mesh, sensor: Sensor, approach: Approach | None) -> Index | None:
-    """The cached index, or None where it is absent or damaged (it is then built anew)."""
+    """The cached index, or None where it is absent or damaged (it is then rebuilt)."""
     try:
         meta = json.loads((folder / "meta.json").read_text("utf-8"))
         if meta["format"] != FORMAT:

@@ -1,4 +1,4 @@
-"""A touch as a real sensor would report it: rigid or elastic contact, spoilt by noise."""
+"""A simulated touch: the rigid or elastic contact at a pose, with sensor noise."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ LEAST_CONTACT = 1e-6  # m^2: touches of less are not simulated
 MARGIN = 0.25  # of the window, on each side: the gel is dragged along by what presses beside the window
 
 
-def felt_mask(
+def simulate_mask(
     space: ContactSpace, T: ArrayLike, elastic: bool, shape: tuple[int, int] | None = None
 ) -> NDArray[np.bool_]:
-    """Where the sensor feels the object at ``T`` (4, 4), without noise: (h, w) bool over the window.
+    """The contact mask of the object at ``T`` (4, 4), without noise: (h, w) bool over the window.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def felt_mask(
     return elastic_in_window(depth, pitch, margin, sensor.max_penetration)
 
 
-def felt_height(space: ContactSpace, T: ArrayLike, elastic: bool = True) -> NDArray[np.float32]:
+def simulate_depth_map(space: ContactSpace, T: ArrayLike, elastic: bool = True) -> NDArray[np.float32]:
     """How deep the gel is pressed in [m] by the object at ``T`` (4, 4): (H, W) at the sensor's own resolution.
 
     An ``elastic`` gel sinks beside the contact too.
@@ -104,8 +104,8 @@ def spoilt(mask: NDArray[np.bool_], space: ContactSpace, noise: Noise, rng: np.r
 def elastic_in_window(
     depth: NDArray, pitch: tuple[float, float], margin: tuple[int, int], deepest: float
 ) -> NDArray[np.bool_]:
-    """The elastic contact in a window, of a depth field [m] that reaches ``margin`` (rows, columns) beyond it each side, where
-    nothing is felt that is deeper than ``deepest`` [m]."""
+    """The elastic contact in a window, of a depth field [m] that reaches ``margin`` (rows, columns) beyond it each side, without
+    contact where the object is deeper than ``deepest`` [m]."""
     gel, window = _where_gel(depth, margin, deepest)
     return elastic_mask(gel, pitch)[window]
 

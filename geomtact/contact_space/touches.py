@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.contact_class import contact_class
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
+from geomtact.contact_space.touch import LEAST_CONTACT, simulate_mask, spoilt
 from geomtact.errors import InputError
 from geomtact.se3 import Array
 from geomtact.sensing.noise import MODERATE, Noise
 
 PENETRATION = (0.3e-3, 1.5e-3)
-FELT = {"elastic": True, "rigid": False, "both": None}  # gels, as ``each_touch`` takes them
+GEL_KINDS = {"elastic": True, "rigid": False, "both": None}  # gels, as ``each_touch`` takes them
 _TRIED = 2000  # touches, at most, for each one found of a class
 
 
@@ -84,12 +84,12 @@ def each_touch(
         tried += len(T)
         if tried > _TRIED * (made + 1):
             kind = f"{only} ones" if only else "large enough"
-            raise InputError(f"{space.mesh.name}: of {tried:,} touches {made} were {kind}; take another part")
+            raise InputError(f"{space.mesh.name}: of {tried:,} touches {made} were {kind}; take another object")
         for pose, d in zip(T, depth, strict=True):
             if only is not None and contact_class(space, pose) != only:
                 continue
             soft = made % 2 == 1 if elastic is None else elastic
-            mask = felt_mask(space, pose, soft)
+            mask = simulate_mask(space, pose, soft)
             if counts(space, mask):
                 yield Touch(pose, float(d), spoilt(mask, space, noise, rng), soft)
                 made += 1

@@ -1,4 +1,4 @@
-"""What was known before the touch, as a density over poses that touch or not (the thesis's P(G), 6.2)."""
+"""Prior densities over poses that touch or not (the thesis's P(G), 6.2)."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from geomtact.se3 import Array, check_pose, exp, hat, inverse, log
 
 LogDensity = Callable[[Array], Array]
 
-_TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is asked
+_TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is evaluated
 _CLOSER = 0.125 * 0.5 ** np.arange(8)  # rad by which a continuous symmetry is searched, from the best of many images on
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """A pose known with an uncertainty, a vision system's or that of a ``Mode``: at T exp(xi^), with a rotation of half a turn at
-    most, the density relative to the uniform goes as that of xi ~ N(0, covariance).
+    """An uncertain pose, from a vision system or a ``Mode``.
 
-    So the wider its rotations, the less it knows of them; drawn as T exp(xi^), rotations by a whole turn would come home to T.
+    Relative to the uniform, the density at T exp(xi^) is proportional to that of xi ~ N(0, covariance), for rotations of at most
+    half a turn.
 
-    Its share of a cell is that of poses drawn from it, of those that touch; where it covers too many cells for that, its density
-    at the cell's pose, widened by a cell's own spread.
+    Its mass in a cell is the share of poses drawn from it that touch there. Where it covers too many cells for that, it is the
+    density at the cell's pose, widened by a cell's own spread.
 
     Attributes
     ----------
@@ -106,10 +106,10 @@ class OfAllImages:
 
     def __call__(self, T: Array) -> Array:
         """At poses (n, 4, 4)."""
-        told = self.prior
-        if isinstance(told, GaussianPrior):
-            told = over_images(told, self.symmetry)
-        return log_mean_of_counted([checked(told(T @ S), len(T)) for S in images(self.symmetry)])
+        density = self.prior
+        if isinstance(density, GaussianPrior):
+            density = over_images(density, self.symmetry)
+        return log_mean_of_counted([checked(density(T @ S), len(T)) for S in images(self.symmetry)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,26 +135,26 @@ class OfPoses:
 
 
 @dataclass(frozen=True, eq=False)
-class NothingFelt:
+class NoContactDensity:
     """Log density, not normalised, where the object touches none of several sensors.
 
     Attributes
     ----------
-    others : what each sensor but the first told, all without contact
-    before : what was known before that; None for nothing
+    others : posteriors of all sensors but the first, all without contact
+    prior : log density before these images; None for the uniform
     """
 
     others: Sequence[Posterior]
-    before: LogDensity | None
+    prior: LogDensity | None
 
     def __call__(self, T: Array) -> Array:
         """At poses (n, 4, 4), touching the first sensor or not."""
-        density = np.zeros(len(T)) if self.before is None else self.before(T)
+        density = np.zeros(len(T)) if self.prior is None else self.prior(T)
         return density + np.sum([other.log_density(T) for other in self.others], axis=0)
 
 
 def over_images(prior: GaussianPrior, symmetry: Symmetry) -> GaussianPrior:
-    """``prior`` as it is told by the images under a ``symmetry`` that stand for all: wider by what lies between them."""
+    """``prior`` widened by the spacing of the images under a ``symmetry`` at which it is evaluated."""
     free = np.zeros((3, 3)) if symmetry.axis is None else np.outer(symmetry.axis, symmetry.axis) / _TURNS**2
     if symmetry.kind == "sphere":
         free = np.eye(3) / _ROTATIONS**2
@@ -163,7 +163,7 @@ def over_images(prior: GaussianPrior, symmetry: Symmetry) -> GaussianPrior:
 
 
 def checked(density: Any, n: int) -> Array:
-    """What a function of a user's gave for ``n`` poses, as log densities (n,).
+    """The result of a user's function for ``n`` poses, as log densities (n,).
 
     Raises
     ------
@@ -179,7 +179,7 @@ def checked(density: Any, n: int) -> Array:
 
 
 def images(symmetry: Symmetry) -> Array:
-    """Elements (m, 4, 4) of ``symmetry`` at which a prior that is a function is asked."""
+    """Elements (m, 4, 4) of ``symmetry`` at which a prior that is a function is evaluated."""
     return symmetry.sampled(_TURNS if symmetry.axis is not None else _ROTATIONS)
 
 

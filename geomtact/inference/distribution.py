@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geomtact.contact_space.index import Index, spelled_out
+from geomtact.contact_space.index import Index, expand_runs
 from geomtact.inference.facts import Diagnostics, Provenance
 from geomtact.inference.reference import Reference
 from geomtact.se3 import Array
 from geomtact.sensing.reading import Observation
 
-LEADING_CELLS = 400  # number of the most probable cells from which modes are grown
+LEADING_CELLS = 400  # number of the most probable cells from which modes are grown; hand-set
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class CellDistribution:
     off_contact_log_density : without contact, the prior's log density at poses (n, 4, 4) in ``frame``; it is not saved
     log_evidence : log of the mean likelihood under the prior, comparable between objects for the same images and effort
     seed : of the random choices made where credible levels tie
-    runs : (N,) how many cells from each of ``cells`` on share one density, as the cells of a block do where there is
+    runs : (N,) how many cells from each of ``cells`` on share one density, as those of a coarse cell do where there is
         little mass; one each by default
     refined : what registration found, by pose id
     reference : poses of the prior or of the frame before, by which modes are reported at one of their images under the object's
         symmetry
     observations : one for each image, in the order given; none for a loaded posterior
-    provenance, diagnostics : what it was made from, and what to think of it
+    provenance, diagnostics : what it was made from, and signs of trouble in it
     timing_ms, warnings : time by stage; one line each
     """
 
@@ -108,7 +108,7 @@ def cell_densities(posterior: CellDistribution) -> NDArray[np.float32]:
         out[cells] = np.exp(posterior.log_prob.astype(np.float32) - index.log_weight[cells])
     else:
         density = np.exp(row_log_density(posterior, np.arange(len(cells))).astype(np.float32))
-        out[spelled_out(cells, posterior.runs)] = np.repeat(density, posterior.runs)
+        out[expand_runs(cells, posterior.runs)] = np.repeat(density, posterior.runs)
     return out
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from geomtact.errors import UsageError, nearest_name
 
-RESOLVED = ("blocks", "cells", "all")
+RESOLVED = ("coarse", "cells", "all")
 
 
 @dataclass(frozen=True)
@@ -15,11 +15,11 @@ class Effort:
 
     Attributes
     ----------
-    resolved : what is scored: "blocks" of about 20 cells, "cells" (on a large grid those where the mass is), or "all"
+    resolved : what is scored: "coarse" cells of about 20 cells, "cells" (on a large grid those where the mass is), or "all"
         cells, their pixels counted too
     modes : that are refined
     thorough : whether each is refined by all registrations or by one
-    outlines : whether, of one mask, the outline is what tells them apart where few enough cells are left (see
+    outlines : whether, of one mask, the outline refines the modes where few enough cells are left (see
         ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by FilterReg
     """
 
@@ -38,7 +38,7 @@ class Effort:
 
 
 EFFORTS = {
-    "fast": Effort("blocks", 0),
+    "fast": Effort("coarse", 0),
     "balanced": Effort("cells", 5, thorough=False),
     "exact": Effort("all", 25, outlines=True),
 }

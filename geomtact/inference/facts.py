@@ -1,4 +1,4 @@
-"""What a posterior was made from, and what was noticed on the way: typed, so that no decision reads a text or a key."""
+"""The provenance and the diagnostics of a posterior, typed so that no decision reads a text or a key."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from geomtact.se3 import Array
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What to think of a posterior.
+    """Signs of trouble in a posterior.
 
     Attributes
     ----------
-    is_outlier : whether a contact is unlike any simulated touch of the object
+    is_outlier : whether a contact is out of distribution: no simulated touch of the object resembles it
     disagrees : whether the other sensors, or the prior, contradict a sensor's image
-    unexplained_nats : per contact, by how much the likeliest pose explains less than the poses that suit each sensor best;
-        inf where no pose suits all; None where poses were not searched for
-    misfit_nats : per contact, by how much the likeliest pose misses masks beyond what is usual; as ``unexplained_nats``, and
-        None with measured depths
+    unexplained_nats : per contact, by how much the likeliest pose explains less than the best pose of each sensor alone;
+        inf where no pose suits all; None where no poses were searched
+    misfit_nats : per contact, by how much the likeliest pose misses the masks beyond the usual error; as
+        ``unexplained_nats``, and None with measured depths
     refined_by_outline : whether the outline was compared with those of rigid and elastic gels
     frame : number of the frame in a sequence, from 1; None outside of one
     surprise_nats : log of how likely the posterior of the frame before made this frame, relative to chance; None where
-        there was nothing to compare with
+        nothing was compared
     is_skipped : whether the frame's image could not be read
     """
 

@@ -120,7 +120,7 @@ def heading(path: str | Path) -> tuple[str, str, str]:
 
 def load(path: str | Path, cache_dir: str | Path | None = None) -> CellDistribution:
     """Read a posterior, from its file or the folder that holds it as posterior.npz; its index is opened from the cache, or built
-    anew where it is no longer there.
+    again where it is missing.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> CellDistribut
         cells, runs, log_prob = data["row_cell"], data["row_length"], data["row_log_prob"]
         poses, seed = int(data["index_poses"]), int(data["seed"])
         frame, evidence = str(data["frame"]), float(meta["log_evidence"])
-        _check(mesh.sha256 == str(data["object_sha256"]), "its mesh is not the one that it says it is of")
+        _check(mesh.sha256 == str(data["object_sha256"]), "its mesh is not the one that its checksum names")
         _check(frame in ("sensor", "world"), f"frame {frame!r}")
         _check_rows(cells, runs, log_prob, poses)
         T_frame_sensor = check_pose(data["T_frame_sensor"], "T_frame_sensor")
@@ -194,7 +194,7 @@ def file_of(path: str | Path) -> Path:
 
 
 def _read(path: Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The arrays of ``names``, or all, and what is told in words."""
+    """The arrays of ``names``, or all, and the texts."""
     try:
         if not zipfile.is_zipfile(path):  # numpy would take it for a pickle
             raise ValueError("it is no .npz file, or not a whole one")
@@ -210,8 +210,8 @@ def _read(path: Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any
 
 def _check_rows(cells: NDArray[Any], runs: NDArray[Any], log_prob: NDArray[Any], poses: int) -> None:
     """ValueError where runs of cells are none of a grid of so many ``poses``, or no distribution over it."""
-    _check(cells.ndim == 1 and cells.dtype.kind in "iu" and log_prob.shape == cells.shape, "rows of unlike length")
-    _check(len(runs) in (0, len(cells)), "rows of unlike length")
+    _check(cells.ndim == 1 and cells.dtype.kind in "iu" and log_prob.shape == cells.shape, "rows of different length")
+    _check(len(runs) in (0, len(cells)), "rows of different length")
     if len(cells):
         ends = cells + (runs if len(runs) else 1)
         inside = cells[0] >= 0 and ends[-1] <= poses and (ends > cells).all() and (ends[:-1] <= cells[1:]).all()

@@ -1,10 +1,10 @@
-"""Several sensors on one object: the product of what each says (thesis 6.2 and its appendix).
+"""Several sensors on one object: the product of their likelihoods (thesis 6.2 and its appendix).
 
     P(T | LS_1 .. LS_N)  is proportional to  P(T) P(LS_1 | T) .. P(LS_N | T)
 
 Each sensor's posterior, relative to the uniform distribution on its own contact pose space, is its likelihood up to a
-constant. All are brought onto the cells of one sensor, the first that has contact. A sensor that feels nothing speaks too:
-against the poses at which the object would touch it.
+constant. All are transferred to the cells of one sensor, the first that has contact. A sensor without contact counts against
+the poses at which the object would touch it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.cell_transfer import CellTransfer, ExtrinsicsStd
 from geomtact.errors import NoPoseAgreesError
-from geomtact.inference.densities import NothingFelt
+from geomtact.inference.densities import NoContactDensity
 from geomtact.inference.distribution import Refined, cell_densities
 from geomtact.inference.extrinsics import extrinsics_covariance
 from geomtact.inference.facts import Diagnostics
@@ -34,14 +34,17 @@ from geomtact.inference.search import SensorView
 from geomtact.log_mass import normalised
 from geomtact.se3 import Array, inverse
 
-# Of what two sensors show, at least: what a cell's width hides of the pose it hides from all of them
-_CORRELATION = 0.1
-_NEGLIGIBLE = 25.0  # nats below the most probable place
-# Density relative to the uniform distribution below which the first sensor's places are transferred by one pose each
-_UNLIKELY_DENSITY = 0.1
-_DISAGREES = -2.0  # nats by which the other sensors may make a reading less likely than chance does
-# Nats a contact above which the likeliest pose leaves what is seen unexplained: so do 2 of 100 scenes of right rigs (pin, head)
-_UNEXPLAINED = 1.75
+# Least correlation between the log densities of two sensors, because a cell's width hides the same part of the pose from both.
+# Hand-set; its effect was measured on simulated scenes apart from those of the study (docs/several-sensors.md).
+_LEAST_CORRELATION = 0.1
+_NEGLIGIBLE_NATS = 25.0  # log density below that of the most probable place from which a place has no weight; hand-set
+_UNLIKELY_DENSITY = (
+    0.1  # density relative to the uniform below which a place is transferred by one pose alone; hand-set
+)
+_DISAGREES_NATS = -2.0  # support of the other sensors for an image below which a disagreement is reported; hand-set
+# Unexplained nats per contact above which poor agreement is reported: 2 of 100 simulated scenes of the pin and the head with
+# exact sensor poses exceed it.
+_UNEXPLAINED_NATS = 1.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +56,9 @@ class Fused:
     cells : (n,) of the index of the first sensor that has contact
     log_prob : (n,) log probability of each, normalised
     first : which sensor that is
-    weight : (N,) by how much each sensor counts: less than 1 where others say the same
+    weight : (N,) power of each sensor's likelihood: less than 1 where sensors correlate
     log_evidence : log of the mean over the prior, on the first sensor's space, of the product of densities so weighed
-    support : (N,) for each sensor, by how many nats the others make its reading likelier than the uniform does; 0 for one
+    support : (N,) for each sensor, the log likelihood of its image under the others, relative to the uniform; 0 for one
     """
 
     cells: NDArray[np.int64]
@@ -97,7 +100,7 @@ def fuse(
 
     def likelihood_of(other: Posterior) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         T_other_first = inverse(other.T_frame_sensor) @ base.T_frame_sensor
-        return _seen(
+        return _likelihood(
             CellTransfer(index, other.index, T_other_first, extrinsics_std or ExtrinsicsStd()), other, unlikely
         )
 
@@ -138,7 +141,7 @@ def fused_posterior(
 
     Parameters
     ----------
-    touches : what each sensor tells under the uniform prior, not refined, in the world frame
+    touches : posteriors of the single sensors under the uniform prior, not refined, in the world frame
     mode_refiners : of the object on each sensor
     prior : as in ``Localizer.localize``
     modes : how many are refined
@@ -201,22 +204,22 @@ def _widened(posterior: Posterior, T_frame_sensor: Array, extrinsics_std: Extrin
 
 def poor_agreement(unexplained_nats: float | None, with_prior: bool = False) -> list[str]:
     """The warning, if any, that no pose explains all images nearly as well as others explain each of them."""
-    if unexplained_nats is None or unexplained_nats <= _UNEXPLAINED:
+    if unexplained_nats is None or unexplained_nats <= _UNEXPLAINED_NATS:
         return []
     left = f"leaves {unexplained_nats:.1f} nats a contact unexplained"
     if not np.isfinite(unexplained_nats):
         left = "does not suit all of them"
     return [
-        f"the sensors agree badly: the likeliest pose {left}, rarely more than {_UNEXPLAINED} where the sensor poses are right; "
-        f"check {'the prior, ' * with_prior}T_world_sensor, or whether one of them touches something else, or give the "
-        "uncertainty of the sensor poses (std_mm, std_deg)"
+        f"the sensors agree badly: the likeliest pose {left}, rarely more than {_UNEXPLAINED_NATS} where the sensor poses "
+        f"are right; check {'the prior, ' * with_prior}T_world_sensor, or whether one of them touches something else, or "
+        "give the uncertainty of the sensor poses (std_mm, std_deg)"
     ]
 
 
 def _without_contact(touches: Sequence[Posterior], prior: Any) -> Posterior:
     """The posterior when no sensor has contact: the prior, restricted to poses that touch none of them."""
     first, others = touches[0], touches[1:]
-    density = NothingFelt(others, prior_log_density(first.index, prior, first.frame))
+    density = NoContactDensity(others, prior_log_density(first.index, prior, first.frame))
     return replace(first, off_contact_log_density=density, **_of_all(touches))
 
 
@@ -235,8 +238,8 @@ def _of_all(touches: Sequence[Posterior], disagreements: Sequence[str] | None = 
 
 
 def disagreement(fused: Fused, with_prior: bool = False) -> str | None:
-    """Which sensors the others, and the prior, contradict, in words; None where all agree."""
-    against = np.flatnonzero(fused.support < _DISAGREES)
+    """The warning, if any, that the others, or the prior, contradict a sensor."""
+    against = np.flatnonzero(fused.support < _DISAGREES_NATS)
     if not len(against):
         return None
     if len(fused.support) == 2:
@@ -253,22 +256,21 @@ def disagreement(fused: Fused, with_prior: bool = False) -> str | None:
     )
 
 
-def _seen(
+def _likelihood(
     transfer: CellTransfer, other: Posterior, unlikely: NDArray[np.bool_]
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Likelihood (n,) of what ``other`` shows at each place of ``transfer.here``, and of its showing any contact, or none."""
+    """Likelihood (n,) of what ``other`` shows at each place of ``transfer.here``, and of its contact, or its lack."""
     if not other.contact:
-        free = transfer.nothing_felt()
+        free = transfer.no_contact_likelihood()
         return free, free
     return transfer.mean(cell_densities(other), unlikely)
 
 
 def _shares(log_prior: Array, logs: Array, has_contact: NDArray[np.bool_]) -> Array:
-    """By how much each of N sensors counts (N,), given the log density (N, n) that each gives n places.
+    """The power (N,) of each of N sensors, given the log density (N, n) that each gives n places.
 
-    Sensors that vary alike over the places still possible say the same twice, be it the truth or an error that a place repeats to
-    all. So each counts by one over the number of sensors that it speaks for, 1 + the sum of its correlations with the others. One
-    without contact counts in full.
+    Sensors whose log densities correlate over the possible places repeat one another, errors included. So each gets the power
+    1 / (1 + the sum of its correlations with the others). One without contact gets the power 1.
     """
     share, logs = np.ones(len(logs)), logs[has_contact]
     if len(logs) < 2:
@@ -277,22 +279,23 @@ def _shares(log_prior: Array, logs: Array, has_contact: NDArray[np.bool_]) -> Ar
     top = joint.max(initial=-np.inf)
     if top == -np.inf:
         return share
-    possible = joint > top - _NEGLIGIBLE
+    possible = joint > top - _NEGLIGIBLE_NATS
     logs = logs[:, possible]
     weight = np.exp(normalised(joint[possible]))
     # einsum, not @: over so many places a product of matrices waits for its threads longer than it computes
     off = (logs - np.einsum("in,n->i", logs, weight)[:, None]) * np.sqrt(weight)
     covariance = np.einsum("in,jn->ij", off, off)
     std = np.sqrt(np.maximum(covariance.diagonal(), 1e-12))
-    correlation = np.clip(covariance / np.outer(std, std), _CORRELATION, 1)
+    correlation = np.clip(covariance / np.outer(std, std), _LEAST_CORRELATION, 1)
     np.fill_diagonal(correlation, 1)
     share[has_contact] = 1 / correlation.sum(1)
     return share
 
 
 def _support(total: float, touched: Array, without: Array, uniform: Array) -> float:
-    """By how many nats the others make a sensor's reading likelier than the uniform does where it is touched; that it is touched
-    tells against it, if the others make that less likely than chance does, but not in its favour.
+    """Log likelihood [nats] of a sensor's image under the others, relative to the uniform over the poses that touch it.
+
+    That the sensor is touched at all counts only where the others make it less likely than chance does.
 
     Parameters
     ----------
@@ -312,12 +315,12 @@ def _product(mass: Array, densities: Sequence[Array], left_out: int | None = Non
 
 
 def _excluded(name: str, order: Sequence[int], rest: Sequence[float]) -> str:
-    """What to say when no pose agrees with all sensors; ``rest`` is the mass that all but one of them leave."""
+    """The error message where no pose agrees with all sensors; ``rest`` is the mass that all but one of them leave."""
     possible = [i for i, mass in zip(order, rest, strict=True) if mass > 0]
     if len(order) > 2 and len(possible) == 1:
         return (
-            f"T_world_sensor: no pose of {name} agrees with sensor {possible[0] + 1} and with all others, which agree among "
-            "themselves; check that sensor's pose (metres) and image"
+            f"T_world_sensor: no pose of {name} agrees with sensor {possible[0] + 1} and with all others, which agree with "
+            "each other; check that sensor's pose (metres) and image"
         )
     return (
         f"T_world_sensor: no pose of {name} agrees with all {len(order)} sensors; check their poses (metres, sensor to world) "

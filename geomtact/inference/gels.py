@@ -1,7 +1,7 @@
-"""How likely the outline of a contact is at poses, as rigid and elastic gels would feel them, and a search for likelier ones.
+"""Log likelihood of a contact's outline on rigid and elastic gels, and a search for likelier poses.
 
-What the grid stores, and what registration casts, is where the object lies below the membrane. A real gel sinks beside what
-presses, and touches less of it, by an amount that follows only from its pressure.
+The grid stores, and registration casts, where the object lies below the membrane. A real gel sinks beside what presses and
+touches less of it, by an amount that follows from its pressure.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from geomtact.scoring.outline import OutlineLikelihood
 from geomtact.se3 import Array
 
 SHAPE = (60, 80)  # of the casts
-GELS = (0.0, 0.5, 1.0)  # of an elastic half-space's sinking: rigid, thin and thick gels, all as likely
-# How many poses are left in each round, how many are tried around each, and in what share of the width of the first
+GELS = (0.0, 0.5, 1.0)  # share of an elastic half-space's sinking: rigid, thin and thick gels, equally likely; hand-set
+# Per round: poses kept, poses tried around each, and their width as a share of the first; hand-set
 ROUNDS = ((200, 8, 1.0), (60, 10, 0.6), (25, 12, 0.35))
 
 

@@ -1,7 +1,7 @@
-"""The leading modes of several sensors, or of heights, taken below the grid, by all contacts at once.
+"""The leading modes of several sensors, or of depth maps, refined below the grid by all contacts at once.
 
-A cell is wider than the contacts of several sensors leave the pose, so its own pose is far from where they agree: in each of the
-likeliest, the pose is sought that suits all contacts (``search``). Directions that one contact leaves open another may tell.
+A cell is wider than the region in which several contacts agree, so its own pose may be far from that region. In each of the
+likeliest cells, ``search`` looks for the pose that suits all contacts. One contact may constrain what another leaves open.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from geomtact.inference.reweight import reweight_cells
 from geomtact.inference.search import Search, SensorView
 from geomtact.se3 import Array
 
-_CELLS = 250  # that are looked into, however many modes are asked for: more of them take time and tell no more
-# Power of the joint likelihood at one pose; and the share of their mass that the cells looked into keep, whatever is likely
-# within them. Chosen, as are the next, on scenes that the study does not judge (docs/several-sensors.md)
-_LIKELIHOOD_POWER, _KEPT_SHARE = 0.3, 0.03
-# The share that all others keep: halved by every contact, at most, and for how likely those looked into are in the mean, as a
-# share of the best of them
-_OTHERS, _AT_MOST, _AS_LIKELY = 0.4, 0.2, 5.0
-_IMAGE_POWER = 0.5  # power of what a cell had, against what its likeliest pose explains: both speak of the same images
-# nats, for each contact, that a pose explains less than the poses which suit each sensor best: of a right one, of a wrong one
-ALIKE, UNLIKE = 4.0, 8.0
-_EVIDENCE_POWER = 0.5  # power of the likelihood in the evidence
-_OUTLINE = 150.0  # nats that each metre of a contact's outline costs even at the right pose
+_CELLS = 250  # number of cells that are searched: more cells cost time and add no information
+# The next five were chosen on simulated scenes apart from those of the study (docs/several-sensors.md).
+_LIKELIHOOD_POWER = 0.3  # power of the joint likelihood at one pose
+_KEPT_SHARE = 0.03  # share of their mass that the searched cells keep, whatever the search finds
+# Share of their mass that unsearched cells keep: least of ``_OTHERS_MOST`` and ``_OTHERS_BASE`` / 2^contacts +
+# ``_OTHERS_SLOPE`` times the mean likelihood of the searched cells relative to the best.
+_OTHERS_BASE, _OTHERS_MOST, _OTHERS_SLOPE = 0.4, 0.2, 5.0
+_IMAGE_POWER = 0.5  # power of a cell's mass beside the likelihood of its best pose, of the same images; hand-set
+# Unexplained nats per contact up to which the search is trusted in full, and from which on not at all. Hand-set; the second is
+# also a limit of identification, chosen on 22 simulated scenes (docs/which-part.md).
+EXPLAINED_NATS, UNEXPLAINED_NATS = 4.0, 8.0
+_EVIDENCE_POWER = 0.5  # power of the likelihood in the evidence, chosen on 22 simulated scenes (docs/which-part.md)
+_OUTLINE_NATS = 150.0  # loss of log likelihood per metre of outline, even at the true pose (docs/which-part.md)
 
 
 def refine_jointly(
@@ -39,14 +40,13 @@ def refine_jointly(
     seed: int,
     log_prior: NDArray[np.floating] | None = None,
 ) -> Posterior:
-    """``posterior``, on the first sensor's cells, with its ``k`` leading modes refined against all ``views`` and weighed anew.
+    """``posterior``, on the first sensor's cells, with its ``k`` leading modes refined against all ``views`` and reweighted.
 
-    As in ``ModeRefiner.refine``, each cell keeps the pose at which what is seen is likeliest, and what the cells hold together
-    is shared out anew by these likelihoods: but only as far as the likeliest pose explains what all sensors show, in the mean
-    nearly as well as other poses do what each of them shows. If none does, the right one was not looked into. ``log_prior`` is as
-    of ``reweight_cells``.
+    As in ``ModeRefiner.refine``, each cell keeps its likeliest pose, and these likelihoods share out the mass of the cells.
+    That holds only as far as the likeliest pose explains all images nearly as well as other poses explain each of them. If no
+    pose does, the search missed the right cell. ``log_prior`` is as of ``reweight_cells``.
 
-    The evidence becomes the mean likelihood under the prior, as far as the cells looked into hold it. The posterior's
+    The evidence becomes the mean likelihood under the prior, over the searched cells. The posterior's
     diagnostics report ``unexplained_nats`` and, of masks alone, ``misfit_nats``.
     """
     searched = likeliest_cells(posterior, _CELLS)
@@ -57,7 +57,7 @@ def refine_jointly(
     home, poses, likely = search.best_of_each_cell(candidates)
 
     unexplained = (search.best.sum() - likely.max(initial=-np.inf)) / search.n_contacts
-    explains = float(np.clip((UNLIKE - unexplained) / (UNLIKE - ALIKE), 0, 1))
+    explains = float(np.clip((UNEXPLAINED_NATS - unexplained) / (UNEXPLAINED_NATS - EXPLAINED_NATS), 0, 1))
     mass = cell_log_density(posterior, home) + posterior.index.log_weight[home]
     others = 1.0
     if search.n_contacts > 1:
@@ -65,8 +65,8 @@ def refine_jointly(
     kept_share, others_factor = (1 - (1 - share) * explains for share in (_KEPT_SHARE, others))
     if len(home):
         prior = posterior.index.log_weight if log_prior is None else log_prior
-        heights = search.heights(poses)
-        explained = prior[home] + _EVIDENCE_POWER * (likely - heights) + heights
+        by_depth = search.depth_log_likelihood(poses)
+        explained = prior[home] + _EVIDENCE_POWER * (likely - by_depth) + by_depth
         posterior = replace(posterior, log_evidence=float(np.logaddexp.reduce(explained)))
     posterior = reweight_cells(
         posterior, home, _LIKELIHOOD_POWER * likely, kept_share, others_factor, _IMAGE_POWER, log_prior
@@ -75,7 +75,7 @@ def refine_jointly(
     misfit = None
     if not any(view.has_height for view in views):
         outline = np.mean([view.outline for view in search.views[: search.n_contacts]])
-        misfit = _finite_or_inf(-likely.max(initial=-np.inf) / search.n_contacts - _OUTLINE * outline)
+        misfit = _finite_or_inf(-likely.max(initial=-np.inf) / search.n_contacts - _OUTLINE_NATS * outline)
     diagnostics = replace(posterior.diagnostics, unexplained_nats=_finite_or_inf(unexplained), misfit_nats=misfit)
     return replace(posterior, refined=search.refined(posterior, home, poses, k), diagnostics=diagnostics)
 
@@ -88,12 +88,12 @@ def _finite_or_inf(nats: float) -> float:
 def _others_factor(log_mass: Array, log_likelihood: Array, n_contacts: int) -> float:
     """Factor on the mass of cells that were not searched, given ``log_mass`` (n,) and ``log_likelihood`` (n,) of those that were.
 
-    A pose there may explain all contacts as well as the best. That is the less likely, the more contacts there are and the more
-    the best of the searched cells stands out.
+    A pose there may explain all contacts as well as the best. That is less likely with more contacts, and where the best of the
+    searched cells stands out.
     """
     if len(log_mass) < 2:
-        return _AT_MOST
+        return _OTHERS_MOST
     others = np.arange(len(log_mass)) != log_likelihood.argmax()
     log_mass, beside = log_mass[others], log_likelihood[others] - log_likelihood.max()
-    in_the_mean = np.logaddexp.reduce(log_mass + beside) - np.logaddexp.reduce(log_mass)
-    return float(min(_AT_MOST, _OTHERS / 2**n_contacts + _AS_LIKELY * np.exp(in_the_mean)))
+    mean = np.logaddexp.reduce(log_mass + beside) - np.logaddexp.reduce(log_mass)
+    return float(min(_OTHERS_MOST, _OTHERS_BASE / 2**n_contacts + _OTHERS_SLOPE * np.exp(mean)))

@@ -26,8 +26,8 @@ from geomtact.se3 import Array
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.moments import cleaned, moments
 
-_SURFACE_POINTS = 30_000  # of the object
-LIKELIHOOD_POWER = 0.5  # of the likelihood at one pose, when it weighs the cell around it
+_SURFACE_POINTS = 30_000  # points of the object's surface that registration uses; hand-set
+LIKELIHOOD_POWER = 0.5  # power of the likelihood at one pose that reweights the cell around it; hand-set
 _SHAPE = (36, 48)  # of the casts by which refinements are compared
 
 
@@ -53,17 +53,15 @@ class ModeRefiner:
         return [filterreg, icp] if thorough else [filterreg]
 
     def refine(self, posterior: Posterior, contact: Contact, k: int, thorough: bool = True) -> Posterior:
-        """``posterior`` with its ``k`` leading modes refined against the observed ``contact``, and weighed anew.
+        """``posterior`` with its ``k`` leading modes refined against the observed ``contact``, and reweighted.
 
-        Of the cell's own pose, the same with the contact's centroid moved onto the observed one, and what each
-        registration makes of that, the pose at which the observed contact is most likely is kept: a refinement that
-        does not raise it is dropped. What the cells of these modes hold together is then shared out among them by how
-        likely the contact is at each.
+        Each mode keeps the likeliest of three kinds of pose: the cell's own, the same shifted to the observed centroid, and the
+        result of each registration from there. These likelihoods then share out the mass of the modes' cells.
 
         Parameters
         ----------
-        contact : on any grid over the window; its heights are not looked at
-        thorough : whether every registration has a try, or only the one that does best
+        contact : on any grid over the window; its depths are not used
+        thorough : whether ICP registers too, or FilterReg alone
         """
         cells = leading_cells(posterior, k)
         if not len(cells):
@@ -87,7 +85,7 @@ class ModeRefiner:
         different, which = np.unique(poses.reshape(-1, 16), axis=0, return_inverse=True)
         log_likelihood = self.log_likelihood(mask, different.reshape(-1, 4, 4))[which.ravel()].reshape(poses.shape[:2])
         todo = np.arange(poses.shape[1])
-        while len(todo):  # only winners are asked whether they touch, which costs more
+        while len(todo):  # only winners are checked for contact, which costs more
             best = log_likelihood[:, todo].argmax(0)
             off = ~np.isfinite(self.space.penetration(poses[best, todo])) & np.isfinite(log_likelihood[best, todo])
             log_likelihood[best[off], todo[off]] = -np.inf

@@ -20,7 +20,7 @@ from geomtact.inference.distribution import (
 )
 from geomtact.se3 import Array, adjoint, inverse
 
-_LEAST, _SPARE = 6, 2  # modes grown at least, and beyond those asked for
+_LEAST, _SPARE = 6, 2  # modes grown at least, and beyond those requested; hand-set
 _POINTS = 128  # of the surface, for distances between modes
 
 
@@ -35,8 +35,8 @@ class Mode:
     probability : mass within 5 mm or 5 % of the object's diameter, the smaller, of T (mean point distance modulo
         symmetry); each pose counts for its most probable mode only
     covariance : (6, 6) of xi = (rx, ry, rz, tx, ty, tz) in T exp(xi^), radians and metres
-    observable : (r, 6) orthonormal rows: directions of xi, rotations scaled by ``length``, that the contact tells; no rows
-        where that was not worked out, as of modes that are not refined
+    observable : (r, 6) orthonormal rows: the observable directions of xi, rotations scaled by ``length``; no rows where
+        they were not computed, as for modes that are not refined
     length : metres by which rotations are scaled before directions are compared
     refined : whether T was moved off the grid, because the contact simulated there agrees better with the observed one
     """

@@ -1,4 +1,4 @@
-"""How an object moves from one frame of a sequence to the next, as far as that is known."""
+"""Models of how an object moves from one frame of a sequence to the next."""
 
 from __future__ import annotations
 

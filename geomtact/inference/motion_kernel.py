@@ -1,4 +1,4 @@
-"""What a motion makes of a distribution over the cells of a contact pose space: the filter's first step, in arrays."""
+"""The filter's prediction step: a motion applied to a distribution over the cells of a contact pose space."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from geomtact.geometry.approach import allowed, approach_of
 from geomtact.inference.motion import Motion
 from geomtact.se3 import Array, exp, transform
 
-_TWISTS = 4096  # motions drawn, which stand for all
-_ROTATIONS = 1 << 17, 16, 128  # drawn to count how many leave their cell: in all, and of a cell at least and at most
-_CARRIED = 150_000, 2, 64  # points that are carried along with the sensor: in all, and of a cell at least and at most
-_LEAST_TAP = 1e-4
+# All constants of the prediction are hand-set.
+_TWISTS = 4096  # number of motions drawn
+_ROTATIONS = 1 << 17, 16, 128  # rotations drawn to count how many leave their cell: in total, least and most per cell
+_CARRIED = 150_000, 2, 64  # points carried along with the sensor: in total, least and most per cell
+_LEAST_TAP = 1e-4  # share of a lattice cell shifted so far below which it is dropped
 _FEW = 0.5  # share of all rotations up to which only those that hold mass are shifted
-_MIXED = 0.1  # by how much the shares of the penetrations may differ, relative to their mean, when they count as mixed
+_UNIFORM_LEVELS = 0.1  # relative deviation of the shares of the penetrations up to which these count as uniform
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class MotionKernel:
-    """What a motion makes of a distribution over the cells of ``index``.
+    """A motion applied to distributions over the cells of ``index``.
 
     Cells are about as wide as the motion, so what counts is the share of a cell that leaves it. Shifts along x and along y,
     changes of penetration, and turns are taken one after the other, each of them reversible: between two cells as much of the
@@ -98,8 +99,7 @@ class MotionKernel:
     ) -> Mixture:
         """The distribution over the sensor after it has moved as for :attr:`left`. What does not touch any more is lost.
 
-        A step may be much shorter than a cell, so points drawn anew in every cell are carried: now and then one of them crosses
-        over.
+        A step may be much shorter than a cell, so points drawn in every cell are carried: a few of them cross over.
         """
         index, (ny, nx), cells = self.index, self.index.table.shape[1:], before.cells
         points, least, most = _CARRIED
@@ -217,7 +217,7 @@ class MotionKernel:
         moved = np.minimum(depth.astype(np.int64), bins - 1) + bins * start.astype(np.int64)[:, None]
         share = np.bincount(moved.ravel(), minlength=bins**2).reshape(bins, bins) / (16 * len(step))
         share = 0.5 * (share + share.T)
-        if np.abs(share * bins - 1).max() < _MIXED:
+        if np.abs(share * bins - 1).max() < _UNIFORM_LEVELS:
             return np.ones((1, 1), np.float32)
         np.fill_diagonal(share, share.diagonal() + 1 - share.sum(1))
         return share.astype(np.float32)

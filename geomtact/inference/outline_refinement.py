@@ -1,7 +1,7 @@
 """The leading modes of one contact refined by its outline, where few enough cells are left to search each.
 
-Of the likeliest cells, poses are drawn, registered and cast as for several sensors (``search``). The most hopeful are then moved
-and weighed by how far the outline that was observed is from those that rigid and elastic gels would show there (``gels``).
+Of the likeliest cells, poses are drawn, registered and cast as for several sensors (``search``). The best are then refined and
+reweighted by how far the observed outline is from those that rigid and elastic gels would show there (``gels``).
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from geomtact.inference.posterior import Posterior
 from geomtact.inference.reweight import reweight_cells
 from geomtact.inference.search import Search, SensorView
 
-_CELLS = 600  # that are looked into
-ENOUGH = 0.1  # share of the posterior that these must hold, to be worth it
-# Arguments of ``reweight_cells``: the outline is of the image that gave the cells their mass, so that counts by half
+_CELLS = 600  # number of cells that are searched; hand-set
+ENOUGH = 0.1  # least share of the posterior in these cells for which the search pays; hand-set
+# Arguments of ``reweight_cells``, hand-set: the outline comes from the image that gave the cells their mass, so that mass gets
+# the power one half.
 _IMAGE_POWER, _KEPT_SHARE, _OTHERS_FACTOR = 0.5, 0.15, 0.5
 
 
 def few_are_left(posterior: Posterior) -> bool:
-    """Whether the cells that would be looked into hold enough of a posterior."""
+    """Whether the cells that would be searched hold enough of a posterior."""
     cells = likeliest_cells(posterior, _CELLS)
     return bool(np.exp(cell_log_density(posterior, cells) + posterior.index.log_weight[cells]).sum() > ENOUGH)
 

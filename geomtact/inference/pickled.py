@@ -32,6 +32,6 @@ def reopened(kind: type[_Kind], index: Index, scorer: str, fit: Fit, *rest: Any)
     if fit_of(fitted) != fit:
         raise CacheError(
             f"cache entry {index.folder}: its score {scorer!r} is not the one that was pickled; prepare the object again, and "
-            "pickle it anew"
+            "pickle it again"
         )
     return kind(index, fitted, *rest)  # type: ignore[call-arg]

@@ -89,7 +89,7 @@ class Posterior(CellDistribution):
 
     @cached_property
     def entropy_nats(self) -> float:
-        """Minus the mean log density under the posterior itself: 0 for the uniform, lower the more is known."""
+        """Minus the mean log density under the posterior itself: 0 for the uniform, lower for a narrower one."""
         p = self._probability
         return -float(p @ np.where(p > 0, self._log_density, 0.0)) if self.contact else 0.0
 
@@ -117,8 +117,8 @@ class Posterior(CellDistribution):
         return [mode_at(self, cell, mass) for cell, mass in grown(self, k)]
 
     def likeliest(self, n: int) -> Array:
-        """The ``n`` most probable poses (m, 4, 4) in ``frame``, most probable first: one a cell, or a run of cells that are told
-        alike; refined where registration found better.
+        """The ``n`` most probable poses (m, 4, 4) in ``frame``, most probable first: one a cell, or a run of cells of one
+        density; refined where registration found better.
 
         Fewer where there are fewer, none without contact. Most are neighbours; for places that are apart see :meth:`modes`, which
         has the same images under the object's symmetry.
@@ -165,14 +165,14 @@ class Posterior(CellDistribution):
         """
         T = check_transforms(T)
         density = np.atleast_1d(self.log_density(T)).ravel()
-        known, share = np.isfinite(density), np.array([_share(pose, self.seed) for pose in T.reshape(-1, 4, 4)])
+        finite, share = np.isfinite(density), np.array([_share(pose, self.seed) for pose in T.reshape(-1, 4, 4)])
         if len(self.cells):
-            edges = np.unique(np.concatenate([density[known] - _TIE, density[known] + _TIE]))
+            edges = np.unique(np.concatenate([density[finite] - _TIE, density[finite] + _TIE]))
             whole = np.rint(self._probability * 2.0**52)  # whole numbers up to 2**53 add up to the same in any order
             below = np.cumsum(np.bincount(np.searchsorted(edges, self._log_density), whole, len(edges) + 1))
             above, upto = (1 - below[np.searchsorted(edges, density + off)] / below[-1] for off in (_TIE, -_TIE))
             share = above + share * (upto - above)
-        out = np.where(known, share, 1.0)
+        out = np.where(finite, share, 1.0)
         return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
 
     def sample(self, n: int, rng: np.random.Generator | int) -> Array:
@@ -207,7 +207,7 @@ class Posterior(CellDistribution):
     @staticmethod
     def load(path: str | Path, cache_dir: str | Path | None = None) -> Posterior:
         """Read what :meth:`save` wrote: the file ``path``, or the posterior.npz in that folder. Its index is opened from
-        ``cache_dir``, by default ``$GEOMTACT_CACHE`` or the user's cache folder, or built anew where it is no longer there.
+        ``cache_dir``, by default ``$GEOMTACT_CACHE`` or the user's cache folder, or rebuilt where it is missing.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What was known before the touch, in any of the forms that it may be given in (the thesis's P(G), 6.2)."""
+"""The prior (the thesis's P(G), 6.2) in each form that a user may give."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) 
     Raises
     ------
     UsageError, InputError
-        Of no known kind, for another object or frame, or ruling out every pose that touches.
+        Of an unsupported type, for another object or frame, or ruling out every pose that touches.
     """
     if prior is None:
         return index.log_weight
@@ -55,7 +55,7 @@ def prior_log_mass(index: Index, prior: Any, T_frame_sensor: Array, frame: str) 
 
 
 def lost_contact(prior: Any, sensor: Sensor, T_frame_sensor: Array) -> bool:
-    """Whether ``prior`` says that the object touches the sensor where it stands at ``T_frame_sensor`` (4, 4)."""
+    """Whether ``prior`` requires the object to touch the sensor at ``T_frame_sensor`` (4, 4)."""
     return isinstance(prior, Posterior) and prior.contact and stands_as(prior, sensor, T_frame_sensor)
 
 
@@ -68,7 +68,7 @@ def prior_log_density(index: Index, prior: Any, frame: str) -> LogDensity | None
     Raises
     ------
     UsageError, InputError
-        Of no known kind, or for another object or frame.
+        Of an unsupported type, or for another object or frame.
     """
     mesh = index.mesh
     if prior is None:

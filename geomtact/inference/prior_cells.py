@@ -1,4 +1,4 @@
-"""What was known before the touch, as the mass of every cell of an index (the thesis's P(G), 6.2)."""
+"""The prior (the thesis's P(G), 6.2) as the mass of every cell of an index."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from geomtact.errors import InputError
 from geomtact.inference.densities import (
     GaussianPrior,
     LogDensity,
-    NothingFelt,
+    NoContactDensity,
     OfAllImages,
     checked,
     images,
@@ -24,10 +24,10 @@ from geomtact.se3 import Array, inverse
 from geomtact.sensing.sensor import Sensor
 
 _CHUNK = 1 << 16
-_DRAWN = 1024  # poses of a Gaussian at a time
-_BATCHES, _TOUCHING = 8, 1000  # how often at most, and until how many touch
-_FARTHEST = 8.0  # standard deviations from a Gaussian, widened by a cell, that touching poses may be
-_LOOK = (24, 32)  # rays that tell which may
+_DRAWN = 1024  # poses drawn from a Gaussian at a time; hand-set, as are the next three
+_BATCHES, _TOUCHING = 8, 1000  # largest number of such draws, and number of touching poses at which they end
+_FARTHEST = 8.0  # largest distance of a touching pose from a Gaussian widened by a cell, in standard deviations
+_LOOK = (24, 32)  # rays by which poses that cannot touch are left out
 
 
 def log_mass_of_density(index: Index, density: LogDensity, T_frame_sensor: Array) -> NDArray[np.floating]:
@@ -66,18 +66,18 @@ def log_mass_of_poses(index: Index, T: Array, log_mass: Array, T_frame_sensor: A
 
 
 def log_mass_of_posterior(index: Index, prior: Posterior, T_frame_sensor: Array) -> NDArray[np.floating]:
-    """Log mass (N,) of every cell, of what the same sensor told on any grid, or another sensor in the same frame.
+    """Log mass (N,) of every cell, of a posterior of the same sensor on any grid, or of another in the same frame.
 
     Raises
     ------
     InputError
-        The same sensor felt nothing where it stands.
+        The same sensor had no contact at the same pose.
     """
     if not stands_as(prior, index.sensor, T_frame_sensor):
         return _log_mass(index, _carried(index, prior, T_frame_sensor))
     if not prior.contact:
         raise InputError(
-            "prior: it says that the object does not touch the sensor, but this image shows a contact; leave it out"
+            "prior: by it the object does not touch the sensor, but this image shows a contact; leave it out"
         )
     if prior.index.key == index.key:
         return _log_mass(index, cell_log_density(prior, np.arange(len(index))))
@@ -137,7 +137,7 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
 
 
 def _on_another_grid(index: Index, prior: Posterior) -> Array:
-    """Log density (N,) in the cells of ``index`` of a prior that the same sensor told on another grid.
+    """Log density (N,) in the cells of ``index`` of a posterior of the same sensor on another grid.
 
     Of the prior's cells, those in which a cell's own pose lies share out what they hold together by their density at these poses;
     the mass of all others goes to the cells in which their own poses lie.
@@ -145,16 +145,16 @@ def _on_another_grid(index: Index, prior: Posterior) -> Array:
     mass = cell_densities(prior) * np.exp(prior.index.log_weight)
     looked_up = _home(index, np.arange(len(index)), prior.index)
     found = np.flatnonzero(looked_up >= 0)
-    told = np.zeros(len(index))
-    told[found] = np.exp(index.log_weight[found] + cell_log_density(prior, looked_up[found]))
+    mass_here = np.zeros(len(index))
+    mass_here[found] = np.exp(index.log_weight[found] + cell_log_density(prior, looked_up[found]))
     seen = np.unique(looked_up[found])
-    told *= mass[seen].sum() / max(told.sum(), 1e-300)
+    mass_here *= mass[seen].sum() / max(mass_here.sum(), 1e-300)
     mass[seen] = 0
     rest = np.flatnonzero(mass > 0)
     home = _home(prior.index, rest, index)
-    told += np.bincount(home[home >= 0], mass[rest[home >= 0]], len(index))
+    mass_here += np.bincount(home[home >= 0], mass[rest[home >= 0]], len(index))
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(told) - np.where(told > 0, index.log_weight, 0))
+        return np.asarray(np.log(mass_here) - np.where(mass_here > 0, index.log_weight, 0))
 
 
 def _home(index: Index, ids: NDArray[np.int64], other: Index) -> NDArray[np.int64]:
@@ -169,29 +169,30 @@ def _home(index: Index, ids: NDArray[np.int64], other: Index) -> NDArray[np.int6
 
 
 def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
-    """Log density (N,) of a prior that a sensor elsewhere told, in the cells of ``index``: the mean over each, for a cell is
-    wider than the gel is deep, so that its own pose seldom touches there."""
+    """Log density (N,) in the cells of ``index``, of the posterior of a sensor elsewhere: the mean over each cell.
+
+    A cell is wider than the gel is deep, so its own pose seldom touches there.
+    """
     apart = prior.off_contact_log_density
-    others, before = (apart.others, apart.before) if isinstance(apart, NothingFelt) else ((), apart)
+    others, earlier = (apart.others, apart.prior) if isinstance(apart, NoContactDensity) else ((), apart)
     density = np.ones(index.places)
-    for told in (prior, *others):
-        transfer = CellTransfer(index, told.index, inverse(told.T_frame_sensor) @ T_frame_sensor)
-        density *= transfer.mean(cell_densities(told))[0] if told.contact else transfer.nothing_felt()
+    for each in (prior, *others):
+        transfer = CellTransfer(index, each.index, inverse(each.T_frame_sensor) @ T_frame_sensor)
+        density *= transfer.mean(cell_densities(each))[0] if each.contact else transfer.no_contact_likelihood()
     with np.errstate(divide="ignore"):
         out = np.tile(np.log(density), len(index.height))
-    if isinstance(before, OfAllImages):
-        known = log_mass_of_density(index, before.prior, T_frame_sensor)
-        out[index.possible] += known[index.possible] - index.log_possible_weight
-    elif before is not None:
-        out += _by_chunks(index, lambda T: before(T_frame_sensor @ T))
+    if isinstance(earlier, OfAllImages):
+        log_mass = log_mass_of_density(index, earlier.prior, T_frame_sensor)
+        out[index.possible] += log_mass[index.possible] - index.log_possible_weight
+    elif earlier is not None:
+        out += _by_chunks(index, lambda T: earlier(T_frame_sensor @ T))
     return out
 
 
 def _over_images(index: Index, density: LogDensity) -> Array:
     """Log of the mean of exp(``density``) over the images of every cell's pose under the object's symmetry (N,).
 
-    A cell stands for all of them: what the function says of any is said of it. Images that the approach rules out do
-    not count.
+    A cell stands for all of these images. Those that the approach rules out do not count.
     """
     assert index.mesh.symmetry is not None
     symmetric = images(index.mesh.symmetry)

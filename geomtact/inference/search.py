@@ -1,4 +1,4 @@
-"""Poses at which one sensor, or several, would show what they do: drawn, registered, and sought around the best.
+"""Search for the poses that explain the images of one sensor or several: draw, register, and refine around the best.
 
 A cell is wider than contacts leave the pose, so its own pose is far from where they agree. Poses drawn within cells are cast on
 every sensor, the likeliest of each is registered to all contacts together, and a last search around the best of these follows.
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.cell_transfer import UNFELT
+from geomtact.contact_space.cell_transfer import MISSED_CONTACT_SHARE
 from geomtact.inference.distribution import Refined, cell_log_density
 from geomtact.inference.mode_refiner import ModeRefiner, refined_at
 from geomtact.inference.posterior import Posterior
@@ -23,30 +23,31 @@ from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread, moved
 from geomtact.registration.protocol import Problem
-from geomtact.scoring.likelihood import cast_log_likelihood, height_log_likelihood
+from geomtact.scoring.likelihood import cast_log_likelihood, depth_map_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact, SoftMask
 from geomtact.sensing.moments import cleaned
 
-_SHAPE = (24, 32)  # of the casts that choose among many
-_DRAWS = 8  # poses drawn within each
-_POINTS, _ROUGH = (
-    60,
-    20,
-)  # of each outline, at most: for observable directions, and to register all cells that are searched
-_HOPEFUL = 4  # of the poses tried for a cell, that are asked for by more than two sensors
-_THOROUGH = 25  # cells that ICP has a try at, too
-# Of the last search, each in half the width of the one before, and for the better half of the cells
-_ROUNDS, _AROUND = 3, 12
-_REFINED_PER_MODE = 5  # number of cells, for each mode asked for, whose pose is registered by all points
-_NARROW = 0.25  # of the grid's spread: standard deviation of the motions that are tried first around a pose
-_NEAR, _FAR = 0.5e-3, 5e-3  # m by which a pose misses a sensor: its standard deviation, and at most
+_SHAPE = (24, 32)  # pixels of the casts by which many poses are compared
+_DRAWS = 8  # poses drawn within each cell
+# All constants of the search are hand-set.
+_POINTS = 60  # largest number of points of an outline, for observable directions
+_ROUGH_POINTS = 20  # largest number of points of an outline, to register all searched cells
+_HOPEFUL = 4  # number of poses per cell that the third and later sensors evaluate
+_THOROUGH = 25  # number of cells that ICP registers too
+_ROUNDS, _AROUND = 3, 12  # rounds of the last search, each for the better half of the cells, and poses per cell in each
+_REFINED_PER_MODE = 5  # number of cells, for each requested mode, whose pose is registered by all points
+_FIRST_WIDTH = 0.25  # standard deviation of the first motions around a pose, as a share of the grid's spread
+_MISS_STD, _MOST_MISS = (
+    0.5e-3,
+    5e-3,
+)  # distance by which a pose misses a sensor: standard deviation and largest value [m]
 
 
 @dataclass(frozen=True, eq=False)
 class SensorView:
-    """What a sensor shows, the only one or one of several.
+    """The image of one sensor, the only one or one of several.
 
     Attributes
     ----------
@@ -60,16 +61,16 @@ class SensorView:
     T_sensor_first: Array
 
     @cached_property
-    def shown(self) -> SoftMask:
+    def soft_mask(self) -> SoftMask:
         """The contact without specks, at the image's own resolution."""
         assert self.contact is not None
-        shown = self.contact.soft_mask
-        return cleaned(shown, self.refiner.space.sensor)
+        soft_mask = self.contact.soft_mask
+        return cleaned(soft_mask, self.refiner.space.sensor)
 
     @property
     def mask(self) -> NDArray[np.bool_]:
         """Where it is likelier than not."""
-        return self.shown > 0.5
+        return self.soft_mask > 0.5
 
     @property
     def has_height(self) -> bool:
@@ -84,9 +85,9 @@ class SensorView:
         return float(np.pi / 4 * (across.sum() * dy + down.sum() * dx))
 
     def log_likelihood(self, T: Array) -> Array:
-        """Log likelihood (n,) of what is shown, with the object at ``T`` (n, 4, 4) in the first sensor's frame.
+        """Log likelihood (n,) of the image, with the object at ``T`` (n, 4, 4) in the first sensor's frame.
 
-        A pose that does not touch, or is too deep, is the less likely the farther it is from doing so: a search finds its way.
+        The likelihood of a pose that misses, or is too deep, falls with its distance: that guides the search.
         """
         return self.likelihood_of_depths(self.depths(T))
 
@@ -100,20 +101,20 @@ class SensorView:
         sensor, shape = self.refiner.space.sensor, depths.shape[1:]
         deepest = depths.max((1, 2))
         if self.contact is None:
-            return np.where(deepest > 0, np.log(UNFELT), 0.0)
-        off = np.clip(np.maximum(-deepest, deepest - sensor.max_penetration), 0, _FAR)
+            return np.where(deepest > 0, np.log(MISSED_CONTACT_SHARE), 0.0)
+        off = np.clip(np.maximum(-deepest, deepest - sensor.max_penetration), 0, _MOST_MISS)
         likely = cast_log_likelihood(depths, to_grid(self.mask, shape), sensor.pixel_area(shape))
-        return likely + self.height_likelihood(depths) - 0.5 * (off / _NEAR) ** 2
+        return likely + self.depth_likelihood(depths) - 0.5 * (off / _MISS_STD) ** 2
 
-    def height_likelihood(self, depths: NDArray[np.float32]) -> Array:
-        """Log likelihood (n,) of the heights shown, from :meth:`depths`; 0 where there are none."""
+    def depth_likelihood(self, depths: NDArray[np.float32]) -> Array:
+        """Log likelihood (n,) of the measured depth map, from :meth:`depths`; 0 without one."""
         sensor, shape = self.refiner.space.sensor, depths.shape[1:]
         if self.contact is None or self.contact.height is None:
             return np.zeros(len(depths))
         height = np.asarray(cv2.resize(self.contact.height, shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
         touched = to_grid(self.contact.sure, shape)
         return np.asarray(
-            height_log_likelihood(depths, height, touched, sensor.pixel_area(shape), sensor.height_noise), float
+            depth_map_log_likelihood(depths, height, touched, sensor.pixel_area(shape), sensor.height_noise), float
         )
 
 
@@ -168,15 +169,15 @@ class Search:
         T_first_sensor = np.stack([inverse(view.T_sensor_first) for view, _ in touching])
         self.problem, self.rough = (
             Problem.joined(
-                [make_problem(v.shown, v.refiner.space.sensor, c.height, max_points=points) for v, c in touching],
+                [make_problem(v.soft_mask, v.refiner.space.sensor, c.height, max_points=points) for v, c in touching],
                 T_first_sensor,
             )
-            for points in (_POINTS, _ROUGH)
+            for points in (_POINTS, _ROUGH_POINTS)
         )
         self.spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
         self.filterreg = FilterReg(self.first.surface, self.spread)
         self.best = np.full(len(views), -np.inf)
-        self.width = _NARROW * self.spread.metres(self.problem.length)
+        self.width = _FIRST_WIDTH * self.spread.metres(self.problem.length)
 
     def candidates(self, T: Array, hidden: Array) -> Candidates:
         """With the object at ``T`` (n, d, 4, 4); ``hidden`` (n,) as in :class:`Candidates`."""
@@ -204,10 +205,10 @@ class Search:
         T[:, 2, 3] += np.where(np.isfinite(rise), rise, 0)
         return self.candidates(np.concatenate([own[:, None], T.reshape(len(cells), _DRAWS, 4, 4)], 1), hidden)
 
-    def heights(self, T: Array) -> Array:
-        """Log likelihood (n,) of all heights that are shown, with the object at ``T`` (n, 4, 4)."""
+    def depth_log_likelihood(self, T: Array) -> Array:
+        """Log likelihood (n,) of all measured depth maps, with the object at ``T`` (n, 4, 4)."""
         measured = (view for view in self.views if view.has_height)
-        return sum((view.height_likelihood(view.depths(T)) for view in measured), start=np.zeros(len(T)))
+        return sum((view.depth_likelihood(view.depths(T)) for view in measured), start=np.zeros(len(T)))
 
     def registered(self, candidates: Candidates, thorough: bool = False) -> list[Candidates]:
         """What was tried, and what registration makes of the best for each cell; if ``thorough``, ICP too of the most hopeful."""
@@ -247,7 +248,7 @@ class Search:
         some = np.flatnonzero(
             (depth > 0) & (depth <= self.first.space.sensor.max_penetration) & (log_likelihood > -np.inf)
         )
-        # how deep the best of all those are is worked out exactly, which takes longer
+        # only the best of all those get their exact depth, which takes longer
         return self.by_cell(*self._best(T[some], depth[some], log_likelihood[some])[1:])
 
     def by_cell(self, T: Array, log_likelihood: Array) -> tuple[NDArray[np.int64], Array, Array]:
@@ -260,7 +261,7 @@ class Search:
         return home[possible], T[possible], log_likelihood[possible]
 
     def _best(self, T: Array, depth: Array, log_likelihood: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """As :meth:`by_cell`, for poses ``T`` (n, 4, 4) at a known ``depth`` (n,) in any cells."""
+        """As :meth:`by_cell`, for poses ``T`` (n, 4, 4) at the given ``depth`` (n,) in any cells."""
         order = np.argsort(-log_likelihood, kind="stable")
         home, row = np.unique(self.index.lookup(T[order], depth[order]), return_index=True)
         return home, T[order[row]], log_likelihood[order[row]]

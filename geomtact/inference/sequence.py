@@ -13,7 +13,7 @@ import numpy as np
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError, PoseError, UsageError, nearest_name
 from geomtact.inference.facts import Diagnostics, TrackRecord
-from geomtact.inference.filter import FRESH, NOW, Counts, Filter
+from geomtact.inference.filter import FRAME_POWER, UNIFORM_SHARE, Counts, Filter
 from geomtact.inference.motion import Motion, UniformBall
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.inference.posterior import Posterior
@@ -41,8 +41,8 @@ def track(
     *,
     kind: str = "auto",
     background: Any = None,
-    counts: Counts = (NOW, None),
-    fresh: float = FRESH,
+    counts: Counts = (FRAME_POWER, None),
+    fresh: float = UNIFORM_SHARE,
     on_error: str = "raise",
     seed: int = 0,
 ) -> Iterator[Posterior]:
@@ -59,11 +59,11 @@ def track(
     effort, kind, background, seed : as for ``localize``
     prior : distribution before the first frame with contact, over the sensor as it stands then (see ``inference.prior``)
     most : cells that are kept from frame to frame at most, which bounds the time a frame takes; all that count by default
-    counts : powers of a frame's likelihood, in its own posterior and in those of all later frames; None for the latter lets all
-        frames before count by ``filter.MEMORY`` together, so that frames which err alike are not counted twice. (1, 1) is the
-        thesis's, for frames that err independently, such as separate touches
-    fresh : share of the uniform distribution that is mixed in before each frame; 0 is the thesis's filter, which forgets for good
-        whatever it does not keep
+    counts : powers of a frame's likelihood, in its own posterior and in those of all later frames. With None for the latter,
+        all earlier frames have the power ``filter.MEMORY_POWER`` together, so that frames which err alike do not count twice.
+        (1, 1) is the thesis's, for frames that err independently, such as separate touches
+    fresh : share of the uniform distribution that is mixed in before each frame; 0 is the thesis's filter, in
+        which dropped cells stay impossible
     on_error : "raise", or "skip" a frame that cannot be read: its posterior is what the frames before expect
 
     Yields
@@ -90,8 +90,8 @@ def make_filter(
     index: Index,
     scorer: FittedScorer,
     motion: Motion | None = None,
-    counts: Counts = (NOW, None),
-    fresh: float = FRESH,
+    counts: Counts = (FRAME_POWER, None),
+    fresh: float = UNIFORM_SHARE,
     most: int | None = None,
     seed: int = 0,
 ) -> Filter:

@@ -28,17 +28,18 @@ from geomtact.sensing.contact import Contact, SoftMask
 
 LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
 
-_HOLLOW = 0.01  # share of the surface in hollows that the sensor may fit into, from which the user is warned
-# nats by which an image is likelier without the prior: were the moments' likelihood exact, one image in exp(5), or 148, at most
-# would be, its pose drawn from the prior (Markov's inequality)
+_HOLLOW = 0.01  # share of the surface in hollows wider than the window, above which the user is warned; hand-set
+# Gain in an image's log evidence without the prior, above which the user is warned [nats]. Derived: by Markov's inequality at
+# most one image in exp(5) = 148 exceeds it, where the moments' likelihood is exact and the prior holds.
 _CONTRADICTION_NATS = 5.0
 
 
 def touch_posterior(
     index: Index, scorer: FittedScorer, placed: Placed, prior: Any, provenance: Provenance, seed: int
 ) -> tuple[Posterior, LogMass]:
-    """The posterior of one image on the cells of ``index``, not refined; and the log mass of every cell (M,) before it, where
-    there is a prior and contact.
+    """The posterior of one image on the cells of ``index``, not refined, and the log prior mass of every cell (M,).
+
+    The log prior mass is None without a prior, or without contact.
 
     Parameters
     ----------
@@ -82,7 +83,10 @@ def touch_posterior(
         warnings.extend(_contradiction(without_prior - evidence))
     is_outlier = model.is_outlier(usual, likeliest)
     if is_outlier:
-        warnings.append("the contact is unlike any touch of this object that was simulated: is it the right object?")
+        warnings.append(
+            "out-of-distribution contact: no simulated touch of this object resembles it; "
+            "check the object, the sensor and the mask"
+        )
     warnings.extend(_hollows(index.space.hollow))
     calibration = rows.calibration
     posterior = replace(
@@ -99,18 +103,20 @@ def touch_posterior(
     return posterior, log_prior
 
 
-def give_up_lost_contact(posterior: Posterior, prior: Any) -> tuple[Posterior, Any]:
-    """``posterior`` and ``prior``; without the prior where that holds that the object touches, but the image shows no contact."""
+def drop_lost_contact_prior(posterior: Posterior, prior: Any) -> tuple[Posterior, Any]:
+    """``posterior`` and ``prior``; without the prior where it requires contact but the image shows none."""
     if posterior.contact or not lost_contact(prior, posterior.sensor, posterior.T_frame_sensor):
         return posterior, prior
-    warning = "contact was lost: the prior, by which the object touches the sensor where it stands, is given up"
+    warning = (
+        "contact was lost: the prior requires contact at this sensor pose, but the image shows none; it is discarded"
+    )
     return replace(posterior, off_contact_log_density=None, warnings=[*posterior.warnings, warning]), None
 
 
 def refine_modes(posterior: Posterior, log_prior: LogMass, refiner: ModeRefiner, effort: Effort) -> Posterior:
     """The ``posterior`` of one image with its leading modes refined below the grid.
 
-    A mask is registered mode by mode. Depths, and outlines where few cells are left, are searched for and weighed.
+    Masks are registered mode by mode. With depths, or where few cells are left, a search over cells refines and reweights.
     ``log_prior`` is as of :func:`touch_posterior`.
     """
     if not posterior.contact or posterior.observation is None:
@@ -127,8 +133,10 @@ def refine_modes(posterior: Posterior, log_prior: LogMass, refiner: ModeRefiner,
 
 
 def _scored(contact: Contact) -> tuple[SoftMask, float]:
-    """The mask that is scored, and the depth [m] of the contour line of the gel that bounds it: where depths are measured, one
-    at which the gel surely lies on the object, which reaches below it by as much."""
+    """The mask that is scored, and the depth [m] of the gel's contour line that bounds it; 0 without depths.
+
+    At that depth the gel surely lies on the object, which reaches that much deeper.
+    """
     if contact.height is not None and contact.height[contact.mask].any():
         return contact.deeper(contact.sure_depth), contact.sure_depth
     return contact.soft_mask, 0.0
@@ -153,8 +161,8 @@ def _contradiction(nats: float) -> list[str]:
     if not nats > _CONTRADICTION_NATS:
         return []
     return [
-        f"the prior and the image contradict each other, by {nats:.0f} nats: look whether both are of this touch and object, "
-        "and at the prior's frame and units"
+        f"the prior and the image contradict each other, by {nats:.0f} nats: check that both are of this touch and object, "
+        "and the prior's frame and units"
     ]
 
 
@@ -163,8 +171,8 @@ def _hollows(share: float) -> list[str]:
     if not share > _HOLLOW:
         return []
     return [
-        f"{100 * share:.0f} % of the object's surface lies in hollows wider than the sensor's window, and touches in there are "
-        "mistaken for others: touch from outside, or localize on a mesh of that wall alone"
+        f"{100 * share:.0f} % of the object's surface lies in hollows wider than the sensor's window, and touches inside them "
+        "are mistaken for others: touch from outside, or localize on a mesh of that wall alone"
     ]
 
 

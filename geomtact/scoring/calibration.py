@@ -1,11 +1,11 @@
-"""From scores to probabilities: what a score is worth as evidence, measured on simulated touches.
+"""From scores to probabilities: the temperature and the uniform mixture weight of a score, fitted on simulated touches.
 
 (A sensor's colours are calibrated elsewhere: ``sensing/calibrate.py``.)
 
-A score divided by a temperature is taken as a log likelihood, and a small share of every posterior is the uniform
-distribution, for what no score foresees. Both are chosen so that the poses of touches drawn uniformly over the contact
-pose space, felt through elastic and rigid gels and noise of any strength up to heavy, come out as probable as possible:
-the logarithmic score is proper, so what maximises it is calibrated (Gneiting and Raftery 2007).
+A score divided by a temperature is a log likelihood, and a small share of every posterior is the uniform distribution, for
+errors that no score models. Both maximise the mean log probability of the true poses of simulated touches: uniform over the
+contact pose space, on rigid and elastic gels, with noise of any strength up to heavy. The logarithmic score is proper, so
+its maximum is calibrated (Gneiting and Raftery 2007).
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index
-from geomtact.contact_space.touch import CALIBRATION_NOISE, LEAST_CONTACT, draw_noise, felt_mask, spoilt
+from geomtact.contact_space.touch import CALIBRATION_NOISE, LEAST_CONTACT, draw_noise, simulate_mask, spoilt
 from geomtact.progress import Progress
 from geomtact.scoring.protocol import Scorer
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 
-TEMPERATURES = np.geomspace(0.01, 30.0, 240)  # in units of the spread of the scores, whatever their scale
-_BINS = 1 << 12
+TEMPERATURES = np.geomspace(0.01, 30.0, 240)  # searched, in units of the spread of the scores; hand-set range
+_BINS = 1 << 12  # of the histogram of scores, for speed
 _CHUNK = 1 << 18  # rows worked on at a time
-_TINY = 1e-30  # probabilities below it are added up as logarithms: single precision ends near 1e-38
-_SPREAD_TOUCHES = 10  # that the spread of the scores is taken from
-FLOORS = np.geomspace(1e-3, 0.5, 16)
-_SHAPE = (72, 96)  # of the simulated touches
-_TRIES = 20  # draws for each simulated touch, at most
-_BATCH = 4  # poses tried at once for one that touches a sensor with a housing
+_TINY = 1e-30  # probability below which sums are made of logarithms: single precision ends near 1e-38
+_SPREAD_TOUCHES = 10  # touches that give the spread of the scores; hand-set
+FLOORS = np.geomspace(1e-3, 0.5, 16)  # searched uniform mixture weights; hand-set range
+_SHAPE = (72, 96)  # pixels of the simulated touches
+_TRIES = 20  # largest number of draws for each simulated touch
+_BATCH = 4  # poses drawn at once for one that touches a sensor with a housing
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class CalibrationTouches:
 
 @dataclass(frozen=True)
 class Calibration:
-    """``log likelihood = score / temperature``; ``floor`` is the uniform's share of the posterior.
+    """``log likelihood = score / temperature``; ``floor`` is the uniform mixture weight of the posterior.
 
     ``gain`` is the mean information gained by the touches it was fitted on [nats].
     """
@@ -91,16 +91,16 @@ def simulate_touches(
     ids: list[int] = []
     for k in range(n):
         rng = np.random.default_rng([seed, k])
-        felt = _felt(index, k % 2 == 1 if elastic is None else elastic, rng)
-        if felt is not None:
-            masks.append(spoilt(felt[0], index.space, draw_noise(noise, rng), rng))
-            ids.append(felt[1])
+        simulated = _simulated_mask(index, k % 2 == 1 if elastic is None else elastic, rng)
+        if simulated is not None:
+            masks.append(spoilt(simulated[0], index.space, draw_noise(noise, rng), rng))
+            ids.append(simulated[1])
         if progress:
             progress((k + 1) / n, "simulating sensor noise")
     return CalibrationTouches(masks, np.array(ids, np.int64))
 
 
-def _felt(index: Index, elastic: bool, rng: np.random.Generator) -> tuple[NDArray[np.bool_], int] | None:
+def _simulated_mask(index: Index, elastic: bool, rng: np.random.Generator) -> tuple[NDArray[np.bool_], int] | None:
     """The contact (h, w) of a random pose before noise, and the id of the pose's cell; None where no draw gives one."""
     shape = index.sensor.along(_SHAPE)
     pixel = index.sensor.pixel_area(shape)
@@ -108,7 +108,7 @@ def _felt(index: Index, elastic: bool, rng: np.random.Generator) -> tuple[NDArra
         drawn = _drawn(index, rng)
         if drawn is None:
             continue
-        mask = felt_mask(index.space, drawn[0], elastic, shape)
+        mask = simulate_mask(index.space, drawn[0], elastic, shape)
         if mask.sum() * pixel >= min(LEAST_CONTACT, 12 * pixel):
             return mask, drawn[1]
     return None
@@ -132,7 +132,7 @@ def _drawn(index: Index, rng: np.random.Generator) -> tuple[Array, int] | None:
 def fit_calibration(
     scorer: Scorer, index: Index, touches: CalibrationTouches, weight: NDArray[np.floating] | None = None
 ) -> Calibration:
-    """The temperature and floor under which the true poses of ``touches`` are most probable.
+    """The temperature and uniform mixture weight under which the true poses of ``touches`` are most probable.
 
     ``weight`` is the measure of what ``scorer`` scores and ``touches.ids`` count: the cells of ``index`` by default.
     """
@@ -163,12 +163,12 @@ def fit_to_scores(
 
 
 def best_floor(ratio: Array) -> tuple[float, float]:
-    """The floor under which the truths are most probable, and their mean gain with it.
+    """The uniform mixture weight under which the true poses are most probable, and their mean gain with it.
 
-    ``ratio`` (n,) are the gains at the truths without a floor: the density there becomes a mixture with the uniform.
+    ``ratio`` (n,) are the gains at the true poses without a mixture: the density there becomes one with the uniform.
     """
-    mixed = np.log((1 - FLOORS[:, None]) * np.exp(np.minimum(ratio, 500)) + FLOORS[:, None]).mean(1)
-    return float(FLOORS[mixed.argmax()]), float(mixed.max())
+    gains = np.log((1 - FLOORS[:, None]) * np.exp(np.minimum(ratio, 500)) + FLOORS[:, None]).mean(1)
+    return float(FLOORS[gains.argmax()]), float(gains.max())
 
 
 def _histogram(
@@ -230,5 +230,5 @@ def posterior_log_prob(
 
 
 def chunks(n: int) -> list[slice]:
-    """``n`` rows in parts that are worth a thread's time."""
+    """``n`` rows in slices large enough for a thread."""
     return [slice(start, start + _CHUNK) for start in range(0, n, _CHUNK)]

@@ -1,11 +1,11 @@
-"""Coarse to fine: the blocks of the nested grid are scored first, and only those that carry mass cell by cell.
+"""Coarse to fine: the coarse cells of the nested grid are scored first, and only those with mass cell by cell.
 
-A block is described by the mean of its cells' vectors and by how they spread about it. Were they normally distributed, with
-variance v_j in component j, the mean of exp(-|f - g|^2 / t) over the block would be
+A coarse cell is described by the mean of its cells' vectors and by how they spread about it. Were they normally distributed, with
+variance v_j in component j, the mean of exp(-|f - g|^2 / t) over the coarse cell would be
 
     prod_j (1 + 2 v_j / t)^(-1/2) exp(-(f - mean g)_j^2 / (t + 2 v_j)),
 
-so a block's score stands for all of its cells, and what is left unexpanded keeps its mass. The cost of a touch follows
+so a coarse cell's score is that of all its cells, and one that is not expanded keeps its mass. The cost of a touch follows
 its ambiguity and not the size of the grid.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.index import Index, spelled_out
+from geomtact.contact_space.index import Index, expand_runs
 from geomtact.scoring.calibration import (
     Calibration,
     CalibrationTouches,
@@ -30,22 +30,22 @@ from geomtact.scoring.encoder import EncoderScorer
 from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
 from geomtact.sensing.contact import SoftMask
 
-SHARE = 0.98  # of the mass, that is scored cell by cell
-_LEADING = 64  # blocks among whose cells the best is looked for
-_CHUNK = 1 << 12  # blocks worked on at a time: they stay in the processor's cache
+SHARE = 0.98  # share of the mass that is scored cell by cell; hand-set
+_LEADING = 64  # coarse cells among whose cells the best score is searched; hand-set
+_CHUNK = 1 << 12  # coarse cells worked on at a time: they stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
-class BlockScorer:
-    """Scores of whole blocks, on the scale of the cells' scores.
+class CoarseScorer:
+    """Scores of whole coarse cells, on the scale of the cells' scores.
 
     Attributes
     ----------
     cells : the scorer of the cells
-    narrowing : (P B, d) t / (t + 2 v) of every block at every penetration, t being the cells' temperature
+    narrowing : (P B, d) t / (t + 2 v) of every coarse cell at every penetration, t being the cells' temperature
     narrowed : (P B, d) ``narrowing`` times the mean vector
     constant : (P B,) the score at a vector of zeros
-    temperature : that the cells' scores are worth as evidence
+    temperature : of the calibration of the cells' scores
     """
 
     cells: EncoderScorer
@@ -56,9 +56,9 @@ class BlockScorer:
     name: str = "blocks of encoder"
 
     @classmethod
-    def make(cls, cells: EncoderScorer, index: Index, temperature: float) -> BlockScorer:
-        """Over the blocks of ``index``, each cell weighed by its measure."""
-        first, _ = index.block_runs
+    def make(cls, cells: EncoderScorer, index: Index, temperature: float) -> CoarseScorer:
+        """Over the coarse cells of ``index``, each cell weighed by its measure."""
+        first, _ = index.coarse_runs
         weight = np.maximum(np.asarray(index.weight).reshape(-1), 1e-30)[:, None]
         total = np.add.reduceat(weight, first)
         middle = np.add.reduceat(weight * cells.stored, first) / total
@@ -68,20 +68,20 @@ class BlockScorer:
         return cls(cells, _single(narrow), _single(narrow * middle), _single(constant), temperature)
 
     def score(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
-        """Score (P B,) of every block: under the normal model, the temperature times the log of the mean of
+        """Score (P B,) of every coarse cell: under the normal model, the temperature times the log of the mean of
         exp(score / temperature) over its cells."""
         return self.trusted(index, self.cells.seen(index, mask))[0]
 
     def trusted(self, index: Index, seen: NDArray[np.float32]) -> tuple[NDArray[np.float32], np.float32]:
         """As :meth:`score`, for the vector ``seen`` (d,) of the observed contact, and how far the scores are trusted."""
         out = np.asarray(self.constant + self.narrowed @ (2 * seen) - self.narrowing @ seen**2)
-        first, counts = index.block_runs
+        first, counts = index.coarse_runs
         leading = np.sort(np.argpartition(-out, min(_LEADING, len(out) - 1))[:_LEADING])
-        trust = self.cells.trust(float(self.cells.of(spelled_out(first[leading], counts[leading]), seen).max()))
+        trust = self.cells.trust(float(self.cells.of(expand_runs(first[leading], counts[leading]), seen).max()))
         return (out, trust) if trust == 1 else (self._scaled(seen, trust), trust)
 
     def _scaled(self, seen: NDArray[np.float32], by: np.float32) -> NDArray[np.float32]:
-        """The scores (P B,) of the blocks when those of the cells are multiplied ``by`` a factor."""
+        """The scores (P B,) of the coarse cells when those of the cells are multiplied ``by`` a factor."""
         out = np.empty(len(self.constant), np.float32)
         half, ones = np.float32(0.5 * self.temperature), np.ones(len(seen), np.float32)
         for start in range(0, len(out), _CHUNK):
@@ -107,8 +107,8 @@ class Rows:
     first, runs : (N,) first pose id, ascending, and number of cells of each run; runs None for single cells
     score : (N,)
     log_prior : (N,) log mass of each run
-    calibration : what the scores are worth
-    by : name of what was scored by
+    calibration : of the scores
+    by : name of the score
     """
 
     first: NDArray[np.int64]
@@ -125,12 +125,12 @@ class Cascade:
 
     Attributes
     ----------
-    blocks : the scorer of blocks
-    coarse : what the blocks' scores are worth by themselves
-    partly : what the scores are worth where cells are scored in some blocks only; None where that is not done
+    coarse_scorer : of coarse cells
+    coarse : calibration of the coarse cells' scores alone
+    partly : calibration where cells are scored in some coarse cells only; None where that is not done
     """
 
-    blocks: BlockScorer
+    coarse_scorer: CoarseScorer
     coarse: Calibration
     partly: Calibration | None
 
@@ -138,14 +138,14 @@ class Cascade:
     def fit(
         cls, cells: EncoderScorer, fine: Calibration, index: Index, touches: CalibrationTouches, partly: bool
     ) -> Cascade:
-        """Calibrated on ``touches``; ``fine`` is what the cells' scores are worth where all are scored."""
-        blocks = BlockScorer.make(cells, index, fine.temperature)
-        own = index.block_of(touches.ids)
-        coarse = fit_calibration(blocks, index, CalibrationTouches(touches.masks, own), np.exp(index.log_block_weight))
+        """Calibrated on ``touches``; ``fine`` is the calibration of the cells' scores where all are scored."""
+        scorer = CoarseScorer.make(cells, index, fine.temperature)
+        own = index.coarse_cell_of(touches.ids)
+        coarse = fit_calibration(scorer, index, CalibrationTouches(touches.masks, own), np.exp(index.log_coarse_weight))
         if not partly:
-            return cls(blocks, coarse, None)
-        # what is lost where the truth lies in a block that stays whole is made good by a larger floor
-        out = cls(blocks, coarse, replace(fine, floor=0.0))
+            return cls(scorer, coarse, None)
+        # a larger uniform mixture weight makes up for true poses in coarse cells that stay whole
+        out = cls(scorer, coarse, replace(fine, floor=0.0))
         gains = []
         for mask, true in zip(touches.masks, touches.ids, strict=True):
             rows = out.expanded(index, mask)
@@ -157,45 +157,45 @@ class Cascade:
 
     def to_json(self) -> dict[str, Any]:
         """What :meth:`from_json` reads."""
-        out = {"temperature": self.blocks.temperature, "coarse": asdict(self.coarse)}
+        out = {"temperature": self.coarse_scorer.temperature, "coarse": asdict(self.coarse)}
         return out if self.partly is None else out | {"partly": asdict(self.partly)}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any], cells: EncoderScorer, index: Index) -> Cascade:
-        blocks = BlockScorer.make(cells, index, data["temperature"])
+        scorer = CoarseScorer.make(cells, index, data["temperature"])
         partly = Calibration(**data["partly"]) if "partly" in data else None
-        return cls(blocks, Calibration(**data["coarse"]), partly)
+        return cls(scorer, Calibration(**data["coarse"]), partly)
 
     def whole(self, index: Index, mask: SoftMask) -> Rows:
-        """The blocks alone."""
-        first, runs = index.block_runs
+        """The coarse cells alone."""
+        first, runs = index.coarse_runs
         shares, masks = contact_hypotheses(mask, index.sensor)
-        scores = [self.blocks.score(index, each) for each in masks]
-        score = mix_hypotheses(shares, scores, index.log_block_weight, self.coarse.temperature)
-        return _possible(Rows(first, runs, score, index.log_block_weight, self.coarse, self.blocks.name))
+        scores = [self.coarse_scorer.score(index, each) for each in masks]
+        score = mix_hypotheses(shares, scores, index.log_coarse_weight, self.coarse.temperature)
+        return _possible(Rows(first, runs, score, index.log_coarse_weight, self.coarse, self.coarse_scorer.name))
 
     def expanded(self, index: Index, mask: SoftMask) -> Rows:
-        """Blocks, and cell by cell those of them that hold ``SHARE`` of the mass."""
-        first, counts = index.block_runs
+        """Coarse cells, and cell by cell those of them that hold ``SHARE`` of the mass."""
+        first, counts = index.coarse_runs
         shares, masks = contact_hypotheses(mask, index.sensor)
-        seen = [self.blocks.cells.seen(index, each) for each in masks]
-        scores, trust = zip(*(self.blocks.trusted(index, each) for each in seen), strict=True)
-        prior = index.log_block_weight
+        seen = [self.coarse_scorer.cells.seen(index, each) for each in masks]
+        scores, trust = zip(*(self.coarse_scorer.trusted(index, each) for each in seen), strict=True)
+        prior = index.log_coarse_weight
         score = mix_hypotheses(shares, scores, prior, self.coarse.temperature)
         log_prob = posterior_log_prob(score, prior, replace(self.coarse, floor=0.0))
         chosen = heaviest(np.exp(log_prob), SHARE)
         length = np.where(chosen, counts, 1)
-        ids = spelled_out(first, length)
+        ids = expand_runs(first, length)
         runs, cell_prior = np.ones(len(ids), np.int64), index.log_weight[ids]
-        # the blocks that stay whole are scored as the cells that they begin with, and then as what they are
+        # the coarse cells that stay whole are scored as their first cells, and then as a whole
         at, whole = (np.cumsum(length) - length)[~chosen], ~chosen
         runs[at], cell_prior[at] = counts[whole], prior[whole]
-        cell_scores = [by * self.blocks.cells.of(ids, each) for by, each in zip(trust, seen, strict=True)]
-        for cell_score, block_score in zip(cell_scores, scores, strict=True):
-            cell_score[at] = block_score[whole]
+        cell_scores = [by * self.coarse_scorer.cells.of(ids, each) for by, each in zip(trust, seen, strict=True)]
+        for cell_score, coarse_score in zip(cell_scores, scores, strict=True):
+            cell_score[at] = coarse_score[whole]
         assert self.partly is not None
         cell_score = mix_hypotheses(shares, cell_scores, cell_prior, self.partly.temperature)
-        return _possible(Rows(ids, runs, cell_score, cell_prior, self.partly, self.blocks.cells.name))
+        return _possible(Rows(ids, runs, cell_score, cell_prior, self.partly, self.coarse_scorer.cells.name))
 
 
 def _possible(rows: Rows) -> Rows:

@@ -1,4 +1,4 @@
-"""Classical descriptors: contacts as vectors whose Euclidean distance measures how unlike they are.
+"""Classical descriptors: contacts as vectors whose Euclidean distance measures their dissimilarity.
 
 Each is a library's own, brought to a grid that does not depend on the resolution of the mask. A vector of d numbers
 costs 4 d bytes per pose to store, and one multiplication and addition per number to compare; both stand in each class,
@@ -71,7 +71,7 @@ class Hu:
 
     Blind to place, turn and size by design: they describe what was touched, not where in the window. What lies below
     1e-5 counts as nothing, as in OpenCV's ``matchShapes``; so the logarithm does not jump where a moment changes its
-    sign. scikit-image's takes ten times as long as OpenCV's, but knows pixels that are not square.
+    sign. scikit-image's takes ten times as long as OpenCV's, but supports pixels that are not square.
 
     7 numbers: 28 bytes per pose, 7 multiplications to compare, 0.1 ms to describe.
     """

@@ -40,7 +40,7 @@ class EncoderScorer(VectorScorer):
     Attributes
     ----------
     usual : largest squared distance to the nearest stored contact that is usual for touches of the object. A contact
-        farther from all of them is unlike what the network has learned from, and its scores count for less in proportion.
+        farther from all of them is out of distribution for the network, and its scores count for less in proportion.
     """
 
     usual: float = np.inf

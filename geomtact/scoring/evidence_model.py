@@ -1,7 +1,7 @@
-"""How likely a touch is at all: the evidence for the object, and whether the object could have made such a contact.
+"""The evidence of a touch for an object, and whether the touch is an outlier for it.
 
-The network's score is worth something within one object only. Between objects, the moments' likelihood is compared: a
-density over what a touch may show, which integrates to one for every object.
+The network's score compares poses of one object only. Between objects, the moments' likelihood is compared: a density over
+the moments of a touch, which integrates to one for every object.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from geomtact.contact_space.index import Index
 from geomtact.scoring.moments import Moments
 from geomtact.sensing.contact import SoftMask
 
-_SMALL = 60_000  # poses up to which the mean is over all of them
+_SMALL = 60_000  # number of poses up to which the mean is over all of them; hand-set, for speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +25,11 @@ class EvidenceModel:
     Attributes
     ----------
     moments : fitted to the index
-    usual : (evidence, likelihood of the best pose), each of which all but one in a hundred touches of the object reach
+    limits : (evidence, likelihood of the best pose): log values that 99 % of the object's touches reach
     """
 
     moments: Moments
-    usual: tuple[float, float] = (-np.inf, -np.inf)
+    limits: tuple[float, float] = (-np.inf, -np.inf)
 
     def evidence(
         self, index: Index, mask: SoftMask, log_prior: NDArray[np.floating] | None = None, above: float = 0.0
@@ -52,4 +52,4 @@ class EvidenceModel:
     def is_outlier(self, evidence: float, best: float) -> bool:
         """Whether hardly any touch of the object is so unlikely under the uniform distribution: as a whole, or at its best
         pose."""
-        return evidence < self.usual[0] or best < self.usual[1]
+        return evidence < self.limits[0] or best < self.limits[1]

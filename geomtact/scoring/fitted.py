@@ -39,25 +39,26 @@ from geomtact.scoring.vectors import describe_index
 from geomtact.sensing.contact import SoftMask
 
 FORMAT = 13
-_COSTLY = 300_000  # poses from which on a second score is felt in the time of a touch
-_LARGE = 2_000_000  # poses up to which scoring all of them takes no longer than choosing which
-_USUAL = 0.9  # share of touches that are no farther from all stored contacts than is usual
-_OUTLIERS = 0.01  # share of touches whose evidence, or best pose, counts as an outlier
-_LEAST_GAIN = 0.05  # nats that of information that a touch has to gain in the mean
-TOUCHES, SEED = 500, 20_200_531  # that scores are calibrated on
-_LEARN = 0.6  # share of them that the moments are learned from; the rest show what they are worth
+# All constants are hand-set.
+_COSTLY = 300_000  # number of poses above which a second score slows a touch down
+_LARGE = 2_000_000  # number of poses up to which scoring all of them takes no longer than choosing which
+_USUAL = 0.9  # share of the touches whose distance to the nearest stored contact counts as usual
+_OUTLIERS = 0.01  # share of the touches whose evidence, or best pose, counts as an outlier
+_LEAST_GAIN = 0.05  # least mean information gain of a touch, below which preparing fails [nats]
+TOUCHES, SEED = 500, 20_200_531  # number and seed of the simulated touches that scores are calibrated on
+_LEARN = 0.6  # share of these touches that the moments are fitted to; the rest are held out
 
 
 @dataclass(frozen=True)
 class FittedScorer:
-    """A scorer and what its scores are worth on one index.
+    """A scorer and its calibration on one index.
 
     Attributes
     ----------
-    name : as it was asked for
+    name : as requested
     scorer, calibration : of the cells
     evidence_model : gives the likelihood of a touch, given the object
-    cascade : of blocks and some cells, by the encoder; None for a score that has no part in it
+    cascade : of coarse cells and some cells, by the encoder; None for other scores
     exact_scorer, exact_calibration : of one that counts the pixels too; None where the score goes without
     """
 
@@ -72,10 +73,10 @@ class FittedScorer:
     def rows(self, index: Index, mask: SoftMask, resolved: str) -> Rows:
         """Scores of all cells under the uniform prior.
 
-        ``resolved`` says how: "blocks" alone, "cells" where the mass is and, on a large grid, blocks elsewhere, or "all"
-        cells, the pixels counted too. A score without a coarse form scores all cells.
+        ``resolved`` says how: "coarse" cells alone, "cells" where the mass is and, on a large grid, coarse cells elsewhere, or
+        "all" cells, the pixels counted too. A score without a coarse form scores all cells.
         """
-        if self.cascade is not None and resolved == "blocks":
+        if self.cascade is not None and resolved == "coarse":
             return self.cascade.whole(index, mask)
         if self.cascade is not None and self.cascade.partly is not None and resolved == "cells":
             return self.cascade.expanded(index, mask)
@@ -92,7 +93,7 @@ class FittedScorer:
         """Scores of every single cell that has mass.
 
         ``log_prior`` (N,) is the log mass of all cells, the uniform's where it is None; ``exact`` scores count the pixels too.
-        ``mask`` is what the object would touch if it were drawn back by ``above`` [m], a contour line of the gel's heights.
+        ``mask`` is the contact of the object drawn back by ``above`` [m]: a contour line of the depth map.
         """
         scorer, calibration = self.scorer, self.calibration
         if exact and self.exact_scorer is not None and self.exact_calibration is not None:
@@ -188,15 +189,17 @@ def _simulated(index: Index, path: Path | None, progress: Progress | None) -> Ca
 def _fit(name: str, scorers: dict[str, Scorer], index: Index, touches: CalibrationTouches) -> dict[str, Any]:
     """All that is fitted, as the cache holds it."""
     n = round(_LEARN * len(touches.ids))
-    learn, judge = (CalibrationTouches(touches.masks[part], touches.ids[part]) for part in (slice(n), slice(n, None)))
+    learn, held_out = (
+        CalibrationTouches(touches.masks[part], touches.ids[part]) for part in (slice(n), slice(n, None))
+    )
     moments = Moments.fit(index, learn.masks, learn.ids)
     nearest = {
-        each: float(np.quantile([-scorer.score(index, mask).max() for mask in judge.masks], _USUAL))
+        each: float(np.quantile([-scorer.score(index, mask).max() for mask in held_out.masks], _USUAL))
         for each, scorer in scorers.items()
         if isinstance(scorer, EncoderScorer)
     }
     scorers = {**_limited(scorers, nearest), "moments": moments}
-    evidence = [EvidenceModel(moments).evidence(index, mask) for mask in judge.masks]
+    evidence = [EvidenceModel(moments).evidence(index, mask) for mask in held_out.masks]
     data: dict[str, Any] = {
         "format": FORMAT,
         "moments": {
@@ -209,15 +212,15 @@ def _fit(name: str, scorers: dict[str, Scorer], index: Index, touches: Calibrati
         "weights": {name: 1.0},
     }
     if name == DEFAULT_SCORER:
-        comparison = Comparison(index, judge)
+        comparison = Comparison(index, held_out)
         candidates = {each: scorers[each] for each in (ENCODER, "moments", "iou")}
-        # on a large grid a further score has to be worth its time
+        # on a large grid a further score must gain more, for its time
         data["weights"], _ = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
         more = {**candidates, "likelihood": scorers["likelihood"]}
         data["exact_weights"], exact = choose(comparison, more, least=0.02, start=data["weights"])
         data["exact"] = asdict(exact)
     # only the moments have learned from some of the touches
-    touches = judge if "moments" in data["weights"] else touches
+    touches = held_out if "moments" in data["weights"] else touches
     calibration = fit_calibration(_weighed(data["weights"], scorers), index, touches)
     data["calibration"] = asdict(calibration)
     if name == DEFAULT_SCORER and data["exact_weights"] == data["weights"]:

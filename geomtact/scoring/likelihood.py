@@ -1,9 +1,9 @@
 """How likely the observed pixels are, given how far the object lies below the membrane at each of them.
 
-A pixel is felt when the object reaches below the membrane there by more than a threshold: 0 for a rigid contact, a part
-of the penetration for an elastic gel, which dips beside what presses (Hertz: half of it under a ball). Where exactly
-between felt and not felt the boundary falls is uncertain by its softness. Threshold and softness are unknown for a touch
-and marginalised over; neighbouring pixels are felt together, so that each counts for a part of an observation only.
+A pixel is in contact when the object reaches below the membrane there by more than a threshold. It is 0 for a rigid contact, a
+share of the penetration for an elastic gel, which dips beside what presses (Hertz: half of it under a ball). The softness is
+the width of the boundary. Threshold and softness are unknown for a touch and marginalised over. Neighbouring pixels are
+correlated, so that each counts for less than one observation.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from geomtact.se3 import Array
 from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
 
-THRESHOLDS = (0.0, 0.25, 0.5)  # of the penetration
-SOFTNESS = (0.1e-3, 0.4e-3)  # m
-_CORRELATED = 4e-6  # m^2 that are felt or not felt together
-_SCALE = 0.05  # by which all depths of a touch may be too large or too small
-_FAR = 0.05  # m above the membrane that are as good as infinitely many
-_OUTLIERS = 0.02  # share of pixels that are outliers: dust, glare, what no model foresees
+# All constants are hand-set; the thresholds span a rigid contact and Hertz's half under a ball.
+THRESHOLDS = (0.0, 0.25, 0.5)  # least depth of a pixel in contact, as a share of the penetration; equally likely
+SOFTNESS = (0.1e-3, 0.4e-3)  # width of the boundary between contact and none, in depth [m]; equally likely
+_CORRELATED = 4e-6  # area within which pixels count as one observation [m^2]
+_SCALE = 0.05  # standard deviation of a depth, as a share of it, that all depths of a touch share
+_FAR = 0.05  # height above the membrane that counts as infinite [m]
+_OUTLIERS = 0.02  # share of pixels that are outliers, such as dust and glare
 
 
 @dataclass(frozen=True)
@@ -49,13 +50,13 @@ class PixelLikelihood:
         P, bin_size = len(depths), depths[0] * 2
         # between two contours the surface lies in the middle; beyond the last ones it lies a bin away
         below = depths[:, None] - np.arange(P + 1) * bin_size  # by the pose's penetration and the pixel's contour
-        felt = np.diff(overlaps(index.bits, seen).astype(np.float32), axis=0, prepend=0, append=seen.sum())
+        in_contact = np.diff(overlaps(index.bits, seen).astype(np.float32), axis=0, prepend=0, append=seen.sum())
         area = np.diff(index.area.astype(np.float32), axis=0, prepend=0, append=seen.size)
-        counts = np.concatenate([felt, np.maximum(area - felt, 0)]).T  # (n, 2 (P + 1))
+        counts = np.concatenate([in_contact, np.maximum(area - in_contact, 0)]).T  # (n, 2 (P + 1))
         weight = _independent(index.sensor.pixel_area(seen.shape))
         out = np.zeros(index.area.shape, np.float32)
         for p, d in enumerate(depths):
-            yes = np.stack([_felt(below[p] - t * d, s) for t, s in product(THRESHOLDS, SOFTNESS)], 1)
+            yes = np.stack([_contact_probability(below[p] - t * d, s) for t, s in product(THRESHOLDS, SOFTNESS)], 1)
             logs = weight * np.concatenate([np.log(yes), np.log1p(-yes)]).astype(np.float32)  # (2 (P + 1), K)
             out[p] = log_mean_exp(counts @ logs)
         return out
@@ -69,14 +70,14 @@ def cast_log_likelihood(depths: NDArray[np.floating], seen: NDArray[np.bool_], a
     """
     deepest = np.maximum(depths.max((1, 2)), 0)[:, None, None]
     weight = _independent(area)
-    sign = np.where(seen, 1, -1).astype(depths.dtype)  # not felt is as likely as felt with the object as far above
+    sign = np.where(seen, 1, -1).astype(depths.dtype)  # no contact is as likely as contact with the object as far above
     each = []
     for t, s in product(THRESHOLDS, SOFTNESS):
-        each.append(weight * np.log(_felt(sign * (depths - t * deepest), s)).sum((1, 2)))
+        each.append(weight * np.log(_contact_probability(sign * (depths - t * deepest), s)).sum((1, 2)))
     return np.asarray(log_mean_exp(np.stack(each, 1)), float)
 
 
-def height_log_likelihood(
+def depth_map_log_likelihood(
     depths: NDArray[np.floating],
     height: NDArray[np.floating],
     touched: NDArray[np.bool_],
@@ -103,12 +104,12 @@ def height_log_likelihood(
     return _independent(area) * np.log((1 - _OUTLIERS) * np.exp(-0.5 * off2) + _OUTLIERS).sum(1)
 
 
-def _felt(below: NDArray[np.floating], softness: float) -> NDArray[np.floating]:
-    """Probability that a pixel is felt at which the object is ``below`` [m] under the threshold."""
+def _contact_probability(below: NDArray[np.floating], softness: float) -> NDArray[np.floating]:
+    """Probability that a pixel is in contact where the object is ``below`` [m] under the threshold."""
     out: NDArray[np.floating] = _OUTLIERS / 2 + (1 - _OUTLIERS) / (1 + np.exp(np.clip(-below / softness, -30, 30)))
     return out
 
 
 def _independent(area: float) -> float:
-    """How much of an observation a pixel of ``area`` [m^2] is."""
+    """Share of one observation that a pixel of ``area`` [m^2] counts for."""
     return min(1.0, area / _CORRELATED)

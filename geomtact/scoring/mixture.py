@@ -1,4 +1,4 @@
-"""Contacts of several patches, for which the score of a cell is too sure.
+"""Contacts of several patches, for which the score of a cell is overconfident.
 
 Where two or three places of an object touch at once, a degree more or less of tilt decides which of them do. So the contact
 that was simulated for the touch's own cell often shows but one of them, while that of a cell elsewhere, whose own contact
@@ -20,19 +20,19 @@ from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.patches import patches
 from geomtact.sensing.sensor import Sensor
 
-# Share of the mixture that the patches alone have. On 654 touches of several patches, drawn on four objects, 0.1 to 0.3
-# gain 0.06 to 0.08 nats more than none; on a gear, whose contacts have several as simulated, 0.15 costs 0.1
-_ALONE = 0.15
-_MOST = 3  # patches, the largest, that are looked at alone
+# Summed share of the hypotheses that one patch alone is the contact. Chosen on 654 simulated touches of several patches on four
+# objects: 0.1 to 0.3 gain 0.06 to 0.08 nats over none. On a gear, whose stored contacts have several patches, 0.15 costs 0.1.
+_SINGLE_PATCH_SHARE = 0.15
+_MOST_PATCHES = 3  # largest patches that get a hypothesis each; hand-set
 
 
 def contact_hypotheses(mask: SoftMask, sensor: Sensor) -> tuple[list[float], list[SoftMask]]:
-    """What the object's own contact may be where a sensor shows ``mask`` (h, w): contacts (h, w), and before them the share of
-    the mixture that each has."""
-    alone = patches(mask, sensor.pixel_area(mask.shape), _MOST)
+    """Hypotheses for the object's own contact behind the observed ``mask`` (h, w): their shares of the mixture, and their
+    contacts (h, w)."""
+    alone = patches(mask, sensor.pixel_area(mask.shape), _MOST_PATCHES)
     if len(alone) < 2:
         return [1.0], [mask]
-    return [1 - _ALONE] + [_ALONE / len(alone)] * len(alone), [mask, *alone]
+    return [1 - _SINGLE_PATCH_SHARE] + [_SINGLE_PATCH_SHARE / len(alone)] * len(alone), [mask, *alone]
 
 
 def mix_hypotheses(
@@ -44,7 +44,7 @@ def mix_hypotheses(
     """The scores (N,) of a mixture of likelihoods, that have ``shares`` (k,) and ``scores`` (k, N).
 
     Each likelihood, exp(score / temperature), is taken to the mean of one over the rows, whose measure has the log ``log_weight``
-    (N,): so every component concerns the pose alone, however unlike the object it is.
+    (N,): so every component concerns the pose alone, however poorly it fits the object.
     """
     if len(scores) == 1:
         return scores[0]

@@ -59,7 +59,7 @@ def run(
 
 
 def with_weights(weights: dict[str, NDArray[np.float32]]) -> Encoder:
-    """The network with given weights; a RuntimeError or a KeyError says that they are not its own."""
+    """The network with given weights; raises RuntimeError or KeyError for the weights of another."""
     network = Encoder(len(weights["trunk.0.bias"]), len(weights["heads.touch.2.bias"]))
     network.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
     return network.eval()

@@ -1,8 +1,7 @@
-"""How likely the outline of a contact is, given where the gel should be touched.
+"""Log likelihood of a contact's outline, given where the object should touch the gel.
 
-A reader finds the outline a little beside where it is, and errs alike along some length of it: a smooth displacement of unknown
-strength, over which it is marginalised. So what counts is how far the two outlines are apart, not how many pixels differ: a
-shape lies in details that have hardly any area.
+A contact mask displaces the outline smoothly, by an unknown strength that is marginalised over. So the distance between the two
+outlines counts, not the number of pixels that differ: a shape lies in details that have hardly any area.
 """
 
 from __future__ import annotations
@@ -17,12 +16,15 @@ from geomtact.log_mass import log_mean_exp
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
-STRENGTHS = (0.2e-3, 0.35e-3, 0.6e-3)  # m rms of the displacement, all as likely
-_CORRELATION = 2e-3  # m along the outline over which it is alike: to 1/e, as of ``Noise.correlation``
-_OUTLIER = 3.0  # times the strength from which on a piece of outline is an outlier: dust, or a patch that was not found
-_STEEPEST = 1.0  # slope down to the pixels beside the contact, from which on it is a wall
-_FLATTEST = 0.05  # slope at least, in working out how far away the level is
-_POINTS = 150  # of the observed outline, at most
+# All constants are hand-set; strengths and correlation span the moderate and the heavy noise of ``sensing.noise``.
+STRENGTHS = (0.2e-3, 0.35e-3, 0.6e-3)  # rms of the displacement [m], equally likely
+_CORRELATION = 2e-3  # correlation length of the displacement along the outline, to 1/e, as ``Noise.correlation`` [m]
+_OUTLIER = (
+    3.0  # displacement, in strengths, above which a piece of outline is an outlier, such as dust or a missed patch
+)
+_STEEPEST = 1.0  # slope of the object beside the contact that counts as a wall
+_FLATTEST = 0.05  # least slope by which a depth is turned into a distance
+_POINTS = 150  # largest number of points of the observed outline
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,17 +65,17 @@ class OutlineLikelihood:
     def log_likelihood(self, over: NDArray[np.floating]) -> Array:
         """Natural log of the likelihood (n,) up to a constant, ``over`` (n, h, w) being how much deeper [m] the object lies than
         where touch begins; -inf where it lies nowhere so deep."""
-        # beside a wall there is no telling how far away the level is: about halfway to the pixel beyond
+        # beside a wall the distance to the level is undefined: about halfway to the next pixel
         over = np.maximum(over, -_STEEPEST * float(np.sqrt(self.field_pitch.prod())))
         which, at, length = _crossings(over, self.field_pitch)
         column, row = np.rint((at + 0.5) * self.field_pitch / self.pitch - 0.5).astype(int).T
         h, w = self.beside.shape
-        from_seen = self.beside[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
-        from_told = self._from_points(over)
+        at_outline = self.beside[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
+        at_points = self._from_points(over)
         each = []
         for strength in STRENGTHS:
-            expected = np.bincount(which, _squared(from_seen, strength) * length, len(over))
-            seen = _squared(from_told, strength).mean(1) * self.length if len(self.points) else 0.0
+            expected = np.bincount(which, _squared(at_outline, strength) * length, len(over))
+            seen = _squared(at_points, strength).mean(1) * self.length if len(self.points) else 0.0
             each.append(-0.25 * (expected + seen) - self.length * np.log(strength / STRENGTHS[0]))
         out = log_mean_exp(np.stack(each, 1) / (np.sqrt(np.pi) * _CORRELATION))
         return np.where((over > 0).any((1, 2)), out, -np.inf)

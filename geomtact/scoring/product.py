@@ -1,7 +1,7 @@
-"""Several scores taken together, each with the weight that it is worth on one index.
+"""Several scores combined, each with a weight that is fitted to one index.
 
-On a coarse grid the network gains all there is; on a fine one, with a known contact face, moments or pixels add
-more than it has learned. What adds what is measured on simulated touches, so that no more is computed than the scene needs.
+On a coarse grid the network alone gains most; on a fine one, with a known contact face, moments or pixels add information.
+The choice is made on simulated touches, so that no score is computed that adds nothing.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.contact import SoftMask
 
-RATIOS = (0.25, 0.5, 1.0)  # of what a further score counts, each score divided by its own temperature
-_PLACES, _TOUCHES = 15_000, 120  # that scores are compared on
+RATIOS = (0.25, 0.5, 1.0)  # searched weights of a further score, each divided by its own temperature; hand-set
+_PLACES, _TOUCHES = 15_000, 120  # places of the index and touches on which scores are compared; hand-set, for speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,20 +71,22 @@ class Comparison:
             self._scores[scorer.name] = [scorer.score(self._index, mask).ravel() for mask in self.masks]
         return self._scores[scorer.name]
 
-    def worth(self, scores: Sequence[NDArray[np.float32]]) -> Calibration:
+    def calibrated(self, scores: Sequence[NDArray[np.float32]]) -> Calibration:
+        """The calibration of ``scores``, one array (m,) per touch."""
         return fit_to_scores(lambda i: scores[i], self._true, self._weight)
 
 
 def choose(
     comparison: Comparison, candidates: Mapping[str, Scorer], least: float, start: Mapping[str, float] | None = None
 ) -> tuple[dict[str, float], Calibration]:
-    """The scores that together gain most, with the weight of each, and what they are worth: one more is taken while it adds
-    ``least`` nats.
+    """The scores that together gain most, with the weight of each, and their calibration.
+
+    One more is added while it gains ``least`` nats.
 
     The first of the candidates is preferred as long as none gains ``least`` more; ``start`` is a choice to go on from.
     """
     scores = {name: comparison.scores(scorer) for name, scorer in candidates.items()}
-    alone = {name: comparison.worth(each) for name, each in scores.items()}
+    alone = {name: comparison.calibrated(each) for name, each in scores.items()}
     if start is None:
         first = next(iter(candidates))
         best = max(alone, key=lambda name: alone[name].gain)
@@ -93,7 +95,7 @@ def choose(
 
     def together(weights: Mapping[str, float]) -> Calibration:
         n = len(comparison.masks)
-        return comparison.worth([sum(w * scores[name][i] for name, w in weights.items()) for i in range(n)])  # type: ignore[misc]
+        return comparison.calibrated([sum(w * scores[name][i] for name, w in weights.items()) for i in range(n)])  # type: ignore[misc]
 
     reached = together(chosen)
     while len(chosen) < len(candidates):
@@ -103,9 +105,9 @@ def choose(
             if name not in chosen
             for ratio in RATIOS
         ]
-        worth = [together(trial) for trial in trials]
-        best_trial = int(np.argmax([c.gain for c in worth]))
-        if worth[best_trial].gain < reached.gain + least:
+        calibrated = [together(trial) for trial in trials]
+        best_trial = int(np.argmax([c.gain for c in calibrated]))
+        if calibrated[best_trial].gain < reached.gain + least:
             break
-        chosen, reached = trials[best_trial], worth[best_trial]
+        chosen, reached = trials[best_trial], calibrated[best_trial]
     return chosen, reached

@@ -14,7 +14,7 @@ from geomtact.sensing.contact import SoftMask
 class Scorer(Protocol):
     """Compares one observed contact with every stored one.
 
-    A score is a similarity: higher is more alike, and nothing else is promised of its scale. What a score is worth as
+    A score is a similarity: higher is more alike, and nothing else is promised of its scale. The value of a score as
     evidence is measured, not assumed (``scoring.calibration``).
     """
 

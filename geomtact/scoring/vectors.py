@@ -24,7 +24,7 @@ _BATCH = 4096  # contacts described at a time
 
 
 class Descriptor(Protocol):
-    """Maps contact masks to vectors whose Euclidean distance says how unlike the contacts are.
+    """Maps contact masks to vectors whose Euclidean distance measures the dissimilarity of contacts.
 
     What is compared by its cosine comes as unit vectors: between those, the distance grows as the cosine falls.
     """

@@ -16,7 +16,7 @@ import numpy as np
 
 from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import CALIBRATION_NOISE, felt_height
+from geomtact.contact_space.touch import CALIBRATION_NOISE, simulate_depth_map
 from geomtact.contact_space.touches import Touch, random_touches
 from geomtact.errors import NoPoseAgreesError, UsageError, nearest_name
 from geomtact.evaluation import simultaneous_touches
@@ -207,7 +207,7 @@ def make(kind: str, localizer: Localizer, n: int, seed: int) -> list[Scene]:
 def _height(space: ContactSpace, touch: Touch, seed: list[int]) -> Array:
     """The height map (H, W) [m] of a touch."""
     rng = np.random.default_rng(seed)
-    height = felt_height(space, touch.T_sensor_object, touch.elastic)
+    height = simulate_depth_map(space, touch.T_sensor_object, touch.elastic)
     x, y = space.sensor.pixel_centres()
     off = space.sensor.height_noise * smooth_field(x, y, rng.uniform(*MODERATE.correlation), rng)
     return np.where(height > 0, np.maximum(height + off, 0), 0)

@@ -62,7 +62,7 @@ def _told(
         return Told(number, touches, dict.fromkeys(names, -math.log(len(names))), dict.fromkeys(names, True))
     with np.errstate(divide="ignore"):
         log_probability = {name: float(np.log(found[name].probability)) for name in names}
-    return Told(number, touches, log_probability, {name: found[name].unlike for name in names})
+    return Told(number, touches, log_probability, {name: found[name].is_outlier for name in names})
 
 
 def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:

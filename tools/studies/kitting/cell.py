@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import felt_mask, spoilt
+from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.contact_space.touches import counts, penetrations
 from geomtact.errors import InputError
 from geomtact.inference.mode_refiner import LIKELIHOOD_POWER, ModeRefiner
@@ -193,5 +193,5 @@ def draw_part(space: ContactSpace, rng: np.random.Generator) -> Array:
 
 def _felt(space: ContactSpace, T_world_sensor: Array, T_world_part: Array, elastic: bool) -> NDArray[np.bool_] | None:
     """The mask (H, W) without noise; None where it is smaller than a contact that counts."""
-    mask = felt_mask(space, inverse(T_world_sensor) @ T_world_part, elastic)
+    mask = simulate_mask(space, inverse(T_world_sensor) @ T_world_part, elastic)
     return mask if counts(space, mask) else None

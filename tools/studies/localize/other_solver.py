@@ -73,9 +73,9 @@ def _touched(depth: Array, lengths: list[float]) -> NDArray[np.bool_]:
 
 
 def felt_by_tamaas(space: ContactSpace, T: Array, elastic: bool) -> NDArray[np.bool_]:
-    """``contact_space.touch.felt_mask`` with tamaas for the elastic gel: the same touch, another solver."""
+    """``contact_space.touch.simulate_mask`` with tamaas for the elastic gel: the same touch, another solver."""
     with mock.patch.object(touch, "elastic_mask", tamaas_mask):
-        return touch.felt_mask(space, T, elastic)
+        return touch.simulate_mask(space, T, elastic)
 
 
 def main() -> None:

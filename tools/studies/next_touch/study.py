@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.touch import felt_mask, spoilt
+from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.contact_space.touches import Touch, penetrations, random_touches
 from geomtact.errors import NoPoseAgreesError
 from geomtact.geometry.pose_error import mssd
@@ -92,7 +92,7 @@ def _made(
     """The image with the object at ``T`` (4, 4) over the sensor, empty if it meets nothing; None where the sensor's body strikes
     first."""
     space = localizer.space
-    mask = felt_mask(space, T, elastic)
+    mask = simulate_mask(space, T, elastic)
     if not mask.any():
         return mask
     return None if np.isnan(space.penetration(T[None])[0]) else spoilt(mask, space, noise, rng)

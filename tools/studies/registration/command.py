@@ -48,7 +48,7 @@ def judge_registration(
     from geomtact.contact_space.build import choose_resolution
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.contact_space.space import ContactSpace
-    from geomtact.contact_space.touches import FELT, random_touches
+    from geomtact.contact_space.touches import GEL_KINDS, random_touches
     from geomtact.evaluation import identity
     from geomtact.inference.mode_refiner import ModeRefiner
     from geomtact.json_values import plain
@@ -81,7 +81,7 @@ def judge_registration(
         settings = identity(mesh, pressed) | {
             "touches": touches,
             "noise": {"name": noise.value, **asdict(strength)},
-            "elastic": FELT[felt],
+            "elastic": GEL_KINDS[felt],
             "seed": seed,
             "grid": resolution.to_json(),
             "methods": list(methods(grid.spread)),
@@ -92,7 +92,7 @@ def judge_registration(
         def more(
             first: int, space: ContactSpace = space, methods: Any = methods, grid: registration.Grid = grid
         ) -> Iterator[Any]:
-            pressed_at = random_touches(space, touches, seed, FELT[felt], strength)
+            pressed_at = random_touches(space, touches, seed, GEL_KINDS[felt], strength)
             return registration.trials(space, pressed_at, methods, grid, strength, seed, first=first)
 
         study_file.judged(out, content, settings, touches, "registering", more)

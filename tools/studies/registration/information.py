@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import felt_mask
+from geomtact.contact_space.touch import simulate_mask
 from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.observability import GAIN, Spread, moved, observable_subspace
 from geomtact.registration.protocol import Problem
@@ -36,13 +36,13 @@ def fisher_information(
     pixel_noise : of the outline's place in a pixel, standard deviation [px]
     """
     T = np.asarray(T, float)
-    mask = felt_mask(space, T, elastic)
+    mask = simulate_mask(space, T, elastic)
     pitch = np.sqrt(space.sensor.pixel_area(mask.shape))
     outline = make_problem(mask, space.sensor, max_points=_POINTS, correlation=float(np.mean(noise.correlation)))
     at = space.sensor.to_pixels(space.sensor.project(outline.points))
     slope = np.zeros((len(at), 6))
     for i, axis in enumerate(np.eye(6)):
-        ahead, behind = (felt_mask(space, moved(T, way * _STEP * axis, problem), elastic) for way in (1, -1))
+        ahead, behind = (simulate_mask(space, moved(T, way * _STEP * axis, problem), elastic) for way in (1, -1))
         # the outline moves outwards by what its signed distance grows
         slope[:, i] = (_inside(ahead, at) - _inside(behind, at)) * pitch / (2 * _STEP)
     rms = np.hypot(noise.outline_rms, pixel_noise * pitch)

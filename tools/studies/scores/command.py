@@ -23,8 +23,8 @@ SCHEMA = "geomtact/scores/2"
 
 @dataclass(frozen=True)
 class Options:
-    """What a study's figures depend on, beside the parts and the scores: ``felt`` is one of ``touches.FELT``, ``only`` a class
-    of contact or None for all."""
+    """What a study's figures depend on, beside the parts and the scores: ``felt`` is one of ``touches.GEL_KINDS``, ``only`` a
+    class of contact or None for all."""
 
     sensor: Sensor
     touches: int
@@ -171,7 +171,7 @@ def _judge(
     cache_dir: Path | None,
 ) -> None:
     """Judge one score on one part, from where the file ends."""
-    from geomtact.contact_space.touches import FELT
+    from geomtact.contact_space.touches import GEL_KINDS
     from geomtact.evaluation import describe
     from geomtact.inference.effort import EFFORTS
     from geomtact.json_values import plain
@@ -202,7 +202,7 @@ def _judge(
         save()
 
     if len(outcomes) < options.touches and not touches:
-        elastic, strength = FELT[options.felt], study_options.noise_named(options.noise)
+        elastic, strength = GEL_KINDS[options.felt], study_options.noise_named(options.noise)
         touches += study.make_touches(
             localizer.space, options.touches, options.seed, strength, elastic=elastic, only=options.only
         )

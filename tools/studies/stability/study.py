@@ -15,7 +15,7 @@ import numpy as np
 
 from geomtact.contact_space.contact_class import CLASSES
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import felt_mask, spoilt
+from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.contact_space.touches import counts, penetrations
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import coverage, simultaneous_touches
@@ -142,7 +142,7 @@ def _jaws(localizer: Localizer, level: float, n: int, seed: int, effort: str) ->
         if second is None:
             continue
         poses = [T, inverse(second) @ T]
-        masks = [felt_mask(space, pose, elastic) for pose in poses]
+        masks = [simulate_mask(space, pose, elastic) for pose in poses]
         if all(counts(space, mask) for mask in masks):
             noisy = [spoilt(mask, space, MODERATE, rng) for mask in masks]
             yield _together(localizer, T, np.stack([np.eye(4), second]), noisy, effort, seed)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.contact_class import contact_class
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import LEAST_CONTACT, felt_mask, spoilt
+from geomtact.contact_space.touch import LEAST_CONTACT, simulate_mask, spoilt
 from geomtact.geometry.mesh import Mesh
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
@@ -112,7 +112,7 @@ def touches(world: World, n: int, seed: int) -> Iterator[tuple[Array, NDArray[np
 
 def _felt(space: ContactSpace, T: Array, threshold: float | None, elastic: bool) -> NDArray[np.bool_]:
     if threshold is None:
-        return felt_mask(space, T, elastic)
+        return simulate_mask(space, T, elastic)
     return np.asarray(space.caster.depths(space.sensor, T[None])[0] > threshold)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import felt_mask, spoilt
+from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.contact_space.touches import Touch
 from geomtact.geometry.distance import PoseDistance
 from geomtact.localizer import Localizer
@@ -35,15 +35,15 @@ def alike(localizer: Localizer, touch: Touch, noise: Noise, rng: np.random.Gener
     """Poses (n, 4, 4) that feel like ``touch``, ``SPACING_MM`` apart, the true one first; and the overlap needed."""
     space, index, true = localizer.space, localizer.index, touch.T_sensor_object
     sensor, along = space.sensor, space.sensor.along
-    needed = overlap_of_readings(felt_mask(space, true, touch.elastic, along(_READING)), space, noise, rng)
+    needed = overlap_of_readings(simulate_mask(space, true, touch.elastic, along(_READING)), space, noise, rng)
     cast = space.caster.contact(sensor, true, along(_SEARCH)).mask
-    felt = felt_mask(space, true, touch.elastic, along(_VERDICT))
+    felt = simulate_mask(space, true, touch.elastic, along(_VERDICT))
 
     def rigid(T: Array) -> Array:
         return overlap(cast, space.caster.depths(sensor, T, along(_SEARCH)) > 0)
 
     def soft(T: Array) -> Array:
-        return np.array([overlap(felt, felt_mask(space, one, touch.elastic, along(_VERDICT))) for one in T])
+        return np.array([overlap(felt, simulate_mask(space, one, touch.elastic, along(_VERDICT))) for one in T])
 
     rows, columns = np.nonzero(cast)
     x, y = sensor.pixel_centres(cast.shape)

@@ -46,7 +46,7 @@ def judge_thesis_table(
     first touches from each side leave open, whoever reads them.
     """
     from geomtact.contact_space.store import FORMAT
-    from geomtact.contact_space.touches import FELT
+    from geomtact.contact_space.touches import GEL_KINDS
     from geomtact.evaluation import identity
     from geomtact.sensing.sensor import Sensor
 
@@ -58,7 +58,7 @@ def judge_thesis_table(
             "sides": sides,
             "touches": touches,
             "noise": {"name": noise.value, **asdict(strength)},
-            "elastic": FELT[felt],
+            "elastic": GEL_KINDS[felt],
             "effort": effort.value,
             "seed": seed,
         }

@@ -38,7 +38,7 @@ def judge_touches(
 
     Prints gain, coverage and pose errors for each number of sensors, and writes them and every outcome to --out.
     """
-    from geomtact.contact_space.touches import FELT
+    from geomtact.contact_space.touches import GEL_KINDS
     from geomtact.evaluation import describe, simultaneous_touches
     from tools.studies.touches import study as sensors_study
 
@@ -47,13 +47,13 @@ def judge_touches(
         settings = describe(localizer) | {
             "scenes": scenes,
             "noise": {"name": noise.value, **asdict(strength)},
-            "elastic": FELT[felt],
+            "elastic": GEL_KINDS[felt],
             "effort": effort.value,
             "seed": seed,
         }
 
         def more(first: int, localizer: Localizer = localizer) -> Iterator[Any]:
-            made = simultaneous_touches(localizer.space, scenes, sensors_study.SENSORS, seed, strength, FELT[felt])
+            made = simultaneous_touches(localizer.space, scenes, sensors_study.SENSORS, seed, strength, GEL_KINDS[felt])
             return sensors_study.fuse_scenes(localizer, made, effort, seed, first)
 
         study_file.judged(

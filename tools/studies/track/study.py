@@ -142,10 +142,10 @@ def settings() -> dict[str, Any]:
     """What the judged filter depends on."""
     return {
         "speed_mm": 1e3 * SPEED,
-        "now": filtering.NOW,
-        "memory": filtering.MEMORY,
-        "newest": filtering.NEWEST,
-        "fresh": filtering.FRESH,
+        "now": filtering.FRAME_POWER,
+        "memory": filtering.MEMORY_POWER,
+        "newest": filtering.NEWEST_SHARE,
+        "fresh": filtering.UNIFORM_SHARE,
     }
 
 

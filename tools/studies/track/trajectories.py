@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.contact_class import contact_class
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import felt_mask, spoilt
+from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.contact_space.touches import counts, penetrations
 from geomtact.errors import MeshError
 from geomtact.geometry.symmetry import about
@@ -66,7 +66,7 @@ def random_trajectory(
     ends = [*slips, n]
     for first, end in zip([0, *slips], ends, strict=True):
         poses += _stretch(space, end - first, speed, max(0, min(featureless, end) - first), rng)
-    masks = [spoilt(felt_mask(space, T, elastic), space, noise, rng) for T in poses]
+    masks = [spoilt(simulate_mask(space, T, elastic), space, noise, rng) for T in poses]
     return Trajectory(np.array(poses), masks, elastic)
 
 
