@@ -20,8 +20,11 @@ from geomtact.se3 import Array, check_pose, exp, hat, inverse, log
 
 LogDensity = Callable[[Array], Array]
 
-_TURNS, _ROTATIONS = 12, 5  # of an axis, and squared of a sphere, at which a prior that is a function is evaluated
-_CLOSER = 0.125 * 0.5 ** np.arange(8)  # rad by which a continuous symmetry is searched, from the best of many images on
+# Images at which a prior that is a function is evaluated: turns about an axis, rotations (squared) of a sphere; hand-set.
+_TURNS, _ROTATIONS = 12, 5
+_CLOSER = 0.125 * 0.5 ** np.arange(
+    8
+)  # steps of the search along a continuous symmetry, from the best image on [rad]; hand-set
 
 
 @dataclass(frozen=True, eq=False)

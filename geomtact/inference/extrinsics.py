@@ -10,8 +10,8 @@ from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.errors import InputError
 from geomtact.se3 import Array, adjoint, inverse
 
-_LARGEST_DISTANCE = 30.0  # m, from a sensor to the origin: more is taken for millimetres
-_LARGEST_SPACING = 10.0  # m, between two sensors: more is taken for millimetres
+_LARGEST_DISTANCE = 30.0  # largest distance of a sensor from the origin [m]; hand-set, as millimetres exceed it
+_LARGEST_SPACING = 10.0  # largest distance between two sensors [m]; hand-set, as millimetres exceed it
 
 
 def extrinsics_covariance(T: Array, T_frame_sensor: Array, extrinsics_std: ExtrinsicsStd) -> Array:

@@ -25,8 +25,8 @@ from geomtact.inference.reference import Reference
 from geomtact.se3 import check_pose, check_transforms
 from geomtact.sensing.sensor import Sensor
 
-_KEPT, _MOST = 0.99, 50_000  # the poses written out: those that hold this much of the mass, but at most so many
-_OFF = 1e-3  # that probabilities may add up to beside 1
+_KEPT, _MOST = 0.99, 50_000  # share of the mass whose poses are written, and their largest number; hand-set
+_OFF = 1e-3  # largest deviation of the sum of probabilities from 1; hand-set
 WITHOUT_PRIOR = (
     "this file lacks the prior and other sensors: it holds only that one sensor without contact rules poses out"
 )

@@ -38,9 +38,7 @@ from geomtact.se3 import Array, inverse
 # Hand-set; its effect was measured on simulated scenes apart from those of the study (docs/several-sensors.md).
 _LEAST_CORRELATION = 0.1
 _NEGLIGIBLE_NATS = 25.0  # log density below that of the most probable place from which a place has no weight; hand-set
-_UNLIKELY_DENSITY = (
-    0.1  # density relative to the uniform below which a place is transferred by one pose alone; hand-set
-)
+_UNLIKELY_DENSITY = 0.1  # density relative to the uniform below which a place is transferred by one pose; hand-set
 _DISAGREES_NATS = -2.0  # support of the other sensors for an image below which a disagreement is reported; hand-set
 # Unexplained nats per contact above which poor agreement is reported: 2 of 100 simulated scenes of the pin and the head with
 # exact sensor poses exceed it.

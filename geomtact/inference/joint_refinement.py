@@ -30,7 +30,7 @@ _IMAGE_POWER = 0.5  # power of a cell's mass beside the likelihood of its best p
 # also a limit of identification, chosen on 22 simulated scenes (docs/which-part.md).
 EXPLAINED_NATS, UNEXPLAINED_NATS = 4.0, 8.0
 _EVIDENCE_POWER = 0.5  # power of the likelihood in the evidence, chosen on 22 simulated scenes (docs/which-part.md)
-_OUTLINE_NATS = 150.0  # loss of log likelihood per metre of outline, even at the true pose (docs/which-part.md)
+_OUTLINE_NATS = 150.0  # loss of log likelihood per metre of outline, measured at true poses (docs/which-part.md)
 
 
 def refine_jointly(

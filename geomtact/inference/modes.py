@@ -21,7 +21,7 @@ from geomtact.inference.distribution import (
 from geomtact.se3 import Array, adjoint, inverse
 
 _LEAST, _SPARE = 6, 2  # modes grown at least, and beyond those requested; hand-set
-_POINTS = 128  # of the surface, for distances between modes
+_POINTS = 128  # points of the surface for distances between modes; hand-set
 
 
 @dataclass(frozen=True)

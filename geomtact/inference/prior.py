@@ -18,7 +18,7 @@ from geomtact.inference.reference import Reference
 from geomtact.se3 import Array, check_transforms
 from geomtact.sensing.sensor import Sensor
 
-_MODES, _POSES = 10, 1000  # modes at which a function, and poses of a pair, that say which image of a pose is expected
+_MODES, _POSES = 10, 1000  # modes of a function, and poses of a pair, in the reference of symmetric images; hand-set
 _EXPECTED = (
     "prior: expected a Posterior, the path of a saved one, a pair (poses (N, 4, 4), log_weights (N,)), a GaussianPrior or a "
     "function of poses, got {}"

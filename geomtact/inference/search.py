@@ -39,10 +39,7 @@ _THOROUGH = 25  # number of cells that ICP registers too
 _ROUNDS, _AROUND = 3, 12  # rounds of the last search, each for the better half of the cells, and poses per cell in each
 _REFINED_PER_MODE = 5  # number of cells, for each requested mode, whose pose is registered by all points
 _FIRST_WIDTH = 0.25  # standard deviation of the first motions around a pose, as a share of the grid's spread
-_MISS_STD, _MOST_MISS = (
-    0.5e-3,
-    5e-3,
-)  # distance by which a pose misses a sensor: standard deviation and largest value [m]
+_MISS_STD, _MOST_MISS = 0.5e-3, 5e-3  # distance by which a pose misses a sensor: std and largest value [m]
 
 
 @dataclass(frozen=True, eq=False)

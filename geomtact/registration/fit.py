@@ -11,7 +11,7 @@ from geomtact.registration.observability import Spread, motion_of, moved, observ
 from geomtact.registration.protocol import Problem, Refinement
 from geomtact.se3 import Array
 
-# All constants are hand-set; FEWEST is the number of degrees of freedom.
+# All constants are hand-set.
 FEWEST = 6  # least number of points on the surface for which a pose is accepted
 _LEAST_SUPPORT = 0.3  # least share of the points on the surface for which a pose is accepted
 _MOST_RESIDUAL = 1.5  # largest residual for which a pose is accepted, in units of the noise

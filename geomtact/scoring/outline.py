@@ -19,9 +19,7 @@ from geomtact.sensing.sensor import Sensor
 # All constants are hand-set; strengths and correlation span the moderate and the heavy noise of ``sensing.noise``.
 STRENGTHS = (0.2e-3, 0.35e-3, 0.6e-3)  # rms of the displacement [m], equally likely
 _CORRELATION = 2e-3  # correlation length of the displacement along the outline, to 1/e, as ``Noise.correlation`` [m]
-_OUTLIER = (
-    3.0  # displacement, in strengths, above which a piece of outline is an outlier, such as dust or a missed patch
-)
+_OUTLIER = 3.0  # displacement, in strengths, above which a piece of outline is an outlier, such as dust
 _STEEPEST = 1.0  # slope of the object beside the contact that counts as a wall
 _FLATTEST = 0.05  # least slope by which a depth is turned into a distance
 _POINTS = 150  # largest number of points of the observed outline
