@@ -22,9 +22,7 @@ LogDensity = Callable[[Array], Array]
 
 # Images at which a prior that is a function is evaluated: turns about an axis, rotations (squared) of a sphere; hand-set.
 _TURNS, _ROTATIONS = 12, 5
-_CLOSER = 0.125 * 0.5 ** np.arange(
-    8
-)  # steps of the search along a continuous symmetry, from the best image on [rad]; hand-set
+_CLOSER = 0.125 * 0.5 ** np.arange(8)  # steps of the search along a continuous symmetry [rad]; hand-set
 
 
 @dataclass(frozen=True, eq=False)
