@@ -152,7 +152,7 @@ def test_weights_that_do_not_fit_are_refused(drawer, weights):
         identify(drawer, touches(drawer[0])[0], weights, kind="mask", effort="fast")
     with pytest.raises(UsageError, match="identify: expected a localizer for each object, got int"):
         identify(3, None)
-    with pytest.raises(UsageError, match="expected parts"):
+    with pytest.raises(UsageError, match="expected objects"):
         identify([], None)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from geomtact.contact_space.index import pack
 from geomtact.contact_space.touch import simulate_mask
-from geomtact.scoring.likelihood import SOFTNESS, THRESHOLDS, PixelLikelihood, _felt, cast_log_likelihood
+from geomtact.scoring.likelihood import SOFTNESS, THRESHOLDS, PixelLikelihood, _contact_probability, cast_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.sensing.sensor import Sensor
 
@@ -45,7 +45,7 @@ def test_it_is_what_adding_up_pixels_gives(rng):
         below = DEPTHS[p] - contour * 0.5 * MM
         each = []
         for t, s in product(THRESHOLDS, SOFTNESS):
-            yes = _felt(below - t * DEPTHS[p], s)
+            yes = _contact_probability(below - t * DEPTHS[p], s)
             each.append(weight * np.where(seen, np.log(yes), np.log(1 - yes)).sum())
         assert score[p, i] == pytest.approx(np.log(np.mean(np.exp(each))), abs=1e-3)
 
@@ -65,9 +65,9 @@ def test_the_pose_that_made_the_contact_is_the_most_likely(rng):
 def test_probabilities_of_a_pixel_lie_between_0_and_1():
     below = np.linspace(-1, 1, 201) * 20 * MM
     for s in SOFTNESS:
-        yes = _felt(below, s)
+        yes = _contact_probability(below, s)
         assert ((yes > 0) & (yes < 1)).all() and (np.diff(yes) >= 0).all()
-        assert _felt(np.zeros(1), s) == pytest.approx(0.5)
+        assert _contact_probability(np.zeros(1), s) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("elastic", [False, True])

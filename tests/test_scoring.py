@@ -311,14 +311,14 @@ def test_simulated_touches_are_of_the_cells_they_say(plug):
 def test_a_touch_that_comes_out_otherwise_changes_no_other(plug, monkeypatch):
     """A draw that one processor rejects and another takes must not give all later touches other random numbers."""
     touches = simulate_touches(plug.index, 12, seed=7)
-    felt, calls = calibration._felt, iter(range(12))
+    simulate, calls = calibration._simulated_mask, iter(range(12))
 
     def but_the_first(*given):
         if next(calls) == 0:
-            felt(*given)
-        return felt(*given)
+            simulate(*given)
+        return simulate(*given)
 
-    monkeypatch.setattr(calibration, "_felt", but_the_first)
+    monkeypatch.setattr(calibration, "_simulated_mask", but_the_first)
     others = simulate_touches(plug.index, 12, seed=7)
     same = [np.array_equal(a, b) for a, b in zip(touches.masks, others.masks, strict=True)]
     assert same == [False] + 11 * [True] and (touches.ids[1:] == others.ids[1:]).all()
