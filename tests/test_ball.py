@@ -61,7 +61,7 @@ def test_the_ball_lies_over_its_imprint_along_the_membranes_normal(on_ball, cent
     assert on_ball.centre(BALL) == pytest.approx(centre, abs=0.01 * MM)
 
 
-def test_heights_and_slopes_are_those_that_rays_find(on_ball, depths):
+def test_heights_and_slopes_equal_those_of_traced_rays(on_ball, depths):
     assert on_ball.height(BALL) == pytest.approx(depths[on_ball.at], abs=5e-3 * MM)
     slopes = np.stack(np.gradient(np.maximum(depths, -1), PITCH)[::-1], -1)
     assert on_ball.slopes(BALL) == pytest.approx(slopes[on_ball.at], abs=0.01)

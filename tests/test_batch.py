@@ -73,7 +73,7 @@ def test_two_processes_write_the_same_bytes_as_one(alone, tmp_path):
     assert written(tmp_path) == alone and len(alone) > 3 * len(PARTS)
 
 
-def test_what_is_there_is_not_made_again(tmp_path):
+def test_existing_results_are_not_recomputed(tmp_path):
     (only,) = tasks(tmp_path)[:1]
     list(run_all(prepare_part, [only]))
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")}
@@ -89,7 +89,7 @@ def test_a_task_that_cannot_be_done_is_named_and_the_others_are_done(tmp_path, j
     assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
 
 
-def test_a_killed_process_loses_its_own_task_which_is_done_anew(tmp_path):
+def test_a_killed_process_loses_only_its_task_which_is_repeated(tmp_path):
     names = [f"task {i}" for i in range(6)]
     told = dict(run_all(note, [(tmp_path, name, "task 2") for name in names], 2))
     assert told == dict.fromkeys(range(6))
@@ -105,7 +105,7 @@ def test_a_task_that_kills_every_process_is_given_up_alone(tmp_path):
 
 
 @pytest.mark.studies
-def test_a_study_of_parts_apart_finds_what_it_finds_of_one_after_the_other(few_touches, tmp_path, cache_dir):
+def test_a_study_of_objects_in_parallel_equals_the_serial_study(few_touches, tmp_path, cache_dir):
     """Also where some are judged already."""
 
     def judge(out: Path, parts: tuple, *words: str) -> dict:
@@ -122,7 +122,7 @@ def test_a_study_of_parts_apart_finds_what_it_finds_of_one_after_the_other(few_t
 
 
 @pytest.mark.studies
-def test_scores_of_parts_apart_are_those_of_one_after_the_other(few_touches, tmp_path, cache_dir):
+def test_scores_of_objects_in_parallel_equal_the_serial_scores(few_touches, tmp_path, cache_dir):
     """With the score that the command line names among the parts."""
 
     def judge(out: Path, *words: str) -> tuple[dict, dict]:
@@ -143,7 +143,7 @@ def test_scores_of_parts_apart_are_those_of_one_after_the_other(few_touches, tmp
 
 
 @pytest.mark.studies
-def test_every_study_by_part_names_the_part_that_it_cannot_judge(tmp_path):
+def test_every_study_by_object_names_an_object_that_it_cannot_evaluate(tmp_path):
     judged_apart = [name for name, study in COMMANDS.items() if "ray" in inspect.signature(study).parameters]
     assert len(judged_apart) >= 10
     for study in judged_apart:
@@ -153,7 +153,7 @@ def test_every_study_by_part_names_the_part_that_it_cannot_judge(tmp_path):
 
 
 @pytest.mark.studies
-def test_a_study_apart_keeps_what_it_could_judge_and_names_the_rest(few_touches, tmp_path, cache_dir):
+def test_a_parallel_study_keeps_its_results_and_names_the_failures(few_touches, tmp_path, cache_dir):
     out = tmp_path / "study.json"
     words = ["stability", PARTS[0], "pim", "--touches", "1", "--sweep", "noise", "--max-poses", "3000"]
     done = CliRunner().invoke(studies, [*words, "--jobs", "1", "--cache-dir", str(cache_dir), "--out", str(out)])
@@ -197,14 +197,14 @@ def test_two_nodes_of_which_one_is_killed_write_the_same_bytes_as_one_process(al
     assert written(tmp_path) == alone
 
 
-def test_an_address_without_a_cluster_is_said():
+def test_an_address_without_a_cluster_is_named():
     pytest.importorskip("ray")
     with pytest.raises(UsageError, match="ray start --head"):
         list(run_all(note, [("", "a", "")], ray="127.0.0.1:1"))
 
 
 @pytest.mark.slow
-def test_the_command_prepares_several_parts_and_names_those_that_it_cannot(few_touches, tmp_path, monkeypatch):
+def test_the_command_prepares_several_objects_and_names_the_failures(few_touches, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "broken.stl").write_text("no mesh")
     words = [
@@ -228,7 +228,7 @@ def test_the_command_prepares_several_parts_and_names_those_that_it_cannot(few_t
 
 
 @pytest.mark.slow
-def test_several_parts_are_trained_for_each_into_a_folder(tmp_path):
+def test_several_objects_are_trained_for_each_into_a_folder(tmp_path):
     words = ["train", "--object", "ball,hex_nut", "--architecture", "resnet50", "--pairs", "32", "--side", "32"]
     done = CliRunner().invoke(app, [*words, "--jobs", "1", "--out", str(tmp_path / "weights")])
     assert done.exit_code == 0, done.output

@@ -111,7 +111,7 @@ def test_a_bulging_membrane_takes_its_own_slope_off_the_balls():
 
 
 @pytest.mark.slow
-def test_two_balls_tell_how_a_membrane_bulges_and_that_a_flat_one_does_not():
+def test_two_balls_measure_the_bulge_of_a_membrane():
     """The curvature comes out somewhat too small: imprints on a bulge are not quite round."""
     for bend in (0.0, 35 * MM, 100 * MM):
         found = []
@@ -202,7 +202,7 @@ def test_weights_that_made_the_slopes_are_found_again(rng):
     assert (terms(np.zeros((5, 3)), u[:5], v[:5], SHAPE) == 0).all()  # without a change of colour the gel is flat
 
 
-def test_presses_of_unknown_depth_do_not_tell_the_pitch_but_bound_it():
+def test_presses_of_unknown_depth_bound_the_pitch_but_do_not_measure_it():
     images, background = presses(8 * MM)
     with pytest.raises(UsageError, match=r"presses of unknown depth.*at most 0\.(\d+) mm") as error:
         calibrate(images, 8 * MM, background)
@@ -245,7 +245,7 @@ def test_a_sensor_file_keeps_the_colours_and_its_indexes(found, tmp_path):
             Sensor.from_toml(wrong, "made.toml")
 
 
-def test_what_is_missing_or_wrong_is_said(found):
+def test_missing_and_wrong_entries_are_named(found):
     images, background = presses(8 * MM)
     with pytest.raises(SensorError, match="not calibrated.*geomtact calibrate"):
         contact_height(images[0], background, replace(found.sensor, colour=None))

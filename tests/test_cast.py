@@ -123,7 +123,7 @@ def test_penetration_is_how_deep_the_ball_is_pressed(sensor, shift, rng):
 
 
 @pytest.mark.parametrize("beyond", [0.2, 1.0, 2.0])
-def test_a_ball_beside_the_window_is_felt_at_its_border(beyond):
+def test_a_ball_beside_the_window_touches_its_border(beyond):
     """Only what lies in the window counts, so the deepest point is on the border."""
     R, half = 4 * MM, ORTHOGRAPHIC.half_window[0]
     pressed = ball(R).penetration(ORTHOGRAPHIC, at(half + beyond * MM, 0, R - 2 * MM)[None])[0]
@@ -148,7 +148,7 @@ def test_a_camera_inside_the_object_is_plus_infinity():
     assert caster.penetration(ORTHOGRAPHIC, at(0, 0, 0)[None])[0] == pytest.approx(30 * MM, abs=1e-8)
 
 
-def test_what_is_finer_than_the_rays_is_found_by_its_vertices():
+def test_details_finer_than_the_rays_are_found_by_their_vertices():
     block = trimesh.creation.box((20 * MM, 20 * MM, 4 * MM))
     block.apply_translation([0, 0, 2.5 * MM])
     spike = trimesh.Trimesh(
@@ -207,7 +207,7 @@ def hits_one_by_one(triangles, start, ray):
 
 
 @each_sensor
-def test_masks_and_heights_are_those_of_rays_traced_in_the_sensor_frame(sensor, rng):
+def test_masks_and_heights_equal_rays_traced_in_the_sensor_frame(sensor, rng):
     """The library turns the rays into the object's frame; here the object is turned instead."""
     mesh = load_mesh("bracket")
     caster = Caster(mesh.vertices, mesh.faces)

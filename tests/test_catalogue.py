@@ -30,14 +30,14 @@ CONSTRUCTED = {
 THESIS = ("pin", "damping_pin", "head", "elbow_pipe")
 
 
-def test_every_part_is_listed():
+def test_every_object_is_listed():
     assert set(catalogue()) == set(CONSTRUCTED)
     folder = next(iter(catalogue().values())).file.parent
     assert {p.stem for p in folder.glob("*.stl")} == set(CONSTRUCTED)
 
 
 @pytest.mark.parametrize("name", CONSTRUCTED)
-def test_catalogue_is_what_is_found_and_what_was_constructed(name):
+def test_the_catalogue_lists_measured_and_constructed_objects(name):
     entry, mesh = catalogue()[name], load_mesh(name)
     assert hashlib.sha256(entry.file.read_bytes()).hexdigest() == entry.sha256
     kind, count, axis = CONSTRUCTED[name]
@@ -56,7 +56,7 @@ def test_catalogue_is_what_is_found_and_what_was_constructed(name):
 
 
 @pytest.mark.parametrize("name", CONSTRUCTED)
-def test_parts_are_sound(name):
+def test_objects_are_closed_solids(name):
     entry, mesh = catalogue()[name], load_mesh(name)
     raw = trimesh.load_mesh(str(entry.file))
     assert raw.is_watertight
@@ -75,7 +75,7 @@ def test_ball_is_a_ball():
 
 
 @pytest.mark.parametrize("name", ["ball", "hex_nut", "stepped_shaft"])
-def test_parts_are_made_again_byte_for_byte(name):
+def test_objects_are_rebuilt_byte_for_byte(name):
     path = Path(__file__).resolve().parents[1] / "tools" / "make_meshes.py"
     spec = importlib.util.spec_from_file_location("make_meshes", path)
     assert spec is not None
@@ -86,7 +86,7 @@ def test_parts_are_made_again_byte_for_byte(name):
     assert tool.stl_bytes(build()) == catalogue()[name].file.read_bytes()
 
 
-def test_parts_are_found_next_to_an_installed_package(tmp_path, monkeypatch):
+def test_objects_are_found_next_to_an_installed_package(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "__file__", str(tmp_path / "geomtact" / "geometry" / "catalogue.py"))
     assert meshes_folder() is None
     (tmp_path / "geomtact_meshes").mkdir()

@@ -25,7 +25,7 @@ def told(gains, ms, mssd=5.0):
 # --- ways
 
 
-def test_a_way_differs_from_the_default_in_one_thing():
+def test_a_variant_differs_from_the_default_in_one_setting():
     """A side known exactly leaves so few poses that the grid is smaller, too."""
     for name, way in WAYS.items():
         changed = {
@@ -50,7 +50,7 @@ ANSWERS = {
 }
 
 
-def test_the_front_holds_what_nothing_beats_in_both():
+def test_the_pareto_front_holds_the_variants_that_no_other_dominates():
     figures = summarise(ANSWERS)
     assert front(figures) == ["fast", DEFAULT, "exact"]
     assert front(figures, "mssd_mm_median", -1) == ["fast"]
@@ -58,14 +58,14 @@ def test_the_front_holds_what_nothing_beats_in_both():
     assert figures["fast"]["ms_quantiles"] == pytest.approx([10.0] * 3)
 
 
-def test_only_what_is_faster_and_surely_better_beats_the_default():
+def test_only_a_faster_and_significantly_better_variant_beats_the_default():
     figures = summarise(ANSWERS)
     assert beaten_by(ANSWERS, figures) == []
     better = {**ANSWERS, "moments": told([2.5, 4.5, 3.5], 30.0), "iou": told([9.0, 0.0, 0.5], 30.0)}
     assert beaten_by(better, summarise(better)) == ["moments"]
 
 
-def test_what_rules_truths_out_or_counts_from_another_uniform_beats_nothing():
+def test_a_variant_that_excludes_truths_or_has_another_uniform_beats_nothing():
     bold = {**ANSWERS, "moments": told([-np.inf, 9.0, 9.0], 1.0), "within 30 degrees": told([9.0, 9.0, 9.0], 1.0)}
     figures = summarise(bold)
     assert beaten_by(bold, figures) == []
@@ -79,7 +79,7 @@ def test_a_truth_that_is_ruled_out_is_counted_apart():
     assert (f["gain_mean"], f["ruled_out"]) == (2.0, pytest.approx(1 / 3))
 
 
-def test_what_is_modelled_adds_the_paired_difference():
+def test_an_ablation_reports_the_paired_difference():
     assert adds(ANSWERS["fast"], ANSWERS[DEFAULT])[0] == pytest.approx((1 + 0.5 + 1) / 3)
     found = modelled(ANSWERS)
     assert set(found) == {"every cell, not blocks", "outlines, pixels and 25 modes (exact)", "5 modes refined"}
@@ -98,7 +98,7 @@ def few_ways(monkeypatch, few_touches):
     monkeypatch.setattr(choices, "TOUCHES", 60)
 
 
-def test_the_study_judges_every_way_on_the_same_touches_and_goes_on_where_it_was(few_ways, tmp_path, monkeypatch):
+def test_the_study_evaluates_every_variant_on_the_same_touches_and_resumes(few_ways, tmp_path, monkeypatch):
     out = tmp_path / "choices.json"
     command = ["choices", "hex_nut", "--touches", "2", "--out", str(out)]
     pictures = ["--plot", str(tmp_path / "a.png"), "--plot-modelled", str(tmp_path / "b.png")]
@@ -120,7 +120,7 @@ def test_the_study_judges_every_way_on_the_same_touches_and_goes_on_where_it_was
     assert json.loads(out.read_text("utf-8"))["parts"] == content["parts"]
 
 
-def test_weights_of_ones_own_are_ways_more(tmp_path):
+def test_own_network_weights_are_further_variants(tmp_path):
     """An encoder of another size has the default's grid, the thesis's network one like its own."""
     from geomtact.scoring.encoder import WEIGHTS
 
@@ -136,7 +136,7 @@ def test_weights_of_ones_own_are_ways_more(tmp_path):
     assert front(summarise({DEFAULT: told([1.0, 2.0], 1.0), **told_more}))[0] == DEFAULT
 
 
-def test_a_few_ways_are_judged_where_they_differ():
+def test_a_few_variants_are_evaluated_where_they_differ():
     ways = choices.ways_of([], ["this side, 1 mode", "this side alone"])
     assert list(ways) == [DEFAULT, "this side alone", "this side, 1 mode"]
     assert choices.scenes_of(ways) == ["known side"]

@@ -97,7 +97,7 @@ def test_usage_errors_exit_2(geomtact, args):
         (["simulate", "pin", "--out", ""], "expected a value after --out, got an empty text"),
     ],
 )
-def test_usage_errors_are_told_in_one_line(args, said, monkeypatch, capsys):
+def test_a_usage_error_is_one_line(args, said, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["geomtact", *args])
     with pytest.raises(SystemExit) as stopped:
         main()
@@ -126,7 +126,7 @@ def test_usage_errors_of_studies_are_one_line(args, said, monkeypatch, capsys):
     assert printed.err.startswith("error: ") and printed.err.count("\n") == 1 and said.lower() in printed.err.lower()
 
 
-def test_the_command_exits_with_the_status_of_what_it_did(monkeypatch, capsys):
+def test_the_process_exits_with_the_status_of_its_command(monkeypatch, capsys):
     for args, status in ((["--version"], 0), (["objects"], 0), ([], 2), (["prepare", "pim", "--sensor", "gelslim"], 3)):
         monkeypatch.setattr("sys.argv", ["geomtact", *args])
         with pytest.raises(SystemExit) as stopped:
@@ -156,14 +156,14 @@ def test_bad_input_exits_3_with_one_line(geomtact, tmp_path):
     assert "'object'" in geomtact("prepare", status=3).stderr
 
 
-def test_every_study_tells_a_wrong_part_in_one_line(geomtact):
+def test_an_unknown_object_is_one_line_in_every_study(geomtact):
     for study in COMMANDS:
         assert study in geomtact(status=2, of=studies).output
         more = ["out.png"] if study == "plot" else []  # it takes a study's file
         assert "pim" in geomtact(study, "pim", *more, status=3, of=studies).stderr
 
 
-def test_wrong_names_and_paths_are_told_before_any_work(geomtact, touched, tmp_path):
+def test_wrong_names_and_paths_are_errors_before_any_work(geomtact, touched, tmp_path):
     image = touched / "ball_1.png"
     (tmp_path / "part.stl").touch()
     assert (
@@ -210,7 +210,7 @@ def test_system_errors_are_one_line_too(geomtact, tmp_path):
     assert "file" in told
 
 
-def test_simulated_images_carry_their_part_and_sensor(touched):
+def test_simulated_images_carry_their_object_and_sensor(touched):
     for k in (1, 2):
         truth = json.loads((touched / f"ball_{k}.json").read_text())
         with Image.open(touched / f"ball_{k}.png") as image:
@@ -223,7 +223,7 @@ def test_simulated_images_carry_their_part_and_sensor(touched):
         assert 0.3 <= truth["penetration_mm"] <= 1.5
 
 
-def test_what_was_assumed_in_reading_a_mesh_is_said(geomtact, tmp_path):
+def test_assumptions_made_in_loading_a_mesh_are_printed(geomtact, tmp_path):
     (tmp_path / "ball.stl").write_bytes(load_mesh("ball").path.read_bytes() + b"end")
     done = geomtact("simulate", "ball.stl", "--unit", "mm", "--sensor", "digit", "--n", 1, "--out", tmp_path / "out")
     assert "warning: ball.stl: 3 bytes after the last triangle are passed over" in done.stderr
@@ -247,7 +247,7 @@ def test_simulate_is_repeatable_and_replays_a_pose(geomtact, touched, tmp_path):
     geomtact("simulate", "ball", "--sensor", "gelslim", "--pose", tmp_path / "pose.json", status=3)
 
 
-def test_the_side_that_is_touched_may_be_said(geomtact, flat_nut, a_touch, tmp_path):
+def test_the_contact_face_may_be_given(geomtact, flat_nut, a_touch, tmp_path):
     Image.fromarray(255 * a_touch(flat_nut)[1].astype(np.uint8)).save(tmp_path / "nut.png")
     own = ("--cache-dir", tmp_path / "own")  # others count what the shared one holds
     nut = ("nut.png", "--object", "hex_nut", "--sensor", "gelsight-mini", "--max-poses", 3000, *own)
@@ -316,7 +316,7 @@ def test_localize_reads_each_image_once(geomtact, touched, tmp_path, monkeypatch
     assert opened == ["ball_1.png", "ball_2.png"]
 
 
-def test_images_and_folders_of_any_name_serve(geomtact, touched, tmp_path):
+def test_images_and_folders_may_have_any_name(geomtact, touched, tmp_path):
     name = os.fsdecode(b"t\xfcr")
     image = shutil.copy(touched / "ball_1.png", tmp_path / f"{name}.png")
     told = geomtact("localize", image, "--out", name, "--json")
@@ -337,7 +337,7 @@ def test_no_contact_exits_4_and_writes_its_result(geomtact, tmp_path):
     assert json.loads((tmp_path / "out" / "result.json").read_text())["modes"] == []
 
 
-def test_geomtact_toml_serves_before_the_metadata(tmp_path):
+def test_geomtact_toml_takes_precedence_over_the_metadata(tmp_path):
     (tmp_path / "geomtact.toml").write_text('object = "part.stl"\nunit = "mm"\nsensor = "gelslim"\n')
     (tmp_path / "part.stl").touch()
     below = tmp_path / "a" / "b"
@@ -366,7 +366,7 @@ def test_geomtact_toml_serves_before_the_metadata(tmp_path):
     assert project.resolve(nothing, {}, below)[0] == {"object": None, "unit": None, "sensor": "gelsight-mini"}
 
 
-def test_a_file_does_not_stand_before_what_is_bundled(tmp_path):
+def test_a_bundled_name_takes_precedence_over_a_file(tmp_path):
     (tmp_path / "ball").mkdir()
     (tmp_path / "digit").write_text("")
     (tmp_path / "geomtact.toml").write_text('object = "ball"\nsensor = "digit"\n')
@@ -416,7 +416,7 @@ def test_statuses_of_errors(error, status, capsys):
 
 
 @pytest.mark.parametrize("error", ["typer.Abort", "EOFError"])
-def test_what_breaks_off_is_told_in_one_line(error, monkeypatch, capsys):
+def test_an_aborted_command_is_one_line(error, monkeypatch, capsys):
     from geomtact.cli.shell import one_line_usage_errors
 
     with pytest.raises(SystemExit) as stopped, one_line_usage_errors():
@@ -437,7 +437,7 @@ def test_interrupt_exits_130_without_a_traceback():
     assert "Traceback" not in done.stderr
 
 
-def test_each_image_may_have_a_background_of_its_own(tmp_path, monkeypatch, rng):
+def test_each_image_may_have_its_own_background(tmp_path, monkeypatch, rng):
     monkeypatch.chdir(tmp_path)
     read_observation, given = reading.read_observation, []
 

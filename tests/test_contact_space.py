@@ -43,7 +43,7 @@ def some_poses(index, n, rng):
 # --- the index against exact casts
 
 
-def test_stored_masks_are_what_an_exact_cast_shows(localizer, rng):
+def test_stored_masks_equal_exact_casts(localizer, rng):
     index, space = localizer.index, localizer.space
     ids = some_poses(index, 400, rng)
     exact = space.caster.depths(index.sensor, index.poses(ids), index.resolution.mask_shape) > 0
@@ -56,7 +56,7 @@ def test_stored_masks_are_what_an_exact_cast_shows(localizer, rng):
     assert np.quantile(iou, 0.1) > 0.6
 
 
-def test_stored_heights_press_as_deep_as_they_say(localizer, rng):
+def test_stored_heights_press_as_deep_as_their_penetration(localizer, rng):
     index, space = localizer.index, localizer.space
     ids = some_poses(index, 400, rng)
     pressed = space.caster.penetration(index.sensor, index.poses(ids))
@@ -100,7 +100,7 @@ def test_a_mean_mask_pixel_lies_where_the_object_presses(localizer, rng):
     assert np.median(np.linalg.norm(off, axis=1)) < 1.5 * MM
 
 
-def test_each_pose_of_the_index_looks_up_itself(localizer):
+def test_each_pose_of_the_index_finds_itself(localizer):
     index = localizer.index
     w = weights(index)
     level = np.arange(len(index)) // index.places
@@ -285,7 +285,7 @@ def test_a_solid_has_no_hollow(ball):
     assert ContactSpace(ball.mesh, ball.sensor).hollow == 0
 
 
-def test_what_enters_the_housing_does_not_touch():
+def test_a_pose_that_enters_the_housing_does_not_touch():
     """A ball pressed into a window far smaller than itself reaches below the membrane beside it, too."""
     narrow = replace(TINY, pixel_pitch=(0.01 * MM, 0.01 * MM))
     centred = transform(np.eye(3), [0, 0, 5 * MM])
@@ -342,7 +342,7 @@ def same(a, b):
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in Index.ARRAYS)
 
 
-def test_the_second_opening_reads_what_the_first_built(tmp_path, monkeypatch):
+def test_the_second_opening_loads_the_index_of_the_first(tmp_path, monkeypatch):
     built = tiny_index(tmp_path)
     monkeypatch.setattr(store, "build", never)
     again = tiny_index(tmp_path)
@@ -352,7 +352,7 @@ def test_the_second_opening_reads_what_the_first_built(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("building-*"))
 
 
-def test_what_goes_into_an_index_goes_into_its_key(tmp_path):
+def test_every_input_of_an_index_is_in_its_key(tmp_path):
     ball = load_mesh("ball")
     keys = {
         tiny_index(tmp_path).key,
@@ -506,7 +506,7 @@ def test_the_cache_is_listed_bounded_and_cleared(tmp_path):
     assert cache_entries(tmp_path) == [] and not list(tmp_path.iterdir())
 
 
-def test_others_may_read_what_one_has_cached_and_killed_builds_are_cleared_away(tmp_path):
+def test_other_users_may_read_a_cache_and_killed_builds_are_removed(tmp_path):
     key = tiny_index(tmp_path).key
     (like := tmp_path / "made").mkdir()
     assert (tmp_path / key).stat().st_mode == like.stat().st_mode
@@ -523,7 +523,7 @@ def test_progress_goes_from_0_to_1(tmp_path):
     assert all(isinstance(what, str) and what for _, what in seen)
 
 
-def test_the_index_says_what_it_was_built_from(tmp_path):
+def test_the_index_records_its_inputs(tmp_path):
     index = tiny_index(tmp_path)
     meta = json.loads((tmp_path / index.key / "meta.json").read_text())
     assert meta["object_sha256"] == index.mesh.sha256 and meta["poses"] == len(index)
@@ -535,7 +535,7 @@ def test_samples_are_the_same_for_the_same_seed(ball):
 
 
 @pytest.mark.parametrize("name", slow_but(["plug", "curved", "plate", "plate on a bulge"], "plug", "plate"))
-def test_what_is_not_cast_could_not_touch(name, request, curved_sensor, monkeypatch):
+def test_poses_that_are_not_cast_cannot_touch(name, request, curved_sensor, monkeypatch):
     """The poses drawn are those of casting every one."""
     if name.startswith("plate"):
         solid = trimesh.creation.box((60 * MM, 40 * MM, 2 * MM))
@@ -557,7 +557,7 @@ def test_what_is_not_cast_could_not_touch(name, request, curved_sensor, monkeypa
     assert np.mean(left_out) > 0.1
 
 
-def test_a_part_much_larger_than_its_sensor_is_drawn_though_it_hardly_ever_touches():
+def test_an_object_much_larger_than_its_sensor_is_sampled_though_it_rarely_touches():
     """One in 400 of the poses within reach, for the housing is in the way."""
     solid = trimesh.creation.box((600 * MM, 500 * MM, 10 * MM))
     poses = ContactSpace(Mesh(solid.vertices, solid.faces, "plate", "m"), Sensor.load("gelsight-mini"))
@@ -565,7 +565,7 @@ def test_a_part_much_larger_than_its_sensor_is_drawn_though_it_hardly_ever_touch
     assert np.isfinite(poses.penetration(T)).all() and len(T) == len(depth) == 64
 
 
-def test_where_hardly_any_pose_touches_it_is_said_how_many_were_tried(ball, monkeypatch):
+def test_where_hardly_any_pose_touches_the_error_counts_the_attempts(ball, monkeypatch):
     for name, few in {"_FIRST": 300, "_MORE": 0}.items():
         monkeypatch.setattr(space, name, few)
     with pytest.raises(

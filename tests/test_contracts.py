@@ -269,7 +269,7 @@ def rays(mesh, rng, n=400):
 
 
 @pytest.mark.parametrize("kind", SCENES, ids=lambda each: each.__name__)
-def test_what_a_ray_meets_is_on_its_triangle_whichever_rays_go_along(kind, rng):
+def test_a_hit_lies_on_its_triangle_whichever_rays_are_cast_with_it(kind, rng):
     mesh = load_mesh("gear")
     corners = mesh.vertices[mesh.faces].astype(np.float32)
     shown = kind(corners)
@@ -376,7 +376,7 @@ def test_a_motion_keeps_the_uniform_distribution_and_all_mass(part, motion, requ
 
 @each_motion
 @each_part
-def test_parts_of_a_distribution_spread_each_for_itself(part, motion, request, rng):
+def test_components_of_a_distribution_spread_independently(part, motion, request, rng):
     """Whatever few cells hold: those of few rotations are spread by another way than those of all."""
     index = request.getfixturevalue(part).index
     spread, possible = MotionKernel(index, motion), index.possible

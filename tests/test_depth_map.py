@@ -124,7 +124,7 @@ def test_noise_about_0_alone_is_no_contact(rng, sigma, width):
         pytest.param(ball(1e-4) - np.roll(ball(1e-4), 90), id="as low as high"),
     ],
 )
-def test_what_is_as_low_as_high_is_not_always_noise(given, rng):
+def test_symmetric_heights_are_not_always_noise(given, rng):
     for noisy in (given, given + correlated(rng, 2e-6, 2)):
         with pytest.raises(ImageError, match="depths of the gel's indentation are >= 0"):
             read(noisy)

@@ -157,7 +157,7 @@ def test_hu_moments_know_pixels_that_are_not_square():
     assert near < 0.1 * far
 
 
-def test_fourier_tells_place_size_and_stretch():
+def test_fourier_measures_place_size_and_stretch():
     half_diagonal = 20.0  # mm
     disk, long = Fourier().describe(np.stack([ellipse(3, -2, 4, 4), ellipse(a=6, b=4, angle=1.0)]), WIDE)
     mean, first, last = (disk[k] + 1j * disk[9 + k] for k in (0, 1, 8))

@@ -54,7 +54,7 @@ def test_a_palette_of_two_colours_is_a_mask(tmp_path, suffix, mask, colours, bac
 @pytest.mark.parametrize("suffix", ["png", "bmp", "tif"])
 @pytest.mark.parametrize("mask", [MASK, NOTHING, ~NOTHING])
 @pytest.mark.parametrize("colours", [None, [0, 0, 0], [0] * 6, [9, 9, 9] * 2], ids=["none", "one", "black", "grey"])
-def test_a_palette_that_does_not_tell_its_colours_apart_counts_by_index(tmp_path, suffix, mask, colours):
+def test_a_palette_with_equal_colours_counts_by_index(tmp_path, suffix, mask, colours):
     image = Image.fromarray(mask.astype(np.uint8), "P")
     if colours is not None:
         image.putpalette(colours)
@@ -86,7 +86,7 @@ def test_two_indices_of_the_colour_of_no_contact_are_refused(tmp_path):
             read_image(tmp_path / f"mask.{suffix}")
 
 
-def test_indices_that_a_palette_does_not_tell_apart_are_refused_without_a_0(tmp_path):
+def test_indices_of_equal_palette_colours_are_refused_without_a_0(tmp_path):
     palette(MASK, [0] * 9, 1, 2).save(tmp_path / "mask.png")
     with pytest.raises(ImageError, match="got nothing but 1 and 2; draw contact white"):
         read_observation(tmp_path / "mask.png", MINI)
@@ -102,7 +102,7 @@ def test_several_frames_in_one_file_are_refused(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
 @pytest.mark.parametrize("orientation", [0, *range(1, 10)])
-def test_an_orientation_tag_is_refused_unless_it_says_upright(tmp_path, suffix, orientation):
+def test_an_orientation_tag_other_than_upright_is_refused(tmp_path, suffix, orientation):
     path, exif = tmp_path / f"turned.{suffix}", Image.Exif()
     exif[274] = orientation
     Image.fromarray(COLOUR).save(path, exif=exif)
@@ -307,7 +307,7 @@ def test_a_video_of_masks_is_cut_at_half(tmp_path, suffix, codec):
     assert "for a mask give --kind mask" in read_observation(colours, MINI).warnings[0]
 
 
-def test_a_video_of_readings_is_no_video_of_masks(tmp_path):
+def test_a_video_of_tactile_images_is_no_video_of_masks(tmp_path):
     path = tmp_path / "readings.avi"
     video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (320, 240))
     video.write(COLOUR)

@@ -59,7 +59,7 @@ def pressed_in_the_middle(space, depth=0.8e-3):
 
 
 @pytest.mark.parametrize("elastic", [False, True])
-def test_a_ball_tells_where_it_is_and_not_how_it_is_turned(ball, elastic):
+def test_a_ball_constrains_its_position_and_not_its_rotation(ball, elastic):
     T = pressed_in_the_middle(ball)
     problem = make_problem(simulate_mask(ball, T, elastic), SENSOR)
     spread = Spread(0.8e-3 / problem.length / np.sqrt(12), 0.8e-3 / np.sqrt(12))
@@ -86,12 +86,12 @@ def test_information_is_that_of_the_outline(ball):
     assert np.diag(found)[3:5] == pytest.approx(expected, rel=0.2)
 
 
-def test_a_touch_that_nothing_moves_tells_nothing():
+def test_a_touch_that_no_motion_changes_constrains_nothing():
     told, rest = split(np.zeros((6, 6)), Spread(0.1, 1e-3), 5e-3)
     assert (told == 0).all() and np.allclose(rest, np.eye(6))
 
 
-def test_what_is_told_depends_on_the_grid_and_not_on_the_units_of_a_turn():
+def test_observability_depends_on_the_grid_and_not_on_the_unit_of_rotation():
     """A quarter of the grid's step, in shifts and in turns, parts what is told from what is not."""
     spread, length = Spread(np.radians(6) / np.sqrt(12), 4e-3 / np.sqrt(12)), 2e-3
     step = np.repeat([np.radians(6) * length, 4e-3], 3)
@@ -118,7 +118,7 @@ def grid_of(space):
 
 
 @pytest.mark.parametrize("name, turned", [("sphere", [0.0, 0.3, 0.2]), ("rod", [0.0, 0.0, 0.3])])
-def test_what_a_symmetry_leaves_open_is_not_told(name, turned):
+def test_a_symmetry_direction_is_not_observable(name, turned):
     """The same contact, the part turned within its symmetry: no error, however the part lies to the pixels."""
     space = ContactSpace(shape(name).with_symmetry(), Sensor("s", (320, 240), (0.07e-3, 0.07e-3), 20e-3, 2e-3))
     T = se3.transform(
@@ -138,7 +138,7 @@ def test_what_a_symmetry_leaves_open_is_not_told(name, turned):
     assert np.linalg.norm(told @ motion_of(T, other, problem)) < 0.15e-3
 
 
-def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
+def test_every_method_starts_from_the_same_pose_at_the_stated_distance(nut):
     touches = touches_of(nut, 3)
     seen = {"a": [], "b": []}
 
@@ -174,7 +174,7 @@ def test_every_method_starts_where_the_others_do_and_as_far_off_as_said(nut):
     assert [t.start_mm for t in again[0]] == [t.start_mm for t in whole[2] if t.method == "a"]
 
 
-def test_who_loses_to_another_library_is_said():
+def test_a_method_that_loses_to_another_library_is_named():
     def trial(touch, method, error, shift):
         return Trial(touch, "edge", False, method, 0.0, shift, 3, 2.0, error, 0.0, True, 1.0)
 
@@ -193,7 +193,7 @@ def test_who_loses_to_another_library_is_said():
     assert nothing["success"]["flat"] == [] and nothing["methods"]["none"]["success"] is None
 
 
-def test_figures_from_the_grid_are_shares_of_what_they_say():
+def test_figures_from_the_grid_are_shares_of_their_touches():
     """Ten trials from the grid: one gets worse by more than half a pixel, eight of ten truths lie in the 90 % region."""
     levels = np.append(np.linspace(0.1, 0.88, 8), [0.92, 0.99])
     some = [
@@ -264,7 +264,7 @@ def observed(points):
 
 
 @pytest.mark.parametrize("name", list(peers(Surface(np.eye(3), np.eye(3)), Spread(0.1, 1e-3))))
-def test_other_libraries_move_the_object_the_right_way(name):
+def test_other_libraries_move_the_object_towards_the_contact(name):
     """The rim is the object's corner; the start pose is off, and comes back."""
     rng = np.random.default_rng(0)
     points, normals = corner(rng, 1500)

@@ -69,7 +69,7 @@ def outcomes(content, part, name):
     return study_file.outcomes(content["parts"][part]["scores"][name], scores.Scored)
 
 
-def test_the_file_says_all_that_the_figures_depend_on(whole, folder):
+def test_the_file_records_every_input_of_its_figures(whole, folder):
     content, _, _ = whole
     assert content["schema"] == "geomtact/scores/2" and content["versions"]["numpy"] == np.__version__
     settings = content["settings"]
@@ -101,7 +101,7 @@ def test_the_file_says_all_that_the_figures_depend_on(whole, folder):
             assert 0 < figures["score_ms_median"] < figures["ms_median"]
 
 
-def test_all_scores_are_judged_on_the_same_elastic_touches(whole):
+def test_all_scores_are_evaluated_on_the_same_elastic_touches(whole):
     content, _, _ = whole
     for part in content["parts"]:
         depths = [[o.penetration_mm for o in outcomes(content, part, name)] for name in NAMES]
@@ -121,7 +121,7 @@ def test_a_score_is_compared_with_iou_touch_by_touch(whole):
             assert entry["figures"]["elastic"]["gain_mean"] == figures["gain_mean"] == pytest.approx(gain[name].mean())
 
 
-def test_over_all_parts_means_are_of_parts_and_coverage_is_of_touches(whole):
+def test_over_all_objects_means_are_of_objects_and_coverage_is_of_touches(whole):
     content, _, _ = whole
     assert list(content["overall"]) == NAMES
     for name, entry in content["overall"].items():
@@ -137,7 +137,7 @@ def test_over_all_parts_means_are_of_parts_and_coverage_is_of_touches(whole):
         assert entry["prepare_s"]["index"] == np.mean([e["prepare_s"]["index"] for e in each])
 
 
-def test_the_screen_shows_a_table_for_each_part_and_one_over_all(whole):
+def test_the_screen_shows_a_table_for_each_object_and_one_over_all(whole):
     content, printed, _ = whole
     titles = ["ball: 6 touches on gelsight-mini", "hex_nut: 6 touches on gelsight-mini", "mean over ball, hex_nut"]
     tables = [printed.index(title) for title in titles]
@@ -185,7 +185,7 @@ def test_a_stopped_study_goes_on_and_ends_as_the_whole_one(whole, stopped, evalu
     assert content["parts"]["hex_nut"]["scores"]["moments"]["prepare_s"]["calibrate"] is None
 
 
-def test_a_run_that_is_killed_leaves_what_it_had(whole, evaluate, tmp_path, monkeypatch):
+def test_a_killed_run_keeps_its_results(whole, evaluate, tmp_path, monkeypatch):
     """The outcomes of the killed run and of the one that goes on are those of a run in one piece."""
     monkeypatch.setattr(study_file, "_SAVE_EVERY", 2)
     whole_run = scores.judged
@@ -239,7 +239,7 @@ def test_other_settings_leave_the_file_as_it_is(whole, evaluate, folder):
     assert json.loads(other.read_text()) == held
 
 
-def test_words_are_told_apart_and_wrong_ones_named(evaluate):
+def test_unknown_words_are_named(evaluate):
     told = evaluate("ball", "--scores", "momens", status=2).stderr
     assert "no score named 'momens'; did you mean 'moments'?" in told
     told = evaluate("ball", "--scores", "l1", "iuo", status=2).stderr
@@ -250,7 +250,7 @@ def test_words_are_told_apart_and_wrong_ones_named(evaluate):
     assert done.exit_code == 2 and "Missing argument 'OBJECT...'" in done.stderr
 
 
-def test_by_default_all_scores_are_judged_on_the_thesis_parts():
+def test_by_default_all_scores_are_evaluated_on_the_thesis_objects():
     from tools.studies.scores.command import sort_words
 
     names = [*(name for name in catalogue.SCORERS if name != catalogue.DEFAULT_SCORER), "fast", "balanced", "exact"]
@@ -273,7 +273,7 @@ def test_a_step_is_timed_by_itself_and_one_from_the_cache_is_not(monkeypatch):
     assert scores.timed(lambda report: "read") == ("read", None)
 
 
-def test_what_the_cache_held_is_not_timed(whole, folder):
+def test_cached_results_are_not_timed(whole, folder):
     mesh, sensor = load_mesh("ball"), Sensor.load("gelsight-mini")
     _, times = scores.prepare(mesh, sensor, "iou", 3000, folder / "cache")
     assert times == scores.PrepareTimes(index=None, describe=0.0, calibrate=None)
@@ -300,7 +300,7 @@ def test_the_picture_is_drawn_from_the_file_alone(whole):
     assert draw_scores(bare).startswith(b"\x89PNG")
 
 
-def test_vectors_take_their_own_bytes(folder, whole):
+def test_the_memory_of_vectors_is_their_bytes(folder, whole):
     localizer = Localizer.prepare(
         "ball", sensor="gelsight-mini", scorer="l1", max_poses=3000, cache_dir=folder / "cache"
     )

@@ -121,7 +121,7 @@ def test_coverage_of_calibrated_levels_and_its_intervals():
     np.testing.assert_allclose(shares, LEVELS, atol=0.012)
 
 
-def test_touches_repeat_and_only_elastic_ones_are_felt_anew(localizer):
+def test_touches_repeat_and_only_elastic_ones_are_computed_anew(localizer):
     space = localizer.space
     blob = np.zeros(localizer.sensor.image_size_px[::-1], bool)
     blob[100:130, 150:190] = True
@@ -159,7 +159,7 @@ def test_the_energy_score_is_least_for_the_distribution_that_truths_come_from(rn
             assert more.mean() > 2 * more.std() / np.sqrt(60), (name, kind)
 
 
-def test_the_energy_score_of_a_certain_answer_is_its_error_and_knows_no_symmetry(nut, rng):
+def test_the_energy_score_of_a_certain_estimate_is_its_error_modulo_symmetry(nut, rng):
     T, other = random_poses(2, rng)
     one = np.repeat(other[None], 10, 0)
     bare = load_mesh("bracket")
@@ -185,7 +185,7 @@ def test_tarp_levels_are_uniform_for_a_calibrated_posterior_and_bunch_for_a_bold
     assert bold["p"] < 1e-6 and bold["counts"][0] + bold["counts"][-1] > 150
 
 
-def test_modes_that_hold_what_they_claim_are_reliable(rng):
+def test_modes_right_as_often_as_their_probability_are_reliable(rng):
     claimed = rng.random(4000)
     found = study.reliability(claimed, rng.random(4000) < claimed)
     assert sum(b["n"] for b in found) == 4000
@@ -194,7 +194,7 @@ def test_modes_that_hold_what_they_claim_are_reliable(rng):
     assert bold["share"] == 0 and bold["high"] < bold["claimed"]
 
 
-def test_a_study_says_what_the_posterior_says(localizer):
+def test_a_study_reports_the_figures_of_the_posterior(localizer):
     touches = study.make_touches(localizer.space, 8, 1, MODERATE)
     outcomes = list(proper.judge(localizer, touches, "fast", 1))
     for touch, outcome in zip(touches, outcomes, strict=True):
@@ -300,7 +300,7 @@ def test_outcomes_are_plain_numbers(localizer):
     assert json.loads(json.dumps(asdict(outcome))) == asdict(outcome)
 
 
-def test_the_judging_solver_agrees_with_hertz_and_with_our_own():
+def test_the_reference_solver_agrees_with_hertz_and_with_the_package():
     pytest.importorskip("tamaas")
     from geomtact.sensing.elastic import elastic_mask
     from tools.studies.localize.other_solver import tamaas_mask
@@ -316,7 +316,7 @@ def test_the_judging_solver_agrees_with_hertz_and_with_our_own():
     assert (tamaas_mask(punch, pitch) ^ (punch > 0)).sum() < 0.03 * (punch > 0).sum()
 
 
-def test_the_thesis_table_counts_what_refinement_brings_nearer():
+def test_the_thesis_table_counts_the_poses_that_refinement_improves():
     rows = [[8.0, 4.0, 9.0, 3.0, 2.0, 1.0], [2.0, 3.0, 1.0, 2.0, 2.0, 2.0], [6.0, 6.0, 5.0, 6.0, 4.0, 5.0]]
     figures = known_approach.summarise([known_approach.Outcome(0, True, [*row, 3.0, 3.0], 20.0) for row in rows])
     assert figures["best"]["error_mm_quartiles"][1] == 6 and figures["best"]["normalised_median"] == 0.3
@@ -326,7 +326,7 @@ def test_the_thesis_table_counts_what_refinement_brings_nearer():
     assert "nearer" not in figures["answer"]
 
 
-def test_touches_of_a_known_side_are_judged_before_and_after_refinement(flat_nut, monkeypatch, tmp_path):
+def test_touches_of_a_known_contact_face_are_evaluated_before_and_after_refinement(flat_nut, monkeypatch, tmp_path):
     monkeypatch.setattr(Localizer, "prepare", classmethod(lambda cls, *args, **options: flat_nut))
     out = tmp_path / "table.json"
     args = ["thesis", "hex_nut", "--sides", "2", "--touches", "1", "--out", str(out)]

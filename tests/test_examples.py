@@ -43,7 +43,7 @@ def test_touch_until_sure(example):
 
 
 @pytest.mark.slow
-def test_the_pencils_ends_tell_most(example, tmp_path):
+def test_the_pencils_ends_constrain_most(example, tmp_path):
     """A touch of its middle tells nothing of which way round it lies; one of its ends does."""
     said = example("docs/examples/pencil.py").splitlines()
     ranked = [line[:24].strip() for line in said if "discards" in line]
@@ -59,7 +59,7 @@ def test_a_gripper_that_reads_its_width(example):
 
 
 @pytest.mark.slow
-def test_a_face_put_down_flat_is_told_whether_the_side_is_known_or_not(example):
+def test_a_face_put_down_flat_is_localized_with_known_and_unknown_contact_face(example):
     said = example("docs/examples/face_on.py", "--max-poses", "20000", "--touches", "6", "--tilt", "1").splitlines()
     assert len(said) == 2 and "any side" in said[0] and "that side" in said[1]
     for line in said:

@@ -104,7 +104,7 @@ def test_a_table_has_a_row_for_each_mode(poses):
         ),
     ],
 )
-def test_broken_files_are_told(read, text, told, tmp_path):
+def test_broken_files_are_errors(read, text, told, tmp_path):
     path = tmp_path / "broken.txt"
     with pytest.raises(InputError, match="no such file"):
         read(path)

@@ -56,7 +56,7 @@ def facing_z(solid, sign):
     return [(face.area / MM**2, face.half_width / MM) for face in faces]
 
 
-def test_steps_are_faces_of_their_own_and_feet_are_one():
+def test_steps_are_separate_faces_and_feet_are_one():
     low, high, foot = (trimesh.creation.box(size) for size in ((20, 20, 10), (10, 10, 14), (4, 4, 4)))
     (lower, _), upper = facing_z(trimesh.boolean.union([low, high]), 1)
     assert lower == pytest.approx(400 - 100) and upper == pytest.approx((100, 5))
@@ -117,7 +117,7 @@ def lifted(mesh, sensor, resolution):
 
 @pytest.mark.parametrize("name", ["bracket", "head", "elbow_pipe"])
 @pytest.mark.parametrize("sensor", ["gelslim", "gelsight-mini"])
-def test_a_face_put_down_is_felt_whole_by_some_pose_of_the_grid(name, sensor):
+def test_some_pose_of_the_grid_shows_a_face_put_down_whole(name, sensor):
     """Of the six widest faces; of a grid without disks many are not."""
     mesh, sensor = load_mesh(name).with_symmetry(), Sensor.load(sensor)
     resolution = choose_resolution(mesh, sensor)

@@ -91,7 +91,7 @@ def test_a_contact_all_across_the_image_is_found(kind, size, light, rng):
     assert np.array_equal(found, find_contact(image, rest).mask) and overlap(found, touched) > 0.5
 
 
-def test_what_may_be_a_contact_is_a_warning(rng):
+def test_a_possible_contact_is_a_warning(rng):
     depth, _ = pressed("ribs", 3, 0, True)
     image, rest = reading(depth, "depth", rng)
     seen = read_observation(image, "gelsight-mini", "reading", rest)

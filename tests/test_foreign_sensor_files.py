@@ -57,7 +57,7 @@ def test_a_file_of_tacto_gives_the_window_that_its_camera_sees(tmp_path):
     assert flat.membrane_radius == 0 and flat.name == "flat"
 
 
-def test_tactos_own_digit_has_the_bundled_digits_camera_and_dome(data_folder):
+def test_the_digit_of_tacto_has_the_bundled_digits_camera_and_dome(data_folder):
     theirs, ours = Sensor.load(data_folder / "tacto_digit" / "config_digit.yml"), Sensor.load("digit")
     assert theirs.camera_distance == pytest.approx(ours.camera_distance)
     assert theirs.membrane_radius == pytest.approx(ours.membrane_radius, rel=0.01)
@@ -72,7 +72,7 @@ def test_the_case_of_a_suffix_does_not_matter(tmp_path, name):
         Sensor.load(tmp_path / "absent.YAML")
 
 
-def test_a_file_of_gsrobotics_shows_its_part_of_the_minis_frame(tmp_path):
+def test_a_file_of_gsrobotics_shows_its_crop_of_the_minis_frame(tmp_path):
     """The frame is as large as the bundled sensor's, which shows 5/7 of it; the pixels differ."""
     mini, theirs = Sensor.load("gelsight-mini"), Sensor.load(written(tmp_path, json.dumps(GSROBOTICS), "config.JSON"))
     assert theirs.name == "config" and theirs.image_size_px == (640, 480) and theirs.border_fraction == 0.1
@@ -100,7 +100,7 @@ def test_a_file_of_gsrobotics_shows_its_part_of_the_minis_frame(tmp_path):
         ({"border_fraction": "a"}, "what this one holds is not valid"),
     ],
 )
-def test_what_is_wrong_with_a_file_of_gsrobotics_is_told(tmp_path, wrong, told):
+def test_an_error_in_a_file_of_gsrobotics_is_named(tmp_path, wrong, told):
     text = json.dumps({key: value for key, value in (GSROBOTICS | wrong).items() if value is not None})
     with pytest.raises(SensorError, match=told) as error:
         Sensor.load(written(tmp_path, text, "config.json"))
@@ -119,7 +119,7 @@ def test_other_json_is_no_sensor(tmp_path, text):
     ("size", "kept"),
     [((640, 480), "68:412, 91:549"), ((3280, 2464), "352:2112, 468:2812"), ((1640, 1232), "176:1056, 234:1406")],
 )
-def test_a_whole_frame_of_the_mini_is_refused_with_its_part_that_counts(size, kept):
+def test_a_whole_frame_of_the_mini_is_refused_with_its_valid_crop(size, kept):
     """gs_sdk cuts off a seventh of 640 x 480 and of 3280 x 2464 px, in whole pixels, as here."""
     frame = np.random.default_rng(0).integers(0, 255, (*size[::-1], 3), np.uint8)
     message = (
@@ -209,7 +209,7 @@ def test_it_may_be_written_out_as_toml(tmp_path):
         ("!!python/object/apply:os.system ['true']", "not valid YAML"),
     ],
 )
-def test_what_is_wrong_is_told_in_one_line(tmp_path, text, told):
+def test_a_faulty_sensor_file_is_one_line(tmp_path, text, told):
     with pytest.raises(SensorError, match=told) as error:
         Sensor.load(written(tmp_path, text))
     assert "\n" not in str(error.value) and "mine.yaml" in str(error.value)

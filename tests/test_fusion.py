@@ -57,7 +57,7 @@ def test_a_sensor_in_the_same_place_sees_each_place_in_itself(plug):
 
 
 @pytest.mark.parametrize("pairs", slow_but((6, 12), 6))
-def test_shares_are_what_happens(plug, rng, pairs):
+def test_shares_equal_the_frequencies_of_simulation(plug, rng, pairs):
     """Of poses drawn within cells, as many touch a second sensor as the cells' shares say, within a factor of two."""
     expected, happened = [], []
     for transfer, places, T in carried(plug, rng, pairs):
@@ -67,7 +67,7 @@ def test_shares_are_what_happens(plug, rng, pairs):
 
 
 @pytest.mark.parametrize("pairs", slow_but((6, 12), 6))
-def test_free_sensors_are_reached_as_often_as_said(plug, rng, pairs):
+def test_sensors_without_contact_are_reached_at_the_stated_frequency(plug, rng, pairs):
     """Of poses drawn within cells, as many reach a second sensor, however deep, as their shares say; and those that do, more."""
     expected, happened = [], []
     for transfer, places, T in carried(plug, rng, pairs):
@@ -79,7 +79,7 @@ def test_free_sensors_are_reached_as_often_as_said(plug, rng, pairs):
     assert ((expected - happened) ** 2).mean() < 0.7 * happened.var()
 
 
-def test_a_rig_known_less_well_spreads_the_shares(plug, rng):
+def test_more_uncertain_extrinsics_spread_the_shares(plug, rng):
     T, _ = plug.space.sample(2, rng)
     carried = T[1] @ se3.inverse(T[0])
     exact, loose = (
@@ -92,7 +92,7 @@ def test_a_rig_known_less_well_spreads_the_shares(plug, rng):
     assert wide.sum() ** 2 / (wide**2).sum() > 1.03 * sharp.sum() ** 2 / (sharp**2).sum()
 
 
-def test_what_the_approach_rules_out_does_not_touch(flat_nut):
+def test_a_pose_outside_the_approach_does_not_touch(flat_nut):
     """A nut known to lie on its face never touches a sensor that looks at it from the side."""
     side = se3.transform(se3.exp([np.pi / 2, 0, 0, 0, 0, 0])[:3, :3], np.zeros(3))
     transfer = CellTransfer(flat_nut.index, flat_nut.index, side)
@@ -113,7 +113,7 @@ def test_doubtful_places_are_carried_roughly_but_without_bias(plug, rng):
     assert rough == pytest.approx(exact, rel=0.1)
 
 
-def test_sensors_that_vary_alike_count_as_one(rng):
+def test_sensors_with_the_same_errors_count_as_one(rng):
     log_prior, fields = np.full(5000, -np.log(5000.0)), rng.normal(size=(3, 5000))
     three = np.ones(3, bool)
     # told apart by what they say, they count all but in full, as do sensors without contact
@@ -129,7 +129,7 @@ def test_sensors_that_vary_alike_count_as_one(rng):
 
 
 @pytest.mark.parametrize("scenes", slow_but((3, 12), 3))
-def test_each_more_sensor_tells_more_of_the_true_pose(plug, scenes):
+def test_each_further_sensor_adds_information_about_the_true_pose(plug, scenes):
     """In the mean of 12 scenes: a second sensor adds 1.1 nats with a standard error of 0.65, two more 4.4 with one of 0.9."""
     gains = []
     touches = random_touches(plug.space, 3 * scenes, 3)
@@ -151,7 +151,7 @@ def test_each_more_sensor_tells_more_of_the_true_pose(plug, scenes):
 
 
 @pytest.mark.parametrize("k", slow_but((0, 3), 0))
-def test_what_is_found_lies_in_the_cell_that_holds_its_mass(plug, k):
+def test_a_mode_lies_in_the_cell_that_holds_its_mass(plug, k):
     touches = random_touches(plug.space, 6, 11)
     T_world_sensor = [se3.inverse(touch.T_sensor_object) for touch in touches]
     some = slice(k, k + 3)
@@ -175,7 +175,7 @@ def test_the_order_of_the_others_changes_nothing_and_the_world_is_anywhere(plug)
     np.testing.assert_allclose(straight.log_prob, moved.log_prob, atol=1e-2)
 
 
-def test_a_sensor_that_feels_nothing_speaks_against_poses_that_would_touch_it(plug, rng):
+def test_a_sensor_without_contact_lowers_poses_that_would_touch_it(plug, rng):
     touch = random_touches(plug.space, 1, 7)[0]
     T, sensors = world([touch], rng)
     # a sensor at the object's other side, and one far away
@@ -204,7 +204,7 @@ def test_a_sensor_that_feels_nothing_speaks_against_poses_that_would_touch_it(pl
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (3, 4, 0, 1, 2), (0, 3, 1, 4, 2)])
 @pytest.mark.slow
-def test_refinement_learns_nothing_from_sensors_out_of_reach_wherever_they_stand(plug, order):
+def test_sensors_out_of_reach_do_not_change_refinement(plug, order):
     touches = random_touches(plug.space, 3, 11)
     _, sensors = world(touches, np.random.default_rng(1))
     far = [se3.transform(np.eye(3), [0, 0, z]) @ sensors[0] for z in (2.0, 3.0)]
@@ -219,7 +219,7 @@ def test_refinement_learns_nothing_from_sensors_out_of_reach_wherever_they_stand
 
 
 @pytest.mark.parametrize("apart", [0.05, 0.3])
-def test_a_sensor_that_looks_away_says_nothing_of_what_lies_behind_it(plug, rng, apart):
+def test_a_sensor_that_faces_away_does_not_constrain_poses_behind_it(plug, rng, apart):
     touch = random_touches(plug.space, 1, 7)[0]
     _, sensors = world([touch], rng)
     away = sensors[0] @ se3.transform(np.eye(3), [0, 0, -apart]) @ np.diag([1.0, -1.0, -1.0, 1.0])
@@ -229,7 +229,7 @@ def test_a_sensor_that_looks_away_says_nothing_of_what_lies_behind_it(plug, rng,
     assert abs(cell_densities(told) - cell_densities(alone)).sum() < 1e-3 * cell_densities(alone).sum()
 
 
-def test_no_contact_anywhere_leaves_what_touches_nothing(plug, rng):
+def test_no_contact_anywhere_leaves_the_poses_that_do_not_touch(plug, rng):
     touches = random_touches(plug.space, 2, 8)
     T, sensors = world(touches, rng)
     empty = np.zeros_like(touches[0].mask)
@@ -240,7 +240,7 @@ def test_no_contact_anywhere_leaves_what_touches_nothing(plug, rng):
 
 
 @pytest.mark.parametrize("order", [[0, 1], [1, 0]])
-def test_sensors_that_felt_nothing_never_rule_the_truth_out_for_a_later_one(plug, order):
+def test_sensors_without_contact_never_exclude_the_truth_for_a_later_one(plug, order):
     """Two of them stay half a millimetre before the part, in either order; a touch comes later."""
     empty = np.zeros(plug.sensor.image_size_px[::-1], bool)
     for seed in range(4):
@@ -266,7 +266,7 @@ def test_sensors_that_exclude_each_other_are_named(plug, rng):
         plug.localize([t.mask for t in touches[1:]], "mask", None, wrong[1:])
 
 
-def test_a_sensor_that_is_hardly_possible_is_told(plug, rng):
+def test_an_improbable_sensor_is_a_warning(plug, rng):
     """Support far below chance is said in words; agreement is not."""
     touches = random_touches(plug.space, 3, 10)
     _, sensors = world(touches, rng)
@@ -298,7 +298,7 @@ def test_a_prior_counts_once(plug, rng):
     assert slope == pytest.approx(1, abs=0.1)
 
 
-def test_a_posterior_told_elsewhere_is_a_prior(plug, rng):
+def test_a_posterior_of_another_frame_is_a_prior(plug, rng):
     """One after the other, two sensors do not rule out the truth, and tell more than each alone."""
     gains = []
     for seed in range(50, 58):
@@ -313,7 +313,7 @@ def test_a_posterior_told_elsewhere_is_a_prior(plug, rng):
     assert both > max(first, second) + 0.3
 
 
-def test_an_image_that_counts_twice_is_told(plug, rng):
+def test_an_image_that_counts_twice_is_a_warning(plug, rng):
     touches = random_touches(plug.space, 2, 12)
     _, sensors = world(touches, rng)
     images = [touch.mask for touch in touches]
@@ -328,7 +328,7 @@ def test_an_image_that_counts_twice_is_told(plug, rng):
     assert not any("counts twice" in warning for warning in then.warnings)
 
 
-def test_the_evidence_of_a_touch_told_twice_is_hardly_more(plug):
+def test_a_repeated_touch_adds_hardly_any_evidence(plug):
     """Two sensors at one place show the same, so that together they say about what each says."""
     touch = random_touches(plug.space, 1, 13)[0]
     sensors = np.stack([np.eye(4), se3.transform(np.eye(3), [0, 0, 2e-6])])
@@ -337,7 +337,7 @@ def test_the_evidence_of_a_touch_told_twice_is_hardly_more(plug):
     assert abs(twice - once) < 0.3 * abs(once)  # what is left is the share of a cell that touches the second sensor
 
 
-def test_saved_and_loaded_it_says_the_same(plug, rng, tmp_path, cache_dir):
+def test_a_posterior_saved_and_loaded_is_the_same(plug, rng, tmp_path, cache_dir):
     touches = random_touches(plug.space, 2, 12)
     T, sensors = world(touches, rng)
     posterior = plug.localize([t.mask for t in touches], "mask", None, sensors)
@@ -347,7 +347,7 @@ def test_saved_and_loaded_it_says_the_same(plug, rng, tmp_path, cache_dir):
     np.testing.assert_allclose([m.T for m in again.modes(3)], [m.T for m in posterior.modes(3)], atol=1e-9)
 
 
-def test_bad_rigs_are_refused(plug):
+def test_bad_sensor_poses_are_refused(plug):
     mask = np.zeros(plug.sensor.image_size_px[::-1], bool)
     T, millimetres = (np.stack([np.eye(4), se3.transform(np.eye(3), [x, 0, 0])]) for x in (0.1, 20.0))
     cases = [
@@ -423,7 +423,7 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_jaw_on_a_plain_rod_says_that_it_may_be_shifted(make_localizer):
+def test_a_jaw_on_a_plain_rod_leaves_the_shift_along_it_open(make_localizer):
     """Both fingers feel the same all along: no mode claims to know where along the rod they hold it."""
     bar = trimesh.creation.cylinder(6e-3, 0.1, sections=64)
     rod = make_localizer(Mesh(bar.vertices, bar.faces, "rod", "m").with_symmetry(), "gelslim", max_poses=8_000)
@@ -444,7 +444,7 @@ def test_a_jaw_on_a_plain_rod_says_that_it_may_be_shifted(make_localizer):
     assert np.linalg.norm(mode.observable @ across) > 0.9
 
 
-def test_what_a_rig_leaves_open_of_a_pose_is_what_its_errors_make_of_it(rng):
+def test_the_pose_uncertainty_of_extrinsics_equals_their_propagated_errors(rng):
     T, sensors = se3.exp(rng.normal(size=6)), se3.exp(0.3 * rng.normal(size=(2, 6)))
     rig = ExtrinsicsStd(2e-3, 0.5e-3)
     eta = rng.normal(size=(40_000, 6)) * np.r_[[rig.rotation] * 3, [rig.translation] * 3]
@@ -458,7 +458,7 @@ def test_what_a_rig_leaves_open_of_a_pose_is_what_its_errors_make_of_it(rng):
 
 
 @pytest.mark.slow
-def test_a_rig_that_is_off_is_told_and_a_right_one_hardly_ever(plug):
+def test_wrong_extrinsics_are_a_warning_and_right_ones_hardly_ever(plug):
     """Each of the sensors but the first off by 5 mm, in a direction of its own: unless the rig is said to be known no better.
 
     Were one right rig in ten warned of, three of six would be once in 63 times.

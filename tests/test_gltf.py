@@ -257,7 +257,7 @@ def test_a_morph_target_without_data_moves_nothing(tmp_path):
     refused("its mesh lies in the glTF extension .*ACME_packs", made.glb(tmp_path / "b.glb"))
 
 
-def test_instances_that_only_other_attributes_tell_apart_are_one(tmp_path):
+def test_instances_that_differ_only_in_other_attributes_are_one(tmp_path):
     made = Made()
     attributes = {"_ID": made.accessor(np.arange(3, dtype=np.float32))}
     made.node["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
@@ -360,7 +360,7 @@ def test_what_is_no_gltf_is_refused(tmp_path, change, words):
     refused(words, made.glb(tmp_path / "a.glb"))
 
 
-def test_a_file_that_was_cut_short_or_is_old_says_so(tmp_path):
+def test_a_truncated_or_old_file_is_named_as_such(tmp_path):
     whole = Made().glb(tmp_path / "a.glb").read_bytes()
     (tmp_path / "a.glb").write_bytes(whole[:-1])
     refused(f"is cut short: expected {len(whole):,} bytes, found {len(whole) - 1:,}", tmp_path / "a.glb")
@@ -370,7 +370,7 @@ def test_a_file_that_was_cut_short_or_is_old_says_so(tmp_path):
     refused("expected glTF 2.0, got version 1", tmp_path / "a.glb")
 
 
-def test_what_other_programs_write_is_the_same_surface(tmp_path):
+def test_files_of_other_programs_give_the_same_surface(tmp_path):
     scene = trimesh.Scene([BOX, BOX.copy().apply_translation((0.1, 0, 0))])
     for name in ("a.glb", "a.gltf"):
         scene.export(str(tmp_path / name))

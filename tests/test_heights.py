@@ -94,7 +94,7 @@ def test_of_all_penetrations_the_true_one_is_likeliest_on_any_gel():
         assert depths[likely.argmax()] == pytest.approx(0.8 * MM, abs=0.03 * MM)
 
 
-def test_gel_that_is_not_touched_speaks_against_what_would_be_in_it_alone():
+def test_gel_without_contact_lowers_only_poses_that_would_enter_it():
     height, touched = np.zeros((4, 4)), np.zeros((4, 4), bool)
     above, below = np.full((1, 4, 4), -1 * MM), np.full((1, 4, 4), 1 * MM)
     free, in_it = (depth_map_log_likelihood(d, height, touched, 1e-6, 0.1 * MM)[0] for d in (above, below))
@@ -125,7 +125,7 @@ def test_scores_of_a_contour_line_belong_to_deeper_poses(balls):
 
 
 @pytest.mark.parametrize("elastic", [False, True])
-def test_heights_tell_how_deep_a_ball_lies_and_how_large_it_is(balls, elastic):
+def test_heights_measure_the_depth_and_the_size_of_a_ball(balls, elastic):
     ball, other = balls
     T = transform(np.eye(3), [1 * MM, -0.7 * MM, BALL - 0.7 * MM])
     height = simulate_depth_map(ball.space, T) if elastic else ball.simulate(T).height
@@ -147,7 +147,7 @@ def test_a_gel_at_rest_shows_its_background_and_slopes_that_face_a_lamp_are_brig
     assert change[40:55, 75:85, 0].mean() < -0.02 < 0.02 < change[65:80, 75:85, 0].mean()
 
 
-def test_a_rendered_reading_gives_its_contact_back(rng):
+def test_a_rendered_tactile_image_gives_its_contact_back(rng):
     touched, height = elastic_contact(under_ball(0.9 * MM, (1.5 * MM, 0.5 * MM)), SENSOR.pixel_pitch)
     reading, background = (
         example_reading(h, SENSOR.pixel_pitch, 1 / 255, rng) for h in (height, np.zeros_like(height))
@@ -160,7 +160,7 @@ def test_a_rendered_reading_gives_its_contact_back(rng):
 
 
 @pytest.mark.parametrize("n", slow_but((2, 6), 2))
-def test_a_prior_that_tells_the_depth_is_held_against_the_whole_press(ball, rng, n):
+def test_a_prior_on_the_depth_is_compared_with_the_whole_press(ball, rng, n):
     """A height map is compared by a contour some way up; how deep the ball lies is not told by that contour's size."""
     for T in ball.space.sample(n, rng, (1.3 * MM, 1.6 * MM))[0]:
         height = ball.simulate(T).height
@@ -173,7 +173,7 @@ def test_a_prior_that_tells_the_depth_is_held_against_the_whole_press(ball, rng,
         assert told[0] > told[1] + 1
 
 
-def test_simulated_readings_are_localized_as_they_come(tmp_path):
+def test_simulated_tactile_images_are_localized_without_options(tmp_path):
     run = CliRunner().invoke(
         app, ["simulate", "hex_nut", "--sensor", "gelsight-mini", "--tactile-image", "--n", "1", "--out", str(tmp_path)]
     )
@@ -184,7 +184,7 @@ def test_simulated_readings_are_localized_as_they_come(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_calibrated_sensor_tells_the_real_ball_by_its_heights(data_folder, tmp_path, cache_dir, few_touches):
+def test_a_calibrated_sensor_identifies_the_real_ball_by_its_heights(data_folder, tmp_path, cache_dir, few_touches):
     """Every sixth press that lies wholly in the window; the calibration saw presses of the other ball alone."""
     folder = data_folder / "gelslam_gsmini_balls"
     found = calibrations(data_folder, cameras()["parallel rays"])

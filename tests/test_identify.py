@@ -45,7 +45,7 @@ def touches(localizer, n=1, seed=0):
 
 
 @pytest.mark.parametrize(("n", "errors"), [(40, 2), pytest.param(160, 3, marks=pytest.mark.slow)])
-def test_touches_are_told_from_those_of_other_parts(drawer, n, errors):
+def test_touches_are_identified_among_those_of_other_objects(drawer, n, errors):
     """In the mean own evidence is no smaller than another part's (a Kullback-Leibler divergence is not negative). A ball's is
     larger by far; the corners of a rod and of a block are alike. Few touches are called unlike their own part."""
     unlike = []
@@ -101,7 +101,7 @@ def test_probabilities_are_evidence_times_weights(drawer):
         ({"is_outlier": False, "unexplained_nats": 0.0, "misfit_nats": 4.7}, True),
     ],
 )
-def test_unlike_all_is_what_is_odd_or_unexplained_of_each(drawer, said, unlike):
+def test_unlike_all_are_outliers_or_unexplained_touches_of_each_object(drawer, said, unlike):
     def localizer(said):
         posterior = SimpleNamespace(contact=True, log_evidence=0.0, diagnostics=Diagnostics(**said))
         return SimpleNamespace(mesh=drawer[0].mesh, sensors=[drawer[0].sensor], localize=lambda image: posterior)
@@ -116,20 +116,20 @@ def test_unlike_all_is_what_is_odd_or_unexplained_of_each(drawer, said, unlike):
 
 @pytest.mark.parametrize("scenes", slow_but((1, 2), 1))
 @pytest.mark.parametrize("flat", slow_but((0, 2), 2))
-def test_three_noisy_touches_of_a_part_are_not_unlike_it(drawer, flat, scenes):
+def test_three_noisy_touches_of_an_object_are_not_unlike_it(drawer, flat, scenes):
     """Rigid and elastic gels in turn; some scenes of each part that has flats."""
     for scene in simultaneous_touches(drawer[flat].space, scenes, 3, 1):
         masks = [touch.mask for touch in scene.touches]
         assert not identify([drawer[flat]], masks, kind="mask", T_world_sensor=scene.T_world_sensor, seed=1).is_unknown
 
 
-def test_no_contact_tells_nothing(drawer):
+def test_no_contact_does_not_change_the_probabilities(drawer):
     found = identify(drawer, np.zeros((320, 427), bool), kind="mask", effort="fast")
     assert not found.posterior.contact and not found.is_unknown
     assert [c.probability for c in found.candidates] == pytest.approx([1 / 3] * 3)
 
 
-def test_a_part_that_no_pose_of_agrees_is_out(drawer, monkeypatch):
+def test_an_object_without_a_possible_pose_has_no_probability(drawer, monkeypatch):
     mask = touches(drawer[1])[0]
 
     def refuses(self, *args, **kwargs):
@@ -156,7 +156,7 @@ def test_weights_that_do_not_fit_are_refused(drawer, weights):
         identify([], None)
 
 
-def test_parts_by_a_folder_and_by_names(tmp_path):
+def test_objects_are_given_by_a_folder_or_by_names(tmp_path):
     assert parts_of(None) == [None] and parts_of("pin") == ["pin"] and parts_of("pin, head") == ["pin", "head"]
     meshes = Path(__file__).parents[1] / "meshes"
     assert "pin" in parts_of(str(meshes)) and len(parts_of(str(meshes))) == 10
@@ -174,7 +174,7 @@ def test_parts_by_a_folder_and_by_names(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_line_tells_the_part(drawer, tmp_path, monkeypatch):
+def test_the_command_line_identifies_the_object(drawer, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "parts").mkdir()
     for localizer in drawer[:2]:
@@ -193,7 +193,7 @@ def test_the_command_line_tells_the_part(drawer, tmp_path, monkeypatch):
 
 
 @pytest.mark.studies
-def test_the_study_tells_what_identify_does(drawer):
+def test_the_study_reports_the_figures_of_identify(drawer):
     told = list(identify_scenes(drawer[1], drawer, 2, 3, MODERATE, "fast", first=1))
     assert [[each.touches for each in some] for some in told] == [[1, 2, 3]]
     assert all(each.scene == 1 and set(each.log_probability) == {"rod", "ball", "block"} for each in told[0])
@@ -202,7 +202,7 @@ def test_the_study_tells_what_identify_does(drawer):
 
 
 @pytest.mark.studies
-def test_figures_of_the_study_follow_from_what_was_told():
+def test_figures_of_the_study_follow_from_its_records():
     def told(touches, a, b, unlike_a, unlike_b):
         logs = np.array([a, b]) - np.logaddexp(a, b)
         return Told(0, touches, dict(zip("ab", logs.tolist(), strict=True)), {"a": unlike_a, "b": unlike_b})

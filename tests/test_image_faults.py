@@ -50,7 +50,7 @@ def sets(data_folder):
     return {name: (read(background), [read(image) for image in images]) for name, (background, images) in found.items()}
 
 
-def test_no_real_reading_is_accused(sets):
+def test_no_real_tactile_image_is_suspected(sets):
     assert sum(len(images) for _, images in sets.values()) == 103
     for name, (background, images) in sets.items():
         assert [faults(image, background) for image in images] == [[]] * len(images), name
@@ -124,7 +124,7 @@ def test_a_square_image_that_is_turned_is_found(rng):
     assert "90 degrees to the right" in faults(np.rot90(image, -1), background)[0]
 
 
-def test_what_is_found_is_a_warning_of_the_reading(sets):
+def test_a_fault_is_a_warning_of_the_tactile_image(sets):
     background, images = sets["gelslam"]
     seen = read_observation(images[0][..., ::-1].copy(), "gelsight-mini", "reading", background)
     assert any("red and blue seem to be exchanged" in warning for warning in seen.warnings)

@@ -43,7 +43,7 @@ def test_an_error_sideways_or_down_needs_as_much_clearance_as_it_is_long_and_one
     assert fixture.clearance_needed(moved) == pytest.approx([0.7e-3, 0.7e-3, 0], abs=1e-4)
 
 
-def test_the_recess_is_what_the_part_sweeps_on_its_way_up(mesh, rng):
+def test_the_recess_is_the_volume_that_the_object_sweeps_upwards(mesh, rng):
     """Held against the least distance from the part of points all the way down, a tenth of a millimetre apart."""
     fixture, up = Fixture(mesh, 100), upwards(mesh)
     about = se3.transform(np.eye(3), mesh.centre)
@@ -57,7 +57,7 @@ def test_the_recess_is_what_the_part_sweeps_on_its_way_up(mesh, rng):
         assert swept - 1e-5 <= needed <= swept + 1e-4
 
 
-def test_a_turn_needs_more_clearance_the_farther_out_the_part_reaches(mesh):
+def test_a_turn_needs_more_clearance_the_larger_the_object(mesh):
     angles = np.array([0.002, 0.01, 0.05])
     turned = np.array([se3.exp([a, 0.5 * a, 0, 0, 0, 0]) for a in angles])
     about = se3.transform(np.eye(3), mesh.centre)
@@ -101,7 +101,7 @@ def test_a_grasp_is_between_surfaces_that_face_away_from_each_other(mesh):
     assert points[:, 2].min() < 0 < points[:, 2].max()
 
 
-def test_a_jaw_that_meets_nothing_says_so_from_where_it_is(nut):
+def test_a_jaw_that_meets_nothing_has_no_contact_and_stays(nut):
     far = se3.transform(np.eye(3), [1.0, 0, 0])
     felt = touch_with_jaw(ContactSpace(nut, SENSOR), far, np.eye(4), False, CLEAN, np.random.default_rng(0))
     assert np.array_equal(felt.T_world_sensor, [np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])])
@@ -114,7 +114,7 @@ def even(T, shares=None):
     return Believed(np.repeat(T, 100, axis=0), np.repeat(shares / 100, 100))
 
 
-def test_what_is_certain_is_placed_and_what_may_be_elsewhere_is_refused(nut):
+def test_a_certain_pose_is_placed_and_an_ambiguous_one_is_refused(nut):
     fixture = Fixture(nut, 100)
     here, there = np.eye(4), se3.transform(np.eye(3), [5e-3, 0, 0])
     assert all(decision.sure for decision in decide(even(here[None]), fixture, CLEARANCES))
@@ -123,7 +123,7 @@ def test_what_is_certain_is_placed_and_what_may_be_elsewhere_is_refused(nut):
     assert not any(decision.sure for decision in torn)
 
 
-def test_one_pose_that_alone_explains_what_was_felt_proves_nothing(nut):
+def test_one_pose_that_alone_explains_the_touches_proves_nothing(nut):
     alone = decide(Believed(np.eye(4)[None], np.ones(1)), Fixture(nut, 100), CLEARANCES)
     assert [decision.probability for decision in alone] == [0.5] * len(CLEARANCES)
 

@@ -35,7 +35,7 @@ def stored_cones(n, rng):
     return index, masks, needed
 
 
-def test_it_is_what_adding_up_pixels_gives(rng):
+def test_it_equals_the_sum_over_pixels(rng):
     index, masks, _ = stored_cones(9, rng)
     seen = masks[2, 4]
     score = PixelLikelihood().score(index, seen)
@@ -90,7 +90,7 @@ def test_a_cast_at_the_true_pose_is_more_likely_than_beside_it(plug, rng, elasti
 
 
 @pytest.mark.slow
-def test_on_a_fine_grid_it_tells_where_the_part_is(make_localizer):
+def test_a_fine_grid_localizes_the_object(make_localizer):
     """One exact face, so that a cell is a few millimetres wide: more than the thesis's pixel distance tells."""
     face = [((0, 0, 1), 0.0)]
     gain = {}

@@ -32,7 +32,7 @@ def localizer(tmp_path_factory):
     return Localizer.prepare(mesh, sensor=MINI, max_poses=1500, scorer="iou", cache_dir=tmp_path_factory.mktemp("c"))
 
 
-def test_the_newest_wins_and_what_came_meanwhile_is_counted():
+def test_the_newest_image_wins_and_skipped_ones_are_counted():
     """A source of 40 images, of which 9 come while the first is worked on, and 20 more while the next one is."""
     may_read, has_read, numbers = threading.Semaphore(1), threading.Semaphore(0), count()
 
@@ -113,7 +113,7 @@ def test_a_folder_that_fills_faster_than_it_is_looked_at_is_not_waited_for(tmp_p
     assert numbers == sorted(set(numbers)) and numbers[-1] < 60
 
 
-def test_a_camera_that_is_not_there_is_told():
+def test_a_missing_camera_is_an_error():
     for open_it in (camera_frames, all_frames):
         with pytest.raises(InputError, match="camera 97: cannot be opened"):
             open_it("97")

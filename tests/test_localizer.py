@@ -34,7 +34,7 @@ def pressed(localizer, T):
 # --- what comes out
 
 
-def test_a_press_at_a_known_pose_is_more_probable_than_chance(localizer, a_touch):
+def test_a_press_at_the_true_pose_is_more_probable_than_chance(localizer, a_touch):
     T, mask = a_touch(localizer)
     posterior = localizer.localize(mask)
     assert posterior.entropy_nats < -0.3
@@ -43,7 +43,7 @@ def test_a_press_at_a_known_pose_is_more_probable_than_chance(localizer, a_touch
         assert posterior.credible_level(T) < 0.95
 
 
-def test_the_nut_on_its_flat_is_found_by_its_hole(flat_nut, uniform_poses):
+def test_the_nut_on_its_flat_is_localized_by_its_hole(flat_nut, uniform_poses):
     """With the face known, x, y and depth of a nut pressed over the window are told by one mask."""
     T, _ = uniform_poses(flat_nut)
     area = np.array([pressed(flat_nut, pose).sum() for pose in T[:80]])
@@ -69,7 +69,7 @@ def test_the_first_modes_predict_the_contact_that_is_seen(name, request, uniform
     assert first > 0.75 and best > 0.8
 
 
-def test_what_was_assumed_in_reading_the_mesh_comes_with_every_posterior(ball, a_touch):
+def test_assumptions_made_in_loading_the_mesh_come_with_every_posterior(ball, a_touch):
     mesh = replace(ball.mesh, warnings=("ball.stl: 37 bytes after the last triangle are passed over",))
     doubtful = replace(ball, index=replace(ball.index, mesh=mesh))
     for mask in (a_touch(ball)[1], np.zeros(ball.sensor.image_size_px[::-1], bool)):
@@ -88,7 +88,7 @@ def test_the_same_seed_gives_the_same_result(localizer, a_touch):
     assert (third.log_prob == one.log_prob).all() and third.credible_level(T) != one.credible_level(T)
 
 
-def test_efforts_differ_in_resolution_and_in_what_is_refined(curved, a_touch):
+def test_efforts_differ_in_resolution_and_in_refinement(curved, a_touch):
     T, mask = a_touch(curved)
     fast, balanced, exact = (curved.localize(mask, effort=e) for e in ("fast", "balanced", "exact"))
     held = curved.index.mass(*curved.index.coarse_runs) > 0  # some blocks are ruled out as a whole
@@ -101,7 +101,7 @@ def test_efforts_differ_in_resolution_and_in_what_is_refined(curved, a_touch):
         curved.localize(mask, effort="quick")
 
 
-def test_settings_and_times_say_how_it_came_about(plug, a_touch):
+def test_settings_and_times_are_recorded(plug, a_touch):
     posterior = plug.localize(a_touch(plug)[1], seed=9)
     assert posterior.settings["seed"] == posterior.seed == 9
     assert posterior.settings["poses"] == len(plug.index) and posterior.settings["kind"] == "mask"
@@ -109,7 +109,7 @@ def test_settings_and_times_say_how_it_came_about(plug, a_touch):
     assert posterior.observation.contact.mask.any() and posterior.warnings == []
 
 
-def test_a_contact_unlike_any_touch_is_warned_of(ball):
+def test_an_outlier_contact_is_a_warning(ball):
     """A ball never makes a frame along the border of the window."""
     mask = np.zeros(ball.sensor.image_size_px[::-1], bool)
     mask[:12], mask[-12:], mask[:, :12], mask[:, -12:] = True, True, True, True
@@ -141,7 +141,7 @@ def test_simulate_is_the_exact_cast(plug, a_touch):
 # --- evidence
 
 
-def test_the_evidence_prefers_the_part_that_was_pressed(make_localizer, ball, flat_nut, curved_sensor, uniform_poses):
+def test_the_evidence_prefers_the_object_that_was_pressed(make_localizer, ball, flat_nut, curved_sensor, uniform_poses):
     T, _ = uniform_poses(flat_nut)
     area = [pressed(flat_nut, pose).sum() for pose in T[:80]]
     nut_mask = pressed(flat_nut, T[int(np.argmax(area))])
@@ -225,7 +225,7 @@ def test_weighted_poses_as_prior_gather_the_mass(localizer, a_touch, uniform_pos
     assert distance.mean(best.T, own).min() <= radius
 
 
-def test_a_gaussian_prior_is_where_it_says(localizer, uniform_poses):
+def test_a_gaussian_prior_lies_about_its_mean(localizer, uniform_poses):
     index, T = localizer.index, uniform_poses(localizer)[0][0]
     T_world_sensor = exp([0.3, -0.2, 0.5, 0.1, 0.2, 0.3])
     narrow = GaussianPrior(T_world_sensor @ T, 1e-8 * np.eye(6))
@@ -242,7 +242,7 @@ def test_a_gaussian_prior_is_where_it_says(localizer, uniform_poses):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("std", [0.02, 0.1, 0.5])
-def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_poses, std):
+def test_a_gaussian_prior_has_the_cells_of_its_samples(plug, uniform_poses, std):
     """Of what touches, by the exact caster; from narrower than a cell, where heights within it differ by more, to far wider.
     The total variation is bounded, draws included."""
     apart = {0.02: 0.1, 0.1: 0.2, 0.5: 1.0}[std]
@@ -262,7 +262,7 @@ def test_a_gaussian_prior_has_the_cells_that_hold_what_it_draws(plug, uniform_po
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["curved", "flat_nut"])
-def test_a_prior_outlives_a_sensor_that_feels_nothing_whichever_image_it_names(name, request, uniform_poses):
+def test_a_prior_outlives_a_sensor_without_contact_whichever_image_it_names(name, request, uniform_poses):
     """A sensor far away feels nothing: what it tells is the prior, the same of every image of a pose, and as a prior for another
     sensor it says what the prior itself says there."""
     localizer = request.getfixturevalue(name)
@@ -281,7 +281,7 @@ def test_a_prior_outlives_a_sensor_that_feels_nothing_whichever_image_it_names(n
         assert here == pytest.approx(prior_log_mass(localizer.index, prior, T_WORLD, "world"), abs=1e-4)
 
 
-def test_a_prior_that_cannot_be_is_refused_and_one_that_the_image_contradicts_is_often_told(plug, uniform_poses):
+def test_an_impossible_prior_is_refused_and_a_contradicted_one_is_mostly_a_warning(plug, uniform_poses):
     """About the true pose nothing is said; about those of far larger or smaller contacts, in a third of the cases at least."""
     T = uniform_poses(plug)[0][:60]
     masks = [plug.simulate(pose).mask for pose in T]
@@ -305,7 +305,7 @@ def test_a_prior_that_cannot_be_is_refused_and_one_that_the_image_contradicts_is
 
 
 @pytest.mark.parametrize("width", [0.3, 0.8, 2.0, 6.0])
-def test_a_gaussian_prior_is_the_density_of_what_it_draws(rng, width):
+def test_a_gaussian_prior_is_the_density_of_its_samples(rng, width):
     """What is drawn is turned as far, in the mean, as its density over evenly drawn poses says; and the wider, the more."""
     prior = GaussianPrior(np.eye(4), np.diag([width**2] * 3 + [1.0] * 3))
     even = transform(random_rotations(300_000, rng), rng.uniform(-3.5, 3.5, (300_000, 3)))
@@ -318,7 +318,7 @@ def test_a_gaussian_prior_is_the_density_of_what_it_draws(rng, width):
 
 
 @pytest.mark.parametrize("covariance", [np.eye(3), np.zeros((6, 6)), np.arange(36).reshape(6, 6)])
-def test_what_is_no_covariance_is_told(covariance):
+def test_a_matrix_that_is_no_covariance_is_refused(covariance):
     with pytest.raises(InputError, match="positive definite covariance"):
         GaussianPrior(np.eye(4), covariance)
 
@@ -332,7 +332,7 @@ def test_poses_that_do_not_touch_carry_no_prior(ball, a_touch):
         ball.localize(mask, prior=(away[None], [0.0]))
 
 
-def test_a_prior_in_the_world_frame_says_the_same(plug, a_touch):
+def test_a_prior_in_the_world_frame_is_the_same_prior(plug, a_touch):
     T_true, mask = a_touch(plug)
     here = plug.localize(mask, prior=lambda T: -1e4 * ((T - T_true)[:, :3, 3] ** 2).sum(1), effort="fast")
     there = plug.localize(
@@ -382,7 +382,7 @@ def test_a_prior_that_makes_no_sense_is_refused(ball, a_touch, prior, error, mes
     assert "\n" not in str(caught.value)
 
 
-def test_what_a_mode_tells_is_a_prior(localizer, a_touch):
+def test_a_mode_is_a_prior(localizer, a_touch):
     """Of a ball, too, whose turns tell nothing."""
     mode = localizer.localize(a_touch(localizer)[1]).modes(1)[0]
     prior = GaussianPrior(mode.T, mode.covariance)
@@ -507,7 +507,7 @@ def test_probabilities_come_true(plug):
         assert low - 0.1 <= share <= high + 0.1, (nominal, share)
 
 
-def test_every_image_has_a_pose_of_its_own(plug, a_touch):
+def test_every_image_has_its_own_pose(plug, a_touch):
     mask = a_touch(plug)[1]
     with pytest.raises(UsageError, match="2 images need T_world_sensor"):
         plug.localize([mask, mask])
@@ -517,7 +517,7 @@ def test_every_image_has_a_pose_of_its_own(plug, a_touch):
         plug.localize(mask, T_world_sensor=np.full((4, 4), np.nan))
 
 
-def test_prepare_reads_what_it_wrote(ball, cache_dir, monkeypatch):
+def test_prepare_loads_its_own_files(ball, cache_dir, monkeypatch):
     monkeypatch.setattr("geomtact.scoring.fitted.simulate_touches", lambda *_, **__: pytest.fail("fitted again"))
     monkeypatch.setattr("geomtact.contact_space.store.build", lambda *_, **__: pytest.fail("built again"))
     again = Localizer.prepare("ball", sensor="gelsight-mini", max_poses=20_000, cache_dir=cache_dir)
@@ -526,7 +526,7 @@ def test_prepare_reads_what_it_wrote(ball, cache_dir, monkeypatch):
 
 
 @pytest.mark.parametrize("name", slow_but(["curved", "flat_nut"], "flat_nut"))
-def test_a_prior_about_any_symmetric_image_says_the_same(name, request, a_touch):
+def test_a_prior_about_any_symmetric_image_is_the_same_prior(name, request, a_touch):
     """Twelve turns of a nut are one pose: a camera that reports any of them knows as much."""
     localizer = request.getfixturevalue(name)
     T_true, mask = a_touch(localizer)
@@ -591,7 +591,7 @@ def test_a_uniform_prior_of_another_grid_rules_nothing_out(plug, cache_dir):
     assert np.abs(mass - plug.index.log_weight)[held].max() < 0.01
 
 
-def test_a_prior_of_a_finer_grid_keeps_what_it_has_in_each_place(plug, cache_dir, rng):
+def test_a_prior_of_a_finer_grid_keeps_its_mass_in_each_place(plug, cache_dir, rng):
     """Of a few narrow peaks, also where a coarse cell's own pose meets some of them and misses the rest."""
     coarse, fine = open_index(plug.mesh, plug.sensor, None, 6_000, cache_dir, None), plug.index
     middle = np.array(coarse.resolution.penetrations)
@@ -605,7 +605,7 @@ def test_a_prior_of_a_finer_grid_keeps_what_it_has_in_each_place(plug, cache_dir
     assert mass.sum() == pytest.approx(1, abs=1e-5) and np.abs(mass - expected).sum() / 2 < 0.2
 
 
-def test_a_prior_of_a_known_face_is_told_about_that_face_on_a_coarser_grid_and_back(plug, cache_dir, rng):
+def test_a_prior_of_a_known_contact_face_moves_to_a_coarser_grid_and_back(plug, cache_dir, rng):
     face = open_index(plug.mesh, plug.sensor, [((0, 0, 1), 0.0)], 6_000, cache_dir, None)
     everywhere, there = (Posterior(each, each.possible, each.log_possible_weight) for each in (plug.index, face))
     mass = np.exp(prior_log_mass(plug.index, there, np.eye(4), "sensor").astype(float))

@@ -138,7 +138,7 @@ def test_training_goes_on_from_weights_that_are_given(parts, tmp_path):
         read_weights(tmp_path / "none.safetensors")
 
 
-def test_what_is_written_says_what_it_was_made_of(tmp_path):
+def test_a_written_file_records_its_inputs(tmp_path):
     network = MaskNetwork().eval()
     path = tmp_path / "mask.safetensors"
     write_mask_network(path, network, {"step": []}, Settings(), 12)
@@ -148,7 +148,7 @@ def test_what_is_written_says_what_it_was_made_of(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_network_that_comes_along_knows_presses_it_never_saw():
+def test_the_bundled_network_segments_unseen_presses():
     """Its own parts have other seeds; of simulated readings it is right about most of the contact."""
     from geomtact.sensing.mask_network import _network
 
@@ -158,7 +158,7 @@ def test_the_network_that_comes_along_knows_presses_it_never_saw():
     assert validate(_network(), sights, contact) > 0.75
 
 
-def test_what_trembles_from_pixel_to_pixel_is_smoothed(monkeypatch, rng):
+def test_noise_from_pixel_to_pixel_is_smoothed(monkeypatch, rng):
     """A shape is left as it is but for a share of a pixel; single pixels beside it or in it are not."""
     rows, columns = np.mgrid[:60, :80]
     shape = 4.0 * np.clip(15 - np.hypot(rows - 30, columns - 40), -1, 1).astype(np.float32)
@@ -201,7 +201,7 @@ def test_images_of_any_shape_get_a_probability_at_each_pixel(shape, rng):
     assert min(seen(change, image).shape[1:]) == 60 and len(seen(change, image)) == CHANNELS
 
 
-def test_the_sensor_says_how_contact_is_found_and_probabilities_reach_the_localizer(data_folder):
+def test_the_sensor_chooses_the_contact_method_and_probabilities_reach_the_localizer(data_folder):
     folder = data_folder / "gelslam_gsmini_balls"
     image, background = (read_image(folder / name) for name in ("6.310mm/40.png", "background.png"))
     plain = Sensor.load("gelsight-mini")
@@ -214,7 +214,7 @@ def test_the_sensor_says_how_contact_is_found_and_probabilities_reach_the_locali
 
 
 @pytest.mark.slow
-def test_by_itself_the_network_is_asked_where_light_is_blown_out_and_colours_tell_slopes(data_folder):
+def test_by_default_the_network_segments_where_light_saturates_and_colours_show_slopes(data_folder):
     """On the gels of FOTS and ObjectFolder one channel is blown out beside every ball, on the GelSight Mini none ever is."""
     for name, some in imprints(data_folder).items():
         for number, drawn in enumerate(some):
@@ -241,7 +241,7 @@ def test_by_itself_the_network_is_asked_where_light_is_blown_out_and_colours_tel
         assert find_contact(*(np.repeat(each[..., 1:2], 3, -1) for each in (lit, rest))).method == "classical"
 
 
-def test_the_way_that_found_the_contact_is_written_down(data_folder):
+def test_the_contact_method_is_recorded(data_folder):
     drawn = imprints(data_folder)["fots"][0]
     height, width = drawn.image.shape[:2]
     plain = replace(Sensor.load("gelsight-mini"), image_size_px=(width, height))
@@ -274,7 +274,7 @@ def test_overlap_and_centre_are_those_of_the_circle_made_smaller(rng):
     assert off_centre(np.zeros((120, 160), bool), (80, 60, 20)) == np.inf
 
 
-def test_the_factor_of_a_half_is_judged_on_the_other():
+def test_the_factor_of_one_half_is_evaluated_on_the_other():
     """Contacts of even images fill 1 / 1.3 of the imprint, of odd ones 1 / 1.5: each is judged with the other's factor."""
     image = np.zeros((120, 160, 3), np.uint8)
     drawn = [Imprint(f"{i}", np.full_like(image, i), image, (80.0, 60.0, 36.0)) for i in range(8)]
@@ -285,7 +285,7 @@ def test_the_factor_of_a_half_is_judged_on_the_other():
     assert figures["iou_interval"][0] <= figures["iou_median"] <= figures["iou_interval"][1]
 
 
-def test_the_baseline_takes_the_largest_of_what_differs(rng):
+def test_the_baseline_takes_the_largest_changed_region(rng):
     background = rng.integers(100, 110, (120, 160, 3)).astype(np.uint8)
     image = background.copy()
     image[disk(50, 50, 15)] += 60
@@ -304,6 +304,6 @@ def test_real_imprints_are_read_and_ours_is_nearer_than_the_baseline(data_folder
         assert max(f.centre for f in ours) < 0.03
 
 
-def test_a_folder_without_readings_is_refused(tmp_path):
+def test_a_folder_without_tactile_images_is_refused(tmp_path):
     run = CliRunner().invoke(studies, ["readings", str(tmp_path)])
     assert run.exit_code == 3 and "expected fots_balls and objectfolder_gelsight_calib in it" in run.output

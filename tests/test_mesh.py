@@ -48,7 +48,7 @@ def test_a_face_keeps_its_outside(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["bracket", "gear", "pin"])
-def test_mm_stl_and_metre_glb_of_one_part_are_one_mesh(tmp_path, name):
+def test_mm_stl_and_metre_glb_of_one_object_are_one_mesh(tmp_path, name):
     original = load_mesh(name)
     raw = trimesh.load_mesh(str(original.path), process=False)
     raw.apply_scale(1e-3)
@@ -248,7 +248,7 @@ def test_points_nan_and_open_surfaces(tmp_path):
     refused("no volume", save(sheet, tmp_path / "sheet.ply"), "mm")
 
 
-def test_a_file_that_was_cut_short_says_so(tmp_path):
+def test_a_truncated_file_is_named_as_such(tmp_path):
     whole = save(box(), tmp_path / "whole.stl").read_bytes()
     cut = tmp_path / "cut.stl"
     cut.write_bytes(whole[: 84 + 50 * 5])
@@ -285,7 +285,7 @@ def test_a_unit_1000_times_wrong_is_refused_and_the_right_one_is_not(tmp_path, s
         (1e30, "more than 1,000,000,000"),
     ],
 )
-def test_sizes_are_told_in_millimetres_without_exponents(tmp_path, scale, size):
+def test_sizes_are_printed_in_millimetres_without_exponents(tmp_path, scale, size):
     with pytest.raises(MeshError, match=size) as caught:
         load_mesh(save(box(offset=(0, 0, 0)).apply_scale(scale), tmp_path / "a.ply"), "mm")
     assert "expected 0.1 mm to 1,000,000 mm" in str(caught.value)
@@ -324,7 +324,7 @@ def test_dirty_files_raise_mesh_errors_only(data_folder):
         ("meshes_trimesh/clean/[a-r]*.STL", "inch"),
     ],
 )
-def test_real_parts_load(data_folder, pattern, unit):
+def test_real_objects_load(data_folder, pattern, unit):
     paths = sorted(data_folder.glob(pattern))
     assert paths
     for path in paths:

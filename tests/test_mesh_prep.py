@@ -79,7 +79,7 @@ def here(command, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["bracket", "gear", "pin"])
-def test_a_sound_part_is_kept_to_the_last_bit(name, tmp_path):
+def test_a_sound_mesh_is_kept_to_the_last_bit(name, tmp_path):
     before, unit = read(ROOT / "meshes" / f"{name}.stl", "mm", Sensor.load("gelslim"))
     work = repair(before, options(before))
     assert unit == "mm" and not work.changes and not work.holes
@@ -113,7 +113,7 @@ def test_shuffled_repeated_turned_and_torn_apart_it_comes_back(seed, turned, rep
     assert sound(work.surface, tmp_path).sha256 == load_mesh(path, "mm").sha256
 
 
-def test_a_hole_is_filled_and_told_or_refused_where_it_is():
+def test_a_hole_is_filled_and_reported_or_refused_with_its_position():
     ball = trimesh.creation.icosphere(4, 10.0)
     gone = np.linalg.norm(ball.triangles_center - [0, 0, 10.0], axis=1) < 0.9
     holed = as_surface(ball).with_faces(as_surface(ball).faces[~gone]).tidied()
@@ -220,7 +220,7 @@ def test_a_cavity_stays_one_however_the_file_is_wound(rng, tmp_path):
         sound(work.surface, tmp_path)
 
 
-def test_what_only_lies_within_anothers_bounds_is_no_cavity(tmp_path):
+def test_a_body_only_within_anothers_bounds_is_no_cavity(tmp_path):
     slug = box((4, 4, 3), (1, 0, 0), inwards=True)
     ring = trimesh.creation.annulus(10, 15, 6)
     surface = as_surface(trimesh.util.concatenate([ring, slug]))
@@ -263,7 +263,7 @@ def test_boxes_that_share_a_face_are_one_solid_or_two(size, where, volume, tmp_p
     ("faces", "words"),
     [([[0, 1, 2], [0, 2, 1]], "enclose nothing"), ([[0, 1, 3], [1, 0, 3]], "enclose nothing|no face has any area")],
 )
-def test_what_encloses_nothing_is_refused(faces, words):
+def test_a_surface_that_encloses_nothing_is_refused(faces, words):
     vertices = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [5, 0, 0]])
     nothing = Surface(vertices, np.array(faces))
     with pytest.raises(Refused, match=words):
@@ -315,7 +315,7 @@ def apart(a, b, mask):
 
 
 @pytest.mark.slow
-def test_the_same_part_in_any_format_and_unit_is_localized_alike(few_touches, tmp_path, rng):
+def test_the_same_object_in_any_format_and_unit_has_the_same_posterior(few_touches, tmp_path, rng):
     part = load_mesh("bracket")
     for file, scale in {"mm.stl": 1e3, "metre.glb": 1.0, "inch.obj": 1 / 25.4e-3}.items():
         trimesh.Trimesh(scale * part.vertices, part.faces, process=False).export(tmp_path / file)
@@ -357,7 +357,7 @@ def test_a_curved_step_file_is_localized_within_its_tessellation(few_touches, tm
         ("a.obj", b"v 0 0 0\nv 10 0 0\nv 0 10 0\nf 1 2 3\n", "auto", "likely: 14.1 mm across in mm.*Give --unit"),
     ],
 )
-def test_what_cannot_be_read_is_said(name, content, unit, words, tmp_path):
+def test_an_unreadable_mesh_is_named(name, content, unit, words, tmp_path):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(Refused, match=words):
         read(tmp_path / name, unit, Sensor.load("gelslim"))
@@ -467,7 +467,7 @@ def test_a_spike_without_area_is_no_deviation(tmp_path):
     assert prove(surface, repair(surface, options(surface))).largest < 1e-4
 
 
-def test_a_file_of_folded_triangles_is_refused_and_a_warning_is_told(here, tmp_path):
+def test_a_file_of_folded_triangles_is_refused_and_a_warning_is_printed(here, tmp_path):
     ring = [(x, y, z) for z in (0.0, 6.0) for x, y in L_SHAPE]
     faces = [(0, k + 1, k) for k in range(1, 5)] + [(6, 6 + k, 7 + k) for k in range(1, 5)]
     faces = [tuple((c + 1) % 6 + 6 * (c // 6) for c in face) for face in faces]
@@ -508,7 +508,7 @@ def inch_box():
     return out.getvalue()
 
 
-def test_the_unit_of_a_file_goes_with_what_is_made_of_it(here, inch_box, tmp_path):
+def test_the_unit_of_a_file_is_kept_in_its_copies(here, inch_box, tmp_path):
     (tmp_path / "part.3mf").write_bytes(inch_box)
     done = here(tmp_path / "part.3mf", "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
@@ -546,7 +546,7 @@ def test_nothing_is_written_over_the_input(command, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_folder_gets_a_table_and_what_is_refused_leaves_nothing(command, tmp_path):
+def test_a_folder_gets_a_table_and_refused_meshes_leave_nothing(command, tmp_path):
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     BOX.export(folder / "box.stl")
@@ -573,7 +573,7 @@ def test_a_mesh_that_takes_too_long_is_given_up(command, tmp_path, monkeypatch):
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_a_part_of_a_catalogue_goes_by_its_name(here, tmp_path, monkeypatch):
+def test_an_object_of_a_catalogue_is_given_by_its_name(here, tmp_path, monkeypatch):
     BOX.export(tmp_path / "crate.stl")
     folder = tmp_path / "parts"
     done = here(tmp_path / "crate.stl", "--unit", "mm", "--out", tmp_path / "out", "--add-to", folder)

@@ -30,7 +30,7 @@ def two_patches(localizer):
     return mask | left | right, [left, right]
 
 
-def test_patches_are_the_mask_in_parts_the_largest_first(rng):
+def test_patches_are_the_components_of_the_mask_largest_first(rng):
     mask = rng.random((90, 120)) > 0.55
     pixel_area = 0.3e-6 / 7.5  # eight pixels count, seven do not
     found = patches(mask, pixel_area)
@@ -51,7 +51,7 @@ def test_patches_keep_their_probabilities(localizer):
         assert each.dtype == np.float32
 
 
-def test_one_patch_is_taken_as_it_is(localizer):
+def test_one_patch_is_left_unchanged(localizer):
     mask, (left, right) = two_patches(localizer)
     dirt = left.copy()
     dirt[:2, :2] = True
@@ -119,7 +119,7 @@ def fit(request, localizer, contact):
     )
 
 
-def test_blocks_are_told_by_the_mixture(localizer, fit, contact):
+def test_coarse_cells_are_scored_by_the_mixture(localizer, fit, contact):
     index, cascade = localizer.index, fit.cascade
     mask, parts, shares = contact
     rows = fit.rows(index, mask, "coarse")
@@ -129,7 +129,7 @@ def test_blocks_are_told_by_the_mixture(localizer, fit, contact):
     assert said == pytest.approx(mixture(shares, scores, weight, cascade.coarse.temperature), rel=1e-3)
 
 
-def test_blocks_are_opened_by_the_mixture_and_their_cells_told_by_it(localizer, fit, contact):
+def test_coarse_cells_are_opened_and_their_cells_scored_by_the_mixture(localizer, fit, contact):
     """Those that stay whole count in it as blocks."""
     index, cascade = localizer.index, fit.cascade
     mask, parts, shares = contact
@@ -157,7 +157,7 @@ def test_blocks_are_opened_by_the_mixture_and_their_cells_told_by_it(localizer, 
 
 
 @pytest.mark.parametrize("above", [0.0, 0.7 * MM])
-def test_cells_are_told_by_the_mixture(localizer, fit, contact, above):
+def test_cells_are_scored_by_the_mixture(localizer, fit, contact, above):
     """Of contour lines too: each patch belongs to as much deeper poses."""
     index = localizer.index
     mask, parts, shares = contact

@@ -167,7 +167,7 @@ def test_steady_light_is_left_as_it_is(real, simulated):
             assert without_flicker(unit(image), smooth_background(unit(image)), estimated=True).stripes == 0
 
 
-def test_flickering_light_is_a_warning_of_the_reading(real):
+def test_flickering_light_is_a_warning_of_the_tactile_image(real):
     rest, images = real["gelslam"]
     image = striped(images[0], 0.05, bands=5, phase=1)
     seen = read_observation(image, "gelsight-mini", "reading", rest)
@@ -208,7 +208,7 @@ def test_a_mounted_camera_shows_the_same_contact(simulated, mounting, tmp_path):
         assert observed.warnings == []
 
 
-def test_masks_are_in_the_sensor_frame_unless_the_sensor_says_otherwise(simulated, tmp_path):
+def test_masks_are_in_the_sensor_frame_unless_the_sensor_file_states_another(simulated, tmp_path):
     sensor = mounted("gelsight-mini", 180, True)
     mask = contact_mask(*simulated[0], "gelsight-mini")
     assert np.array_equal(read_observation(mask, sensor).contact.mask, mask)
@@ -227,7 +227,7 @@ def test_masks_are_in_the_sensor_frame_unless_the_sensor_says_otherwise(simulate
     assert read_observation(tmp_path / "made.png", "gelsight-mini").warnings == []
 
 
-def test_a_turn_that_is_none_is_refused():
+def test_an_invalid_turn_is_refused():
     text = Sensor.load("gelsight-mini").to_toml()
     for line, what in (("camera_rotation_deg = 45", "0, 90, 180 or 270"), ('camera_mirrored = "no"', "true or false")):
         with pytest.raises(SensorError, match=what):
@@ -238,7 +238,7 @@ def test_a_turn_that_is_none_is_refused():
         )
 
 
-def test_what_a_digit_delivers_is_turned_as_its_driver_does(real):
+def test_images_of_a_digit_are_turned_as_by_its_driver(real):
     """digit_interface transposes a frame, then flips it top to bottom: a quarter turn counter-clockwise."""
     rest, images = real["digit"]
     sensor = Sensor.load("digit")

@@ -118,7 +118,7 @@ def test_equal_outcomes_are_equally_likely_everywhere(rng):
     assert information(likelihood) == pytest.approx(0, abs=1e-12)
 
 
-def test_what_varies_within_places_tells_nothing(rng):
+def test_variation_within_places_is_no_information(rng):
     """The same spread within every place as between them: to the naive all differ, but no place is told by it."""
     shown = rng.normal(size=(5, 100, 3))
     noise = np.full(3, 1e-3)
@@ -130,7 +130,7 @@ def test_what_varies_within_places_tells_nothing(rng):
 # Touches and probes of a block
 
 
-def test_an_action_that_tells_two_places_apart_is_worth_log_2(block):
+def test_an_action_that_distinguishes_two_places_is_worth_log_2(block):
     """Moved by 8 mm along its length, the block looks the same in the middle and not at its end."""
     poses = shifts([0, 0, 0], [8, 0, 0])
     assert evaluate(block, above(0), poses).expected_nats == pytest.approx(0, abs=1e-6)
@@ -142,7 +142,7 @@ def test_an_action_that_tells_two_places_apart_is_worth_log_2(block):
     assert evaluate(block, from_the_side, poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
 
 
-def test_a_probe_tells_occupied_from_free(block):
+def test_a_probe_distinguishes_occupied_from_free(block):
     poses = shifts([0, 0, 0], [8, 0, 0])
     inside = Probe([24 * MM, 0, 0], [0, 0, -1])
     assert evaluate(block, inside, poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
@@ -171,7 +171,7 @@ def test_a_sensor_stops_where_the_object_presses(block):
     assert above(40).reached(block, T, pressed)[0, 2, 3] == pytest.approx(-50 * MM)  # beside the block
 
 
-def test_a_sensor_merely_placed_feels_what_is_there(block):
+def test_a_placed_sensor_touches_the_object_there(block):
     poses = shifts([0, 0, -0.5], [0, 0, 0.5])  # tops at 4.5 and 5.5 mm
     assert evaluate(block, above(0, z_mm=5, travel=0.0), poses).contact == 0.5
     assert evaluate(block, above(0, z_mm=5, travel=0.0), poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
@@ -195,7 +195,7 @@ def test_a_housing_that_strikes_first_shows_nothing(block):
 # The thesis's pencil (figures 16 and 17)
 
 
-def test_the_pencil_is_told_at_its_ends(pencil):
+def test_the_pencil_is_constrained_at_its_ends(pencil):
     """Held at a place where it looks the same all along, a pencil may be shifted, and either way round."""
     there = [transform(np.eye(3), [x * MM, 0, 0]) for x in (-6, -2, 2, 6)]
     turned = [T @ transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) for T in there]
@@ -425,7 +425,7 @@ def test_command_ranks_the_actions_of_a_file(command, saved, tmp_path):
     assert (out / "next_touch.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_command_says_when_nothing_helps(command, saved, tmp_path):
+def test_the_command_prints_that_no_action_helps(command, saved, tmp_path):
     file = tmp_path / "actions.json"
     file.write_text(json.dumps({"actions": [{"T_world_sensor": transform(np.eye(3), [3.0, 0, 0]).tolist()}]}))
     content = json.loads(command(saved, "--actions", file, "--json").stdout)
@@ -456,7 +456,7 @@ def test_command_refuses_bad_files(command, saved, tmp_path, text, told):
     assert "actions.json" in error
 
 
-def test_command_refuses_what_is_no_posterior_or_has_no_contact(command, plug, tmp_path):
+def test_the_command_refuses_a_file_without_a_posterior_or_contact(command, plug, tmp_path):
     assert "no such file" in command(tmp_path / "nowhere.npz", status=3).stderr
     nothing = tmp_path / "nothing.npz"
     plug.localize(np.zeros(plug.sensor.image_size_px[::-1], bool)).save(nothing)
@@ -493,7 +493,7 @@ def test_figures_of_runs_made_by_hand():
 
 
 @pytest.mark.parametrize("part", ["connector_plug", "bracket"])
-def test_a_part_lies_on_its_lowest_side(part):
+def test_an_object_lies_on_its_lowest_face(part):
     mesh = load_mesh(part)
     up = upwards(mesh)
     assert np.linalg.norm(up) == pytest.approx(1)

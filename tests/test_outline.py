@@ -76,7 +76,7 @@ def test_a_wall_is_halfway_between_the_rays_that_meet_it_and_those_that_miss_it(
     assert logs.argmax() == 2 and logs[2] > -2.5 and (logs[[0, 4]] < logs[2] - 3).all()
 
 
-def test_what_is_far_off_costs_by_its_length_alone():
+def test_a_distant_outline_costs_by_its_length_alone():
     """A piece of outline that nothing explains, or that nothing shows, is as bad at 3 mm as at 9."""
     speck = np.pi * 2 * MM
     for at in (8.5 * MM, 11 * MM):
@@ -94,7 +94,7 @@ def test_no_touch_is_impossible_and_a_full_window_has_no_outline():
     assert likelihood(full, cone()) < -1
 
 
-def test_a_trembling_outline_is_as_likely_as_its_strength_says(rng):
+def test_a_noisy_outline_is_as_likely_as_its_amplitude(rng):
     """Noise of 0.2 mm costs half a nat for each length over which it is alike, as Gaussian noise does."""
     costs = []
     for _ in range(40):
@@ -146,7 +146,7 @@ def test_a_search_ends_at_likelier_poses_near_by(plug, rng, elastic):
     assert np.linalg.norm(found[0, :2, 3] - true[:2, 3]) < 0.5 * MM
 
 
-def test_the_solved_gel_is_likelier_than_a_rigid_one_where_it_was_felt(plug, rng):
+def test_the_elastic_gel_is_likelier_than_the_rigid_one_on_elastic_touches(plug, rng):
     space = plug.space
     T, _ = space.sample(40, rng, (0.8 * MM, 1.4 * MM))
     more = []
@@ -165,7 +165,7 @@ def upright(make_localizer):
 
 
 @pytest.mark.slow
-def test_of_a_known_side_outlines_tell_more_than_the_grid(upright):
+def test_outlines_add_information_to_the_grid_on_a_known_contact_face(upright):
     """In the mean of touches without noise, rigid and elastic gels in turn; with noise, see docs/no-more-than-needed.md.
 
     The search hangs on last digits: between two processors it changes one touch by 1 nat rms, so the mean of 8 by 0.35. The

@@ -28,7 +28,7 @@ COMPARED = PAGES[:2]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", COMPARED, ids=lambda page: page.name)
-def test_a_page_prints_what_its_commands_give(page, folder):
+def test_a_page_prints_the_output_of_its_commands(page, folder):
     for shown in shown_on(page):
         given = run(shown.words, folder)
         assert agree(shown.output, given), f"{page.name}: {shown.words}; run python -m tools.page_outputs\n{given}"
@@ -56,12 +56,12 @@ def test_outputs_agree_but_for_the_last_digits_and_times(old, new, same):
     assert agree(SAID, SAID.replace(old, new)) is same
 
 
-def test_lines_left_out_stand_for_any():
+def test_an_ellipsis_matches_any_lines():
     assert agree("...\n8,389 of 1,237,368 poses, in 1 s", SAID)
     assert not agree("...\n8,389 of 9 poses, in 1 s", SAID)
 
 
-def test_a_page_is_filled_with_what_is_printed():
+def test_a_page_is_filled_with_the_output_of_its_commands():
     console = "```console\n$ geomtact x 'a b'\nold 1\n...\nmore 2\n$ geomtact y\n```\n"
     script = "```python\nprint(1)\n```\n\nText.\n\n```python\nprint(2)\n```\n\n```\nold\n```\n"
     given = {

@@ -12,13 +12,13 @@ from tools.studies.stability.command import _answers
 pytestmark = pytest.mark.studies
 
 
-def test_the_tables_of_every_page_are_what_its_studies_found():
+def test_the_tables_of_every_page_equal_the_results_of_its_studies():
     texts = {page: page_path(page).read_text("utf-8") for page, *_ in TABLES}
     filled_anew = {page: with_tables(page, text).splitlines() for page, text in texts.items()}
     assert filled_anew == {page: text.splitlines() for page, text in texts.items()}
 
 
-def test_a_table_that_says_something_else_is_filled_anew():
+def test_a_differing_table_is_filled_anew():
     text = (DOCS / "kitting.md").read_text("utf-8")
     other = re.sub(r"^(\| \w+ \|) \d+", r"\1 7", text, flags=re.MULTILINE)
     assert other != text and with_tables("kitting", other) == text
@@ -112,7 +112,7 @@ COUNTS = [
 
 
 @pytest.mark.parametrize(("page", "says", "name"), COUNTS)
-def test_a_page_says_in_words_what_its_study_holds(page, says, name):
+def test_the_prose_of_a_page_agrees_with_its_study(page, says, name):
     text = " ".join((DOCS / f"{page}.md").read_text("utf-8").split())
     assert [
         sentence for sentence in says(study(name)) if not re.search(rf"(?<![\d.,]){re.escape(sentence)}", text)

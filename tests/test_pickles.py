@@ -45,7 +45,7 @@ def check_same(a, b):
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", slow_but(["plug", "pin", "flat_nut"], "flat_nut"))
-def test_a_localizer_answers_the_same_afterwards(name, way, request, a_touch):
+def test_an_unpickled_localizer_gives_the_same_posterior(name, way, request, a_touch):
     localizer = request.getfixturevalue(name)
     T, mask = a_touch(localizer)
     before = localizer.localize(mask, prior=GaussianPrior(T, np.diag(np.repeat([0.2, 4e-3], [3, 3])) ** 2))
@@ -102,7 +102,7 @@ def test_several_sensors_come_along(flat_nut, a_touch):
     check_same(both.localize(images, **options), again.localize(images, **options))
 
 
-def test_a_cache_that_is_gone_or_another_is_told_in_one_line(make_localizer, flat_nut, cache_dir, tmp_path):
+def test_a_missing_or_different_cache_is_one_line(make_localizer, flat_nut, cache_dir, tmp_path):
     shutil.copytree(cache_dir / flat_nut.index.key, tmp_path / flat_nut.index.key)
     elsewhere = make_localizer("hex_nut", "gelsight-mini", approach=[((0, 0, 1), 0.0)], cache_dir=tmp_path)
     text = pickle.dumps(elsewhere)
@@ -119,7 +119,7 @@ def test_a_cache_that_is_gone_or_another_is_told_in_one_line(make_localizer, fla
     assert "\n" not in str(caught.value)
 
 
-def test_a_prior_goes_along_where_it_can_and_else_is_told_in_one_line(flat_nut, a_touch):
+def test_a_prior_is_pickled_where_possible_and_else_the_error_is_one_line(flat_nut, a_touch):
     T, mask = a_touch(flat_nut)
     nothing, away = np.zeros_like(mask), T.copy()
     away[2, 3] += 0.1

@@ -46,7 +46,7 @@ def test_pixels_may_be_wider_than_high_and_pins_brighter_than_the_gel(bright):
     assert np.abs(found.pins - expected).max() < 1.0
 
 
-def test_what_is_no_board_is_said(rng):
+def test_a_board_that_is_none_is_refused(rng):
     image, background = board((26, 26))
     with pytest.raises(UsageError, match=r"expected metres.*2\.5 mm is 0\.0025"):
         pixel_pitch_of_pins(image, background, 2.5)
@@ -61,7 +61,7 @@ def test_what_is_no_board_is_said(rng):
         pixel_pitch_of_pins(scattered, background, 2.5 * MM)
 
 
-def test_a_real_board_tells_what_its_makers_found(data_folder):
+def test_a_real_board_gives_the_pitch_of_its_makers(data_folder):
     folder = data_folder / "ninedtact_calib" / "sensor_1" / "camera_calibration"
     found = pixel_pitch_of_pins(read_image(folder / "sample.png"), read_image(folder / "ref.png"), 2.5 * MM)
     theirs = np.load(folder / "position_scale.npy", allow_pickle=False)[2] * MM

@@ -194,7 +194,7 @@ def test_prisms_of_any_polygon_have_their_area_and_volume_in_every_format(seed, 
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 40), straight=st.integers(0, 4))
-def test_a_fan_that_covers_more_than_the_polygon_is_found_folded(seed, n, straight):
+def test_a_fan_that_covers_more_than_the_polygon_is_folded(seed, n, straight):
     rng = np.random.default_rng(seed)
     ring = simple_polygon(n, rng, straight)
     vertices, faces = prism(ring, 6.0)
@@ -257,7 +257,7 @@ def test_a_face_that_crosses_itself_is_refused(ring, tmp_path):
         load_mesh(tmp_path / "a.obj", "mm")
 
 
-def test_a_face_that_is_not_flat_is_read_with_a_word(tmp_path):
+def test_a_face_that_is_not_flat_is_loaded_with_a_note(tmp_path):
     vertices, faces = prism(L_SHAPE, 6.0)
     for lift, warned in ((0.01, 0), (0.3, 1)):
         bent = vertices.copy()
@@ -426,14 +426,14 @@ def test_numbers_out_of_any_range_are_refused_or_unused(tmp_path):
             assert 1e6 * load_mesh(tmp_path / "a.obj", "mm").areas.sum() == pytest.approx(376)
 
 
-def test_what_is_passed_over_is_said():
+def test_skipped_elements_are_noted():
     assert "2 bytes after the last row" in read_ply(as_ply(*BOX, "binary_little_endian") + b"ab").warnings[0]
     assert "1 lines after the last face" in read_off(as_off(*BOX) + b"\n1 0").warnings[0]
     assert "surf" in read_obj(as_obj(*BOX) + b"\nsurf 0 1 0 1 1").warnings[0]
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])
-def test_ply_headers_end_in_any_way(end):
+def test_ply_headers_end_in_any_line_ending(end):
     head, body = as_ply(*BOX, "binary_big_endian").split(b"end_header\n")
     # a body that begins as a line ends is not taken for one
     assert measured(read_ply((head + b"end_header\n").replace(b"\n", end) + body)) == pytest.approx((376, 480))
@@ -533,7 +533,7 @@ def test_stl_in_doubt_is_refused(data, words):
 
 
 @pytest.mark.parametrize("how", ["fan", "flap"])
-def test_what_is_folded_back_is_refused(how, tmp_path):
+def test_a_surface_folded_back_is_refused(how, tmp_path):
     vertices, faces = prism(L_SHAPE, 6.0, 0)
     fans = np.array([(f[0], f[k], f[k + 1]) for f in faces for k in range(1, len(f) - 1)])
     if how == "flap":
@@ -588,7 +588,7 @@ def test_small_files_that_were_read_wrong(data_folder, file, area, warned):
         np.testing.assert_allclose(1e3 * mesh.vertices[:, 0][[0, -1]], [-5, 19], atol=1e-6)
 
 
-def test_a_text_that_is_cut_short_says_so(data_folder):
+def test_a_truncated_text_is_named_as_such(data_folder):
     with pytest.raises(MeshError, match=r"asc_cut\.stl: is cut short: 1 of 140 facets are not ended"):
         load_mesh(data_folder / "inputs" / "asc_cut.stl", "mm")
 

@@ -176,7 +176,7 @@ def test_levels_are_repeatable_and_depend_on_the_seed(plug, posteriors, samples)
     assert (level != replace(posterior, seed=1).credible_level(T)).all()
 
 
-def test_the_level_is_the_mass_of_what_is_denser(localizer, posteriors, samples):
+def test_the_credible_level_is_the_mass_of_denser_poses(localizer, posteriors, samples):
     posterior = posteriors(localizer)
     w = localizer.index.mass(posterior.cells, runs_of(posterior))
     p = np.exp(posterior.log_prob)
@@ -261,7 +261,7 @@ def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_
     assert posterior.likeliest(0).shape == (0, 4, 4)
 
 
-def test_as_many_of_the_likeliest_are_found_as_are_asked_for_wherever_they_stand(plug, posteriors):
+def test_modes_returns_as_many_as_asked_for_in_any_order_of_cells(plug, posteriors):
     """Also where the very likeliest are every fiftieth, by which the rest is sifted."""
     posterior = posteriors(plug)
     plain = replace(
@@ -345,7 +345,7 @@ def test_what_is_no_pose_is_refused(plug, posteriors):
 # --- no contact
 
 
-def test_an_image_without_contact_says_so(plug, uniform_poses, rng):
+def test_an_image_without_contact_gives_a_posterior_without_contact(plug, uniform_poses, rng):
     posterior = plug.localize(np.zeros(plug.sensor.image_size_px[::-1], bool))
     T, _ = uniform_poses(plug)
     assert posterior.contact is False
@@ -361,7 +361,7 @@ def test_an_image_without_contact_says_so(plug, uniform_poses, rng):
         posterior.sample(3, rng)
 
 
-def test_a_seed_draws_what_its_generator_draws(plug, posteriors):
+def test_a_seed_draws_the_samples_of_its_generator(plug, posteriors):
     posterior = posteriors(plug)
     for seed in (7, np.int64(7)):
         assert np.array_equal(posterior.sample(20, seed), posterior.sample(20, np.random.default_rng(7)))
@@ -396,7 +396,7 @@ def test_a_posterior_survives_the_disk(name, request, a_touch, samples, cache_di
     assert np.array_equal(folder.log_prob, again.log_prob) and np.array_equal(folder.cells, again.cells)
 
 
-def test_the_file_holds_what_is_promised_and_no_pickles(plug, posteriors, tmp_path):
+def test_the_file_holds_the_promised_arrays_and_no_pickles(plug, posteriors, tmp_path):
     posterior = posteriors(plug)
     posterior.save(tmp_path / "p.npz")
     with np.load(tmp_path / "p.npz", allow_pickle=False) as file:
@@ -437,7 +437,7 @@ def test_no_contact_survives_the_disk(plug, tmp_path, cache_dir):
     assert again.contact is False and again.modes() == [] and again.poses.shape == (0, 4, 4) and not again.warnings
 
 
-def test_a_file_without_contact_says_that_it_holds_no_prior(plug, tmp_path, cache_dir):
+def test_a_file_without_contact_is_refused_as_a_prior(plug, tmp_path, cache_dir):
     nothing = np.zeros(plug.sensor.image_size_px[::-1], bool)
     plug.localize(nothing, prior=lambda T: np.where(T[:, 0, 3] > 0, 0.0, -3.0)).save(tmp_path / "p.npz")
     again = Posterior.load(tmp_path / "p.npz", cache_dir)

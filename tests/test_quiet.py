@@ -106,14 +106,14 @@ def test_an_image_of_any_name_is_read(tmp_path, suffix):
     np.testing.assert_array_equal(read_image(path), pixels)
 
 
-def test_strange_names_are_printable_in_what_is_written(tmp_path):
+def test_unusual_names_are_printable_in_output_files(tmp_path):
     text = to_text(plain({STRANGE: [Path(STRANGE), STRANGE]}))
     assert json.dumps(json.loads(text), ensure_ascii=False).encode() == rb'{"p\\udcfcr": ["p\\udcfcr", "p\\udcfcr"]}'
     write_image(tmp_path / f"{STRANGE}.png", np.eye(4, dtype=bool), {"object": STRANGE})
     assert read_metadata(tmp_path / f"{STRANGE}.png")["geomtact:object"] == r"p\udcfcr"
 
 
-def test_a_command_says_nothing_of_missing_pictures_and_takes_any_name(tmp_path):
+def test_a_command_is_quiet_about_missing_pictures_and_takes_any_name(tmp_path):
     ply, _ = textured(tmp_path)
     args = ["simulate", str(ply), "--unit", "mm", "--sensor", "gelsight-mini", "--out", str(tmp_path / STRANGE)]
     run = [sys.executable, "-m", "geomtact", *args]
@@ -124,7 +124,7 @@ def test_a_command_says_nothing_of_missing_pictures_and_takes_any_name(tmp_path)
 
 
 @pytest.mark.slow
-def test_preparation_says_nothing_of_missing_pictures_and_takes_any_name(tmp_path):
+def test_preparation_is_quiet_about_missing_pictures_and_takes_any_name(tmp_path):
     pytest.importorskip("pymeshlab")
     ply, _ = textured(tmp_path)
     shutil.copy(ply, tmp_path / "plain.ply")

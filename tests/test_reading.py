@@ -204,7 +204,7 @@ def test_a_kind_that_is_given_wins():
         read_observation(HEIGHT, MINI, kind="hight")
 
 
-def test_opaque_alpha_is_dropped_and_said(tmp_path, background):
+def test_opaque_alpha_is_dropped_with_a_note(tmp_path, background):
     opaque = np.concatenate([background, np.full((*SHAPE, 1), 255, np.uint8)], -1)
     seen = read_observation(write(tmp_path / "rgba.png", opaque), MINI, background=background)
     assert seen.warnings[0].endswith("the opaque alpha channel was dropped")
@@ -230,7 +230,7 @@ def test_no_contact_is_a_result_and_all_contact_a_warning():
         assert seen.contact.mask.all() and "so its outline is not seen" in seen.warnings[0]
 
 
-def test_a_background_for_a_mask_is_said_to_be_unused(background):
+def test_a_background_for_a_mask_is_a_warning(background):
     assert "the background is not used" in read_observation(MASK, MINI, background=background).warnings[0]
 
 
@@ -357,7 +357,7 @@ def test_missing_files_folders_pickles_and_stacks_are_refused(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("array", [MASK, HEIGHT])
-def test_what_is_written_is_read_back_with_its_metadata(tmp_path, array):
+def test_a_written_image_is_loaded_with_its_metadata(tmp_path, array):
     T = np.eye(4)
     T[:3, 3] = [1e-3, -2.5e-3, 0.1 + 1e-17]
     path = tmp_path / "touch.png"
@@ -391,7 +391,7 @@ def test_a_camera_without_light_shows_no_mask(background, value):
     assert read_observation(np.full(SHAPE, value, np.uint8), MINI).kind == "mask"
 
 
-def test_a_mask_that_hardly_is_a_touch_is_told_of(rng):
+def test_a_mask_that_is_hardly_a_touch_is_a_warning(rng):
     dot = np.zeros(SHAPE, bool)
     dot[100, 100] = True
     rows, columns = np.indices(SHAPE)
@@ -486,7 +486,7 @@ def test_real_gelsight_mini_presses_lie_on_the_circles_drawn_by_eye(data_folder)
     assert not contact_mask(background, background).any()
 
 
-def test_the_classical_way_agrees_with_their_makers_circles_on_other_real_gels(data_folder):
+def test_the_classical_method_agrees_with_their_makers_circles_on_other_real_gels(data_folder):
     """A soft gel (FOTS) bulges far beyond the ball's contact: there only the place is right."""
     sets = imprints(data_folder)
     soft, firm = (
@@ -541,7 +541,7 @@ def test_the_real_digit_without_contact_shows_none(data_folder, rng):
     assert contact_mask(read_image(data_folder / "fots_balls" / "digit" / "0041.png"), background, "digit").any()
 
 
-def test_simulated_digit_readings_give_rounded_patches(data_folder):
+def test_simulated_digit_images_give_rounded_patches(data_folder):
     """Each of 20 readings: one patch that holds most of the mask, without holes, near the contact on the axis."""
     from scipy import ndimage
 

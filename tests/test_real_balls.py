@@ -140,7 +140,7 @@ def test_a_ball_touches_no_deeper_than_the_gel(presses):
         assert 0 <= depth <= p.posterior.sensor.max_penetration, p.file
 
 
-def test_a_mask_hardly_tells_the_balls_apart(presses):
+def test_a_mask_hardly_distinguishes_the_balls(presses):
     """A small ball pressed deeper looks like a large one: no press makes either ball five times likelier."""
     assert {p.file: p.ratio for p in presses if p.ratio >= 5} == {}
 
@@ -173,7 +173,7 @@ def marker(data_folder, tmp_path_factory, few_touches):
     return localizer, read
 
 
-def test_readings_of_another_simulator_run_from_rgb_to_a_report(marker, tmp_path):
+def test_tactile_images_of_another_simulator_run_from_rgb_to_a_report(marker, tmp_path):
     localizer, read = marker
     for posterior, _ in read:
         assert posterior.contact and posterior.observation.kind == "reading"
@@ -184,7 +184,7 @@ def test_readings_of_another_simulator_run_from_rgb_to_a_report(marker, tmp_path
     assert names <= {path.name for path in (tmp_path / "out").iterdir()}
 
 
-def test_readings_of_another_simulator_tell_where_the_marker_is(marker):
+def test_tactile_images_of_another_simulator_localize_the_marker(marker):
     localizer, read = marker
     depths = np.array(localizer.index.resolution.penetrations)
     gains = []
@@ -198,7 +198,7 @@ def test_readings_of_another_simulator_tell_where_the_marker_is(marker):
 
 
 @pytest.mark.xfail(strict=True, reason="the network is too bold on another simulator's readings: see docs/method.md")
-def test_the_markers_featureless_side_is_told_less_than_a_distinctive_touch(marker):
+def test_the_markers_featureless_side_gives_less_information_than_a_distinctive_touch(marker):
     localizer, read = marker
     touches = random_touches(localizer.space, 40, seed=0)
     distinctive = min(localizer.localize(t.mask, kind="mask").entropy_nats for t in touches)

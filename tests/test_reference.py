@@ -136,7 +136,7 @@ def test_a_posterior_as_prior_hands_its_image_on_by_disk_too(name, request, a_to
             check_nearest(localizer.mesh, mode.T, first.modes(1)[0].T, localizer.space.approaches)
 
 
-def test_what_a_mode_tells_turns_with_its_image(curved, a_touch, rng):
+def test_observable_directions_turn_with_the_image_of_a_mode(curved, a_touch, rng):
     """Moved by xi, a pose is moved by A xi as its image: the covariance and what is observable follow."""
     T, mask = a_touch(curved)
     posterior = curved.localize(mask)
@@ -158,7 +158,7 @@ def test_what_a_mode_tells_turns_with_its_image(curved, a_touch, rng):
     assert compared > 3
 
 
-def test_what_a_contact_leaves_open_is_the_same_in_every_image():
+def test_unobservable_directions_are_the_same_in_every_image():
     """Of a nut far off the origin of its file, where its turns shift the origin too."""
     symmetry = load_mesh("hex_nut").symmetry
     C = np.diag(np.arange(1.0, 7.0)) * 1e-4
@@ -188,7 +188,7 @@ def test_a_function_is_asked_which_image_it_prefers(name, turns, request, a_touc
     assert density(mode.T[None])[0] >= density(images).max() - 0.01
 
 
-def test_of_several_poses_those_with_more_mass_say_which_image(flat_nut, a_touch):
+def test_the_poses_with_more_mass_choose_the_image(flat_nut, a_touch):
     T, mask = a_touch(flat_nut)
     images = T @ flat_nut.mesh.symmetry.elements
     first, second = images[flat_nut.space.approaches(images)][:2]

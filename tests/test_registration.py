@@ -37,7 +37,7 @@ def ball():
 
 
 @pytest.mark.parametrize("refiner, part", [(FilterReg, 0.93), (Icp, 0.9)])
-def test_pose_on_a_corner_comes_nearer_in_what_the_contact_tells(refiner, part, block):
+def test_a_pose_on_a_corner_comes_nearer_in_observable_directions(refiner, part, block):
     """Contacts of the narrow top: its sides and corners fix the position across the membrane and the turn about z."""
     surface, caster = block
     nearer, ratio, moved = [], [], []
@@ -98,7 +98,7 @@ def test_covariance_covers_the_error_where_the_model_holds(block):
 
 
 @pytest.mark.parametrize("refiner", REFINERS)
-def test_a_face_beyond_the_window_tells_nothing_and_nothing_drifts(refiner):
+def test_a_face_beyond_the_window_constrains_nothing_and_nothing_drifts(refiner):
     """All pixels in contact: no rim. One straight edge: only the shift across it (and turn along it) is told."""
     plate = trimesh.creation.box((80e-3, 60e-3, 5e-3))
     surface, caster = scene(plate, 80000)
@@ -132,7 +132,7 @@ def test_a_face_beyond_the_window_tells_nothing_and_nothing_drifts(refiner):
 
 
 @pytest.mark.parametrize("refiner", REFINERS)
-def test_a_ball_tells_its_position_along_the_membrane_only(refiner, ball):
+def test_a_ball_constrains_its_position_along_the_membrane_only(refiner, ball):
     surface, caster = ball
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -246,7 +246,7 @@ def unsound():
 
 @pytest.mark.parametrize("refiner", REFINERS)
 @pytest.mark.parametrize("name", unsound())
-def test_unsound_readings_end_in_a_sound_result(refiner, name, block):
+def test_unsound_images_end_in_a_sound_result(refiner, name, block):
     surface, _ = block
     mask, height = unsound()[name]
     starts = np.stack([facing_down(x, 0, 0.8e-3, 9e-3, turn=x) for x in (0.0, 2e-3)])
@@ -289,7 +289,7 @@ def test_a_surface_drawn_point_to_point_comes_nearer_too(block):
     assert len(ratio) > 10 and np.median(ratio) < 0.7
 
 
-def test_heights_tell_what_the_outline_does_not(ball):
+def test_heights_constrain_directions_that_the_outline_does_not(ball):
     """How deep a ball is pressed: an outline may belong to a gel that sinks around it, heights say."""
     surface, caster = ball
     for seed in range(10):
@@ -378,7 +378,7 @@ def test_a_spread_of_zero_and_a_surface_of_one_point_are_refused():
         Surface(np.zeros((1, 3)), np.ones((1, 3)))
 
 
-def test_contacts_of_two_sensors_tell_together_what_each_leaves_open():
+def test_contacts_of_two_sensors_together_constrain_directions_that_each_leaves_open():
     """Two edges of a plate at right angles: each tells the shift across itself, both tell the place."""
     plate = trimesh.creation.box((80e-3, 60e-3, 5e-3))
     surface, caster = scene(plate, 80000)
@@ -408,7 +408,7 @@ def test_contacts_of_two_sensors_tell_together_what_each_leaves_open():
 
 
 @pytest.mark.parametrize("unsure", [0.1e-3, 0.5e-3, 1e-3])
-def test_an_outline_is_as_unsure_as_the_probability_of_contact_says(unsure):
+def test_the_uncertainty_of_an_outline_follows_the_probability_of_contact(unsure):
     """Where the outline errs by s, the probability of contact is that of a Gaussian of that width."""
     from scipy.stats import norm
 

@@ -281,7 +281,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("file.txt", "old")]
 
 
-def test_told_names_the_motions_by_finite_differences(rng):
+def test_observable_directions_match_finite_differences(rng):
     """A motion about the contact is told by as much of it as lies outside the motions that the contact does not tell."""
     T = se3.transform(se3.random_rotations(1, rng)[0], rng.normal(size=3) * 0.02)
     about, length, step = rng.normal(size=3) * 0.01, 0.013, 1e-7
@@ -426,7 +426,7 @@ def test_angles_are_drawn_within_their_range():
     assert figure.axes[0].get_xlim() == (-180, 180)
 
 
-def test_what_people_print_is_one_line(ball, a_touch):
+def test_printed_text_is_one_line(ball, a_touch):
     touched = ball.localize(a_touch(ball)[1])
     nothing = ball.localize(np.zeros_like(a_touch(ball)[1]))
     for shown in (ball, ball.index, ball.mesh, touched, nothing, touched.modes(1)[0]):
@@ -506,7 +506,7 @@ def test_every_committed_picture_is_drawn_from_its_study_alone(study, which, pic
     assert np.array_equal(np.asarray(again), np.asarray(committed))
 
 
-def test_what_is_no_study_is_not_drawn(tmp_path):
+def test_a_file_without_a_study_is_not_drawn(tmp_path):
     (tmp_path / "a.json").write_text('{"schema": "geomtact/other/1"}', "utf-8")
     (tmp_path / "b.json").write_text("[1]", "utf-8")
     for name, why in (

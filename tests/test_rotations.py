@@ -142,7 +142,7 @@ def test_uniform_rotations_fall_into_each_cell_by_its_weight(symmetry, approach,
 @each_approach
 @each_grid
 @pytest.mark.parametrize("level", slow_but([1, 2], 1))
-def test_each_rotation_of_the_grid_is_in_its_own_cell(symmetry, approach, level, disks):
+def test_each_rotation_of_the_grid_lies_in_the_cell_it_represents(symmetry, approach, level, disks):
     directions = grid(symmetry, approach, level, disks)
     R, _, _ = directions.rotations()
     assert allowed(approach_of(R), directions.cones).mean() > 0.9
@@ -211,7 +211,7 @@ def test_any_image_is_an_allowed_image_and_they_are_all_met(symmetry, approach, 
 
 
 @pytest.mark.parametrize("symmetry", ["none", "six turns", "nut", "cube"])
-def test_a_face_lies_in_a_small_cell_of_its_own(symmetry, rng):
+def test_a_face_has_its_own_small_cell(symmetry, rng):
     """About its normal, a seventh of the disk in area; images of the face have the same one."""
     face, half = np.array([0.54, 0.29, 0.79]) / np.linalg.norm([0.54, 0.29, 0.79]), 0.11  # far from its own images
     directions = Directions.make(SYMMETRIES[symmetry], None, 2, disks=[(face, half)])
@@ -242,7 +242,7 @@ def test_cones_about_a_face_weigh_what_they_put_into_its_cells(symmetry, level, 
 
 
 @pytest.mark.parametrize("symmetry", ["axis", "axis with flip"])
-def test_about_a_symmetry_axis_a_face_has_two_bands_of_its_own(symmetry):
+def test_about_a_symmetry_axis_a_face_has_its_own_two_bands(symmetry):
     sym, half = SYMMETRIES[symmetry], 0.11
     even, finer = (
         Directions.make(sym, None, 2, disks=disks) for disks in (None, [(sym.axis, half), (Z + ACROSS, half)])

@@ -50,7 +50,7 @@ def packed(masks, levels=2):
     return pack(masks[: n * levels].reshape(levels, n, -1)).swapaxes(1, 2).copy()
 
 
-def test_overlaps_are_what_counting_pixels_gives(rng):
+def test_overlaps_equal_counted_pixels(rng):
     masks, seen = random_masks(40, rng), random_masks(5, rng)[4]
     expected = (masks & seen).sum((1, 2)).reshape(2, 20)
     assert (overlaps(packed(masks), seen) == expected).all()
@@ -72,7 +72,7 @@ def by_brute_force(scorer, stored, seen):
 
 
 @pytest.mark.parametrize("scorer", list(OVERLAPS.values()), ids=lambda s: s.name)
-def test_scores_are_what_counting_pixels_gives(scorer, localizer, rng):
+def test_scores_equal_counted_pixels(scorer, localizer, rng):
     index = localizer.index
     ids = rng.choice(len(index), 300, replace=False)
     stored = index.masks(ids)
@@ -298,7 +298,7 @@ def test_the_posterior_is_bayes_rule_with_a_share_of_the_prior(rng):
         assert (log_prob[:50] == -np.inf).all()
 
 
-def test_simulated_touches_are_of_the_cells_they_say(plug):
+def test_simulated_touches_lie_in_their_stated_cells(plug):
     touches = simulate_touches(plug.index, 20, seed=7)
     again = simulate_touches(plug.index, 20, seed=7)
     assert (touches.ids == again.ids).all()
@@ -360,7 +360,7 @@ def test_an_unknown_score_names_the_nearest(ball):
 
 
 @pytest.mark.slow
-def test_a_part_whose_touches_are_all_alike_is_refused(make_localizer, monkeypatch, tmp_path):
+def test_an_object_whose_touches_are_all_equal_is_refused(make_localizer, monkeypatch, tmp_path):
     """A slab known to lie on its face fills the window nearly everywhere: only its rim tells anything."""
     trimesh.creation.box((200, 200, 20)).export(tmp_path / "slab.stl")
     slab = load_mesh(tmp_path / "slab.stl", "mm")
@@ -376,7 +376,7 @@ def test_a_part_whose_touches_are_all_alike_is_refused(make_localizer, monkeypat
 # --- probabilities in a mask's stead
 
 
-def test_what_may_be_contact_counts_by_its_probability(plug, a_touch):
+def test_a_possible_contact_pixel_counts_by_its_probability(plug, a_touch):
     """Half of a patch beside the contact moves the moments half as far as all of it."""
     _, mask = a_touch(plug)
     beside = np.zeros_like(mask)

@@ -66,7 +66,7 @@ def test_a_sensor_is_read_from_a_file_and_passed_through(tmp_path):
         ("a = = 3", "not valid TOML"),
     ],
 )
-def test_what_is_added_wrongly_is_named(change, message):
+def test_a_wrong_addition_is_named(change, message):
     with pytest.raises(SensorError, match=re.escape(message)):
         Sensor.from_toml(PLAIN + change, "mine.toml")
 
@@ -98,7 +98,7 @@ def test_what_is_added_wrongly_is_named(change, message):
         ("[0.06, 0.05]", "['a', 'b']", "pixel_pitch_mm must be two numbers"),
     ],
 )
-def test_what_is_impossible_is_refused(old, new, message):
+def test_an_impossible_value_is_refused(old, new, message):
     assert old in PLAIN
     with pytest.raises(SensorError, match=re.escape(message)):
         Sensor.from_toml(PLAIN.replace(old, new))
@@ -116,7 +116,7 @@ def test_numbers_of_numpy_are_written_as_any():
     assert Sensor.from_toml(made.to_toml()) == made
 
 
-def test_an_unknown_name_and_a_missing_file_say_what_to_do():
+def test_the_errors_of_an_unknown_name_and_a_missing_file_name_the_remedy():
     with pytest.raises(SensorError, match="did you mean 'gelsight-mini'"):
         Sensor.load("gelsigt-mini")
     with pytest.raises(SensorError, match="nowhere.toml: no such file"):
@@ -145,7 +145,7 @@ def test_project_undoes_lift_for_every_optics():
                 assert (points[..., 2] == 0).all()
 
 
-def test_what_lies_below_the_membrane_is_lifted_along_its_camera_ray():
+def test_points_below_the_membrane_are_lifted_along_their_camera_ray():
     for radius in (0.0, 30.0):
         for distance in (0.0, 20.0):
             sensor = Sensor("s", (320, 240), (6e-5, 5e-5), distance / 1e3, 2e-3, radius / 1e3)
@@ -200,7 +200,7 @@ def test_the_simulated_digit_sees_its_touches_where_they_are(data_folder, tool):
             assert np.abs(seen - [0, 0, 0.020 - sensor.camera_distance]).max() < 1e-6
 
 
-def test_the_simulated_digit_predicts_the_outlines_of_its_readings(data_folder, tool):
+def test_the_simulated_digit_predicts_the_outlines_of_its_images(data_folder, tool):
     """Judged on triplets 3 and 4, which the fit has not seen: the change falls at the predicted outline."""
     sensor = Sensor.load("digit-hsp")
     touches = [t for t in tool.load_touches(data_folder / "hsp_digit_sim_ycb") if t.name.endswith(("_3/0", "_4/2"))]

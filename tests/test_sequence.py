@@ -80,7 +80,7 @@ def middle_cell(localizer):
     return int(index.possible[place])
 
 
-def test_a_motion_goes_as_far_as_it_says(flat_nut):
+def test_a_motion_has_its_stated_spread(flat_nut):
     """A point anywhere in a cell, moved by N(0, s^2), lies s^2 + h^2 / 6 from its cell's middle in the mean square."""
     index, s = flat_nut.index, 3e-3
     after = MotionKernel(index, GaussianTwist(0.0, s))(Mixture(np.array([middle_cell(flat_nut)]), np.ones(1), 0.0))
@@ -106,7 +106,7 @@ def test_the_ball_ends_at_its_radius(flat_nut):
     assert after.mass[far < ball.radius + 2 * index.resolution.step].sum() > 0.98
 
 
-def test_a_known_motion_of_the_sensor_moves_the_distribution(flat_nut):
+def test_a_measured_motion_of_the_sensor_moves_the_distribution(flat_nut):
     index, spread, rng = flat_nut.index, MotionKernel(flat_nut.index, STILL), np.random.default_rng(0)
     start = middle_cell(flat_nut)
     T = index.poses([start])[0]
@@ -169,7 +169,7 @@ def test_the_filter_beats_single_frames(flat_nut, creeping):
 
 
 @pytest.mark.slow
-def test_frames_alike_are_not_taken_for_independent(pin):
+def test_equal_frames_are_not_treated_as_independent(pin):
     """On a grid of centimetres the frames of a slow object err alike: the thesis's filter becomes sure of a wrong pose."""
     t = random_trajectory(pin.space, 8, 1)
     single = np.mean(gains([alone(pin, mask) for mask in t.masks], t))
@@ -179,7 +179,7 @@ def test_frames_alike_are_not_taken_for_independent(pin):
     assert thesis < ours - 1
 
 
-def test_a_sensor_whose_motion_is_known_tells_more(flat_nut):
+def test_a_sensor_with_measured_motion_adds_information(flat_nut):
     """The object rests in the world, the sensor creeps over it."""
     gain = []
     for seed in (1, 2):
@@ -193,7 +193,7 @@ def test_a_sensor_whose_motion_is_known_tells_more(flat_nut):
     assert np.mean(gain) > 0.05
 
 
-def test_it_says_so_when_the_object_slips_and_finds_back(flat_nut):
+def test_a_slip_is_a_warning_and_tracking_recovers(flat_nut):
     told = 0
     for seed in range(3):
         t = random_trajectory(flat_nut.space, 8, seed, slips=(5,))
@@ -207,7 +207,7 @@ def test_it_says_so_when_the_object_slips_and_finds_back(flat_nut):
     assert told >= 2
 
 
-def test_lost_contact_widens_what_is_expected(flat_nut, creeping):
+def test_lost_contact_widens_the_prediction(flat_nut, creeping):
     masks = list(creeping[1][0].masks)
     nothing = np.zeros_like(masks[0])
     frames = [*masks[:3], nothing, nothing, masks[5]]
@@ -235,7 +235,7 @@ def test_a_frame_given_twice_counts_once(flat_nut, creeping):
     assert moved.entropy_nats > once.entropy_nats
 
 
-def test_a_frame_that_the_prior_was_made_from_is_told(flat_nut, creeping):
+def test_a_frame_that_the_prior_was_made_from_is_a_warning(flat_nut, creeping):
     """Also of a prior that is what was known after many frames."""
     masks = creeping[0][0].masks
     known = list(track(flat_nut, masks[:3]))[-1]
@@ -301,7 +301,7 @@ def test_a_prior_waits_for_the_first_contact(flat_nut, creeping):
     assert gains[0] == pytest.approx(gains[1], abs=1e-6) and gains[0] > 3
 
 
-def test_bad_frames_are_told_by_their_number(flat_nut, creeping, tmp_path):
+def test_bad_frames_are_named_by_their_number(flat_nut, creeping, tmp_path):
     masks = creeping[0][0].masks
     small = np.zeros((10, 10), bool)
     with pytest.raises(ImageError, match=r"frame 2: image: expected 320 x 240 px"):
@@ -349,7 +349,7 @@ def test_poses_and_frames_have_to_agree(flat_nut, creeping):
         ({"on_error": "skp"}, "did you mean 'skip'"),
     ],
 )
-def test_wrong_options_are_told_at_once(flat_nut, wrong, told):
+def test_wrong_options_are_errors_at_once(flat_nut, wrong, told):
     with pytest.raises(UsageError, match=told):
         track(flat_nut, **({"frames": [np.zeros((240, 320), bool)]} | wrong))
 
@@ -369,7 +369,7 @@ def test_trajectories_creep_and_stay_in_contact(flat_nut):
 
 
 @pytest.mark.studies
-def test_the_study_tells_what_the_posteriors_do(flat_nut):
+def test_the_study_reports_the_figures_of_the_posteriors(flat_nut):
     (told,) = track_study.follow(flat_nut, 3, 0, 3, MODERATE, "fast", first=2)
     t = track_study.make_trajectory(flat_nut, 2, 0, 3, MODERATE)
     for k, (p, T) in enumerate(zip(track(flat_nut, t.masks), t.T_sensor_object, strict=True)):
@@ -482,7 +482,7 @@ def test_track_follows_a_folder_that_is_being_filled(command, folder, monkeypatc
     assert "stopped" in result.stderr
 
 
-def test_track_tells_what_is_wrong_in_one_line(command, folder):
+def test_an_error_of_track_is_one_line(command, folder):
     for source, told in (("absent", "no such folder, video or camera"), ("text.avi", "OpenCV cannot read this video")):
         (folder.parent / "text.avi").write_text("no video")
         assert told in command(source, status=3).stderr.splitlines()[-1]

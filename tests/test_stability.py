@@ -43,7 +43,7 @@ def here(plug):
 # --- worlds
 
 
-def test_the_first_level_of_what_may_be_wrong_is_the_localizers_own_world(here):
+def test_the_first_level_of_each_perturbation_is_the_localizers_own_world(here):
     for name in ("pitch", "size", "surface", "faces", "detail", "kind"):
         world = SWEEPS[name].world(here, SWEEPS[name].levels[0])
         assert np.array_equal(world.mesh.faces, here.mesh.faces)
@@ -64,14 +64,14 @@ def test_outside_the_contact_pose_space_the_error_is_that_of_the_pose_itself(plu
     assert answer.mssd_mm == judged(plug.mesh, deeper, posterior).mssd_mm != at_home.mssd_mm
 
 
-def test_whatever_is_said_of_another_part_is_wrong(plug):
+def test_every_mode_of_an_unknown_object_is_wrong(plug):
     sweep = SWEEPS["other_part"]
     told = list(stability.swept(plug, sweep, 1, 4, 3, "fast"))
     assert len(told) == 4 and all(a.wrong and a.gain == -np.inf and a.level == 1 for a in told)
     assert all(a.gain > -np.inf for a in stability.swept(plug, sweep, 0, 4, 3, "fast"))
 
 
-def test_a_sequence_is_judged_at_its_last_frame(flat_nut, monkeypatch):
+def test_a_sequence_is_evaluated_at_its_last_frame(flat_nut, monkeypatch):
     monkeypatch.setattr(stability, "_FRAMES", 8)
     told = list(stability.swept(flat_nut, SWEEPS["slips"], 1, 2, 3, "fast"))
     for number, answer in enumerate(told):
@@ -95,14 +95,14 @@ def test_a_jaw_closes_along_lines_that_are_so_far_apart(plug, a_touch, degrees):
     assert plug.space.penetration((inverse(second) @ T)[None])[0] == pytest.approx(1 * MM, abs=0.05 * MM)
 
 
-def test_a_larger_part_grows_about_its_centre():
+def test_a_larger_object_grows_about_its_centre():
     mesh = load_mesh("connector_plug")
     grown = larger(mesh, 5)
     assert grown.centre == pytest.approx(mesh.centre, abs=1e-9)
     assert grown.vertices - mesh.centre == pytest.approx(1.05 * (mesh.vertices - mesh.centre), abs=1e-9)
 
 
-def test_a_scanned_part_is_off_by_what_is_said():
+def test_a_scanned_object_deviates_by_the_stated_amount():
     """How far points of the scan lie from a ball's surface is the displacement itself."""
     ball = load_mesh("ball")
     radius = np.linalg.norm(ball.vertices - ball.centre, axis=1).mean()
@@ -112,13 +112,13 @@ def test_a_scanned_part_is_off_by_what_is_said():
     assert np.array_equal(scanned(ball, 0.2 * MM).vertices, scanned(ball, 0.2 * MM).vertices)
 
 
-def test_a_coarser_part_keeps_so_many_faces():
+def test_a_coarser_object_keeps_the_stated_number_of_faces():
     mesh = load_mesh("connector_plug")
     here = World(mesh, Sensor.load("gelslim"), MODERATE, (3e-4, 1e-3))
     assert len(SWEEPS["faces"].world(here, 30).mesh.faces) == pytest.approx(0.3 * len(mesh.faces), rel=0.05)
 
 
-def test_pixels_that_are_larger_than_said_show_a_smaller_contact(here, plug):
+def test_pixels_larger_than_stated_show_a_smaller_contact(here, plug):
     world = replace(SWEEPS["pitch"].world(here, 10), noise=CLEAN, threshold=0.0)
     whole = 0
     for T, mask in worlds.touches(world, 16, 3):
@@ -129,7 +129,7 @@ def test_pixels_that_are_larger_than_said_show_a_smaller_contact(here, plug):
 
 
 @pytest.mark.parametrize("level", [0, 0.2])
-def test_a_halo_is_where_the_part_is_so_far_above_the_gel(level):
+def test_a_halo_is_where_the_object_is_within_a_gap_above_the_gel(level):
     """Around a ball it is a disc as large as that of one pressed in deeper by as much."""
     ball = load_mesh("ball")
     radius = np.linalg.norm(ball.vertices - ball.centre, axis=1).mean()
@@ -184,7 +184,7 @@ def test_knobs_stand_out_of_the_surface_and_leave_the_rest_as_it_was(here):
     assert scene.compute_distance(centres.astype(np.float32)).numpy() == pytest.approx(0, abs=1e-7)
 
 
-def test_what_no_touch_fulfils_ends(here, monkeypatch):
+def test_a_condition_that_no_touch_fulfils_ends(here, monkeypatch):
     monkeypatch.setattr(worlds, "TRIED", 40)
     assert list(worlds.touches(replace(here, area=(1.0, 2.0), threshold=0.0), 1, 0)) == []
 
@@ -203,7 +203,7 @@ def test_the_outline_cut_off_is_counted_in_pixel_edges():
 # --- answers
 
 
-def test_a_world_as_it_is_said_to_be_gives_the_localizers_own_answers(plug, here):
+def test_an_unperturbed_world_gives_the_localizers_own_posteriors(plug, here):
     told = list(stability.swept(plug, SWEEPS["size"], 0, 2, 5, "fast"))
     for answer, (T, mask) in zip(told, worlds.touches(here, 2, 5), strict=True):
         assert answer == judged(plug.mesh, T, plug.localize(mask, "mask", effort="fast", seed=5))
@@ -236,7 +236,7 @@ def told(plug, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "level", "mm", "degrees"), [("rig_shift", 0, 0, 0), ("rig_shift", 5, 5, 0), ("rig_turn", 5, 0, 5)]
 )
-def test_a_rig_is_off_by_what_is_said_but_for_its_first_sensor(plug, told, name, level, mm, degrees):
+def test_extrinsics_are_perturbed_as_stated_except_for_the_first_sensor(plug, told, name, level, mm, degrees):
     answers = list(stability.swept(plug, SWEEPS[name], level, 8, 1, "fast"))
     assert answers == [REFUSED] * 8
     true = [scene.T_world_sensor for scene in simultaneous_touches(plug.space, 8, 3, 1)]
@@ -255,7 +255,7 @@ def test_a_jaws_levels_are_degrees(plug, told):
         assert second[2, 2] == pytest.approx(-np.cos(np.radians(30)), abs=1e-9)
 
 
-def test_figures_follow_from_the_answers():
+def test_figures_follow_from_the_records():
     answers = [
         Answer(2.0, 1.0, 0.3, 1.0, 0.9, False),  # right
         Answer(1.0, 1.0, 0.7, 1.0, 0.9, True),  # right, and yet warned
@@ -328,7 +328,7 @@ def test_a_stopped_study_goes_on_and_its_picture_comes_from_the_file_alone(comma
     assert whole["schema"] == evaluate_stability.SCHEMA
 
 
-def test_the_answers_of_all_parts_are_taken_together():
+def test_the_records_of_all_objects_are_pooled():
     one, other = Answer(1.23456, 1.0, 0.3, 1.0, 0.9, False), REFUSED
 
     def part(*answers, effort="fast"):
@@ -343,7 +343,7 @@ def test_the_answers_of_all_parts_are_taken_together():
     assert level == {"level": 2, "figures": stability.summarise([rounded, rounded, other])}
 
 
-def test_a_level_that_no_touch_fulfils_is_left_out_and_the_others_are_judged_once(command, tmp_path, monkeypatch):
+def test_a_level_that_no_touch_fulfils_is_left_out_and_the_others_are_evaluated_once(command, tmp_path, monkeypatch):
     asked = []
 
     def swept(localizer, sweep, level, *args):
@@ -359,7 +359,7 @@ def test_a_level_that_no_touch_fulfils_is_left_out_and_the_others_are_judged_onc
     assert [at["level"] for at in part["sweeps"]["specks"]["levels"]] == [0, 2, 20, 60]
 
 
-def test_what_is_as_prepared_is_touched_once(plug, monkeypatch):
+def test_an_unperturbed_object_is_touched_once(plug, monkeypatch):
     known, sweep = [], SWEEPS["noise"]
     at_home = [level for level in sweep.levels if level == 1e3 * MODERATE.outline_rms]
     first = list(stability.swept(plug, sweep, at_home[0], 2, 1, "fast", known))
@@ -367,12 +367,12 @@ def test_what_is_as_prepared_is_touched_once(plug, monkeypatch):
     assert list(stability.swept(plug, SWEEPS["size"], 0, 2, 1, "fast", known)) == first == known
 
 
-def test_a_sweep_that_is_none_is_said(command):
+def test_an_unknown_sweep_is_refused(command):
     assert evaluate_stability._NAMES.split(", ") == list(SWEEPS)
     assert "no sweep named 'nois'" in command("--sweep", "nois", status=2).output
 
 
-def test_another_part_of_which_nothing_is_known_is_printed(command, tmp_path, monkeypatch):
+def test_an_unknown_object_without_figures_is_printed(command, tmp_path, monkeypatch):
     monkeypatch.setitem(SWEEPS, "other_part", replace(SWEEPS["other_part"], levels=(1,), inside=()))
     words = ["--touches", 4, "--effort", "fast", "--sweep", "other_part"]
     done = command(*words, "--out", tmp_path / "told.json")

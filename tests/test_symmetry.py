@@ -48,7 +48,7 @@ QUICK = ("brick", "hexagonal prism", "tetrahedron", "cube with a bump at a corne
 
 
 @pytest.mark.parametrize("name", slow_but(SOLIDS, *QUICK, "cylinder of 32 sides", "ball"))
-def test_known_groups_in_any_frame(name, rng):
+def test_standard_groups_in_any_frame(name, rng):
     mesh, kind, count = SOLIDS[name]
     R = random_rotations(1, rng)[0]
     vertices = apply(transform(R, [0.01, -0.02, 0.3]), MM * mesh.vertices)
@@ -60,7 +60,7 @@ def test_known_groups_in_any_frame(name, rng):
         assert abs(found.axis @ R[:, 2]) == pytest.approx(1, abs=1e-9)
 
 
-def test_a_real_part_with_faces_of_no_area_has_its_symmetry_found(data_folder):
+def test_a_real_object_with_faces_of_no_area_has_its_symmetry(data_folder):
     """Such a face has no normal."""
     part = load_mesh(data_folder / "meshes_trimesh" / "dirty" / "wallhole.obj", "mm")
     found = find_symmetry(part.vertices, part.faces)
@@ -142,7 +142,7 @@ def test_fast_enough(name):
 
 
 @pytest.mark.slow
-def test_real_parts(data_folder):
+def test_real_objects(data_folder):
     def of(path, scale):
         mesh = trimesh.load_mesh(str(data_folder / path))
         return find_symmetry(scale * mesh.vertices, mesh.faces)

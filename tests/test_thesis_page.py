@@ -75,7 +75,7 @@ def test_a_rod_may_lie_anywhere_along_itself_and_not_across(rod, seen):
 
 
 @pytest.mark.parametrize("where", ["middle", "end"])
-def test_poses_that_feel_the_same_do_and_lie_apart(rod, seen, where):
+def test_poses_with_the_same_contact_lie_apart(rod, seen, where):
     touch, T, needed = seen[where]
     assert np.allclose(T[0], touch.T_sensor_object)
     truth = simulate_mask(rod.space, T[0], True, (72, 96))
@@ -86,7 +86,7 @@ def test_poses_that_feel_the_same_do_and_lie_apart(rod, seen, where):
         assert distance.mean(T[i], T[j][None])[0] >= SPACING_MM * MM - 1e-9
 
 
-def test_an_end_that_is_felt_tells_how_far_along(rod, seen):
+def test_a_touched_end_measures_the_position_along_the_rod(rod, seen):
     (_, middle, _), (_, end, _) = seen["middle"], seen["end"]
     assert len(end) < len(middle) / 4
     assert np.abs(end[:, 0, 3] - 0.09).max() < 5 * MM
@@ -100,7 +100,7 @@ def test_overlap_is_one_with_itself_and_none_where_nothing_is_shared(rng):
     assert overlap(np.zeros((8, 9), bool), np.zeros((8, 9), bool)) == 0
 
 
-def test_the_more_noise_the_less_two_readings_overlap(rod):
+def test_the_more_noise_the_less_two_masks_overlap(rod):
     mask = touch_of(rod, 0.0).mask
     needed = [overlap_of_readings(mask, rod.space, n, np.random.default_rng(0)) for n in (CLEAN, MODERATE, HEAVY)]
     assert needed[0] == 1 > needed[1] > needed[2] > 0
@@ -126,7 +126,7 @@ def test_the_best_guess_is_no_worse_than_the_truth_and_than_a_random_one():
     assert ambiguity.errors(np.zeros((1, 1))) == (0, 0, 0)
 
 
-def test_a_posterior_that_holds_what_feels_the_same_and_nothing_else_has_precision_and_recall_one(rod):
+def test_a_posterior_on_exactly_the_equivalent_poses_has_precision_and_recall_one(rod):
     distance = PoseDistance(rod.mesh)
     here, there = transform(SIDEWAYS, [0, 0, 0]), transform(SIDEWAYS, [0.09, 0, 0])
 
@@ -143,7 +143,7 @@ def test_a_posterior_that_holds_what_feels_the_same_and_nothing_else_has_precisi
     assert judged(SimpleNamespace(contact=False), [here]) == (0, 0)
 
 
-def test_figures_are_told_of_distinctive_and_ambiguous_touches_apart():
+def test_distinctive_and_ambiguous_touches_have_separate_figures():
     outcomes = [Outcome(side, True, [float(10 * side + k)] * len(ROWS), 50.0) for side in (0, 1) for k in range(3)]
     found = [
         ambiguity.Ambiguity(side, k, 2, 0.8, span, span / 2, span / 2, 0.5, 1.0)
@@ -167,7 +167,7 @@ def test_the_grids_neighbours_lie_about_a_step_apart(flat_nut):
     assert 0.3 * step < granularity(flat_nut, 30) <= 2 * step
 
 
-def test_a_study_of_what_is_open_goes_on_and_keeps_what_was_judged(flat_nut, monkeypatch, tmp_path):
+def test_an_interrupted_ambiguity_study_resumes_and_keeps_its_results(flat_nut, monkeypatch, tmp_path):
     monkeypatch.setattr(Localizer, "prepare", classmethod(lambda cls, *args, **options: flat_nut))
     out, plot = tmp_path / "table.json", tmp_path / "table.png"
     monkeypatch.setattr(search, "STARTS", 10)
@@ -207,7 +207,7 @@ def _of(figures, row):
     return f"{figures[row]['error_mm_quartiles'][1]:.1f} / {figures[row]['normalised_median']:.2f}"
 
 
-def test_the_page_says_what_the_study_found():
+def test_the_page_agrees_with_the_study():
     page = (DOCS / "thesis.md").read_text("utf-8")
     parts = json.loads((DOCS / "results" / "thesis.json").read_text("utf-8"))["parts"]
     table = _cells(page, "## Table 1", None)

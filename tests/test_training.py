@@ -74,7 +74,7 @@ def test_a_touch_lies_near_the_stored_contact_of_its_cell(scenes):
         assert np.median(own) < 0.5 * np.median(far)
 
 
-def test_an_elastic_contact_is_part_of_the_rigid_one(scenes):
+def test_an_elastic_contact_lies_within_the_rigid_one(scenes):
     for scene in scenes:
         touches, soft = unpacked(scene.touches, TOUCH_SHAPE), np.flatnonzero(scene.elastic)
         rigid, elastic = touches[soft - 1], touches[soft]
@@ -82,7 +82,7 @@ def test_an_elastic_contact_is_part_of_the_rigid_one(scenes):
         assert not (elastic & ~rigid).any() and elastic.sum() < 0.95 * rigid.sum()
 
 
-def test_a_touch_has_the_least_area_whichever_gel_feels_it(scenes):
+def test_a_touch_has_the_least_area_on_either_gel(scenes):
     for scene in scenes:
         area = unpacked(scene.touches, TOUCH_SHAPE).sum((1, 2)) * scene.pixel**2
         assert area.min() >= LEAST_CONTACT
@@ -179,7 +179,7 @@ def test_training_learns_and_a_resumed_run_ends_where_a_whole_one_does(scenes, t
         assert torch.equal(resumed.state_dict()[name], value), name
 
 
-def test_a_network_gains_what_a_posterior_would(scenes):
+def test_the_gain_of_a_network_equals_that_of_its_posterior(scenes):
     """The loss is minus the log density at the truth: 0 for a network that tells nothing apart."""
     network = Encoder(16, 4)
     with torch.no_grad():
@@ -240,7 +240,7 @@ def test_a_resumed_run_may_have_another_rate_and_nothing_else(tmp_path):
     assert torch.equal(fresh.state[other.weight]["momentum_buffer"], optimizer.state[network.weight]["momentum_buffer"])
 
 
-def test_weights_for_one_part_serve_no_other(weights, tmp_path, ball):
+def test_weights_for_one_object_are_refused_for_another(weights, tmp_path, ball):
     own = {"part": "ball", "part_sha256": ball.mesh.sha256, "sensor": "digit", "sensor_sha256": "0"}
     path = tmp_path / "mine.safetensors"
     save_file(weights, path, own | {"sensor_sha256": ball.sensor.sha256})

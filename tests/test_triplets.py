@@ -70,7 +70,7 @@ def test_the_world_moves_and_nothing_else(scenes, data_folder):
             assert np.abs(seen - moved).max() < 1e-12
 
 
-def test_a_reading_shows_the_object_where_it_is(marker):
+def test_a_tactile_image_shows_the_object_where_it_is(marker):
     """The contact read from each picture covers the one cast at its known pose."""
     localizer, some = marker
     for triplet in some[1:2]:
@@ -92,7 +92,7 @@ def test_the_true_pose_touches_all_three_and_one_moved_off_does_not(marker):
                 assert not touching(localizer, T, moved)[k]
 
 
-def test_one_who_knows_the_pose_is_right(marker, monkeypatch):
+def test_a_posterior_at_the_true_pose_is_right(marker, monkeypatch):
     localizer, some = marker
     monkeypatch.setattr(triplets, "POINTS", 1000)
     told = []
@@ -139,7 +139,7 @@ def test_figures_are_of_each_kind_and_number():
         (["nowhere"], 3, "hsp_digit_sim_ycb"),
     ],
 )
-def test_without_the_data_it_says_which_folder_it_needs(words, status, told, tmp_path, monkeypatch):
+def test_without_the_data_the_error_names_the_folder(words, status, told, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(studies, ["triplets", *words])
     assert done.exit_code == status, done.output

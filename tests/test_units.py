@@ -25,7 +25,7 @@ def commented(path, *comments):
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "off"])
 @pytest.mark.parametrize("unit", UNITS)
-def test_a_unit_in_the_file_serves_and_is_never_overruled(tmp_path, suffix, unit):
+def test_a_unit_in_the_file_is_used_and_never_overruled(tmp_path, suffix, unit):
     path = commented(tmp_path / f"a.{suffix}", "made by hand", unit_comment(unit))
     for given in (None, unit, unit.upper()):
         mesh = load_mesh(path, given)
@@ -116,13 +116,13 @@ def test_sketchup_states_its_unit_in_obj(tmp_path, word, unit):
     assert stated_unit(commented(tmp_path / "a.ply", *comments)) is None
 
 
-def test_a_unit_that_is_not_known_here_is_named(tmp_path):
+def test_an_unsupported_unit_is_named(tmp_path):
     path = commented(tmp_path / "a.obj", "File units = feet")
     with pytest.raises(MeshError, match="states the unit feet; export it in one of mm, cm, m, inch"):
         load_mesh(path, "m")
 
 
-def test_of_several_parts_the_unit_is_for_those_that_need_one(tmp_path):
+def test_of_several_objects_the_unit_is_for_those_that_need_one(tmp_path):
     for name in ("a.stl", "b.glb", "c.ply"):
         BOX.export(str(tmp_path / name))
     stl, glb, ply = (str(tmp_path / name) for name in ("a.stl", "b.glb", "c.ply"))

@@ -32,7 +32,7 @@ def test_the_page_is_served(shown):
         assert page.status == 200 and b"<html" in page.read()
 
 
-def test_the_part_is_drawn_where_the_posterior_says(shown, flat_nut, a_touch):
+def test_the_object_is_drawn_at_the_pose_of_the_posterior(shown, flat_nut, a_touch):
     """In the posterior's frame, of which a unit of the scene is a centimetre: the first mode where it is, the others where poses
     drawn by the same seed lie."""
     T, mask = a_touch(flat_nut)
@@ -50,7 +50,7 @@ def test_the_part_is_drawn_where_the_posterior_says(shown, flat_nut, a_touch):
     assert "frame 1" in shown._summary.content
 
 
-def test_without_contact_no_part_is_drawn(shown, flat_nut):
+def test_without_contact_no_object_is_drawn(shown, flat_nut):
     width, height = flat_nut.sensor.image_size_px
     shown.show(2, flat_nut.localize(np.zeros((height, width), bool), "mask"))
     assert not shown._drawn.visible and not shown._mode.visible
@@ -67,7 +67,7 @@ def test_images_of_every_kind_can_be_shown():
     assert np.array_equal(to_pixels(colour), colour)
 
 
-def test_without_viser_it_is_said_how_to_get_it(flat_nut, monkeypatch):
+def test_without_viser_the_error_names_the_install_command(flat_nut, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"geomtact\[viz\]"):
         Viewer(flat_nut.mesh)
