@@ -10,7 +10,7 @@ from speed import slow_but
 
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
-    """The folder of real readings and meshes; tests that need it are skipped where it is not given."""
+    """The folder of real tactile images and meshes; tests that need it are skipped where it is not given."""
     folder = os.environ.get("GEOMTACT_DATA")
     if not folder or not Path(folder).is_dir():
         pytest.skip("set GEOMTACT_DATA to the folder of real readings")
@@ -74,7 +74,7 @@ def curved_sensor():
 
 @pytest.fixture(scope="session")
 def plug(make_localizer):
-    """A part without symmetry."""
+    """An object without symmetry."""
     return make_localizer("connector_plug", "gelslim", max_poses=20_000, touches=240)
 
 
@@ -97,7 +97,7 @@ def curved(make_localizer, curved_sensor):
 
 @pytest.fixture(scope="session")
 def flat_nut(make_localizer):
-    """A nut known to lie on its flat face: only x, y, depth and a sixth of a turn are left."""
+    """A nut that lies on its flat face: only x, y, depth and a sixth of a turn are unknown."""
     return make_localizer("hex_nut", "gelsight-mini", approach=[((0, 0, 1), 0.0)])
 
 
@@ -110,7 +110,7 @@ def cone(make_localizer):
 LOCALIZERS = ("plug", "pin", "ball", "curved", "flat_nut", "cone")
 
 
-# a part without symmetry that may touch anyhow, and a symmetric one whose face and housing leave little
+# an object without symmetry that may touch anyhow, and a symmetric one whose face and housing leave little
 @pytest.fixture(params=slow_but(LOCALIZERS, "plug", "flat_nut"))
 def localizer(request):
     """Each of the localizers in turn."""
@@ -133,7 +133,7 @@ def uniform_poses():
 
 @pytest.fixture(scope="session")
 def a_touch():
-    """A touch of a localizer's part at a pose that the grid does not hold: its pose (4, 4) and its mask (H, W)."""
+    """A touch of a localizer's object at a pose that the grid does not hold: its pose (4, 4) and its mask (H, W)."""
     touches: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def touch(localizer):

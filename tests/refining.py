@@ -1,4 +1,4 @@
-"""Touches whose pose is known, for laws of refinement."""
+"""Touches at a given pose, for laws of refinement."""
 
 import numpy as np
 import trimesh

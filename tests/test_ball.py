@@ -1,4 +1,4 @@
-"""The gel under a ball as a camera sees it: what rays cast at a mesh of the ball say, too."""
+"""The gel under a ball as a camera sees it: the closed form equals rays cast at a mesh of the ball."""
 
 import numpy as np
 import pytest
@@ -29,8 +29,8 @@ def middle(sensor):
 
 @pytest.fixture
 def centre(sensor, middle):
-    """Of the ball, (3,): along the membrane's normal, so that both meet in a circle of the imprint's radius, which is the same
-    whichever way one looks."""
+    """Of the ball, (3,): along the membrane's normal, so that both meet in a circle of the imprint's radius, which is the
+    same in every viewing direction."""
     above, bend = np.sqrt(BALL**2 - IMPRINT**2), sensor.membrane_radius
     if not bend:
         return middle + [0, 0, above]

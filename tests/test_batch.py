@@ -36,7 +36,7 @@ def written(folder: Path) -> dict:
 
 
 def tasks(folder: Path) -> list:
-    """Parts on a sensor of so few pixels that preparing takes no time."""
+    """Objects on a sensor of so few pixels that preparing takes no time."""
     sensor = Sensor("coarse", (40, 30), (0.5e-3, 0.5e-3), 0.0, 2e-3)
     return [(name, None, sensor, "moments", 1000, folder) for name in PARTS]
 
@@ -106,7 +106,7 @@ def test_a_task_that_kills_every_process_is_given_up_alone(tmp_path):
 
 @pytest.mark.studies
 def test_a_study_of_objects_in_parallel_equals_the_serial_study(few_touches, tmp_path, cache_dir):
-    """Also where some are judged already."""
+    """Also where some are evaluated already."""
 
     def judge(out: Path, parts: tuple, *words: str) -> dict:
         options = ["--touches", "1", "--sweep", "noise", "--max-poses", "3000", "--cache-dir", str(cache_dir)]
@@ -123,7 +123,7 @@ def test_a_study_of_objects_in_parallel_equals_the_serial_study(few_touches, tmp
 
 @pytest.mark.studies
 def test_scores_of_objects_in_parallel_equal_the_serial_scores(few_touches, tmp_path, cache_dir):
-    """With the score that the command line names among the parts."""
+    """With the score that the command line names among the objects."""
 
     def judge(out: Path, *words: str) -> tuple[dict, dict]:
         options = ["--touches", "3", "--max-poses", "3000", "--cache-dir", str(cache_dir), "--out", str(out)]
@@ -180,7 +180,7 @@ def test_two_nodes_of_which_one_is_killed_write_the_same_bytes_as_one_process(al
         killed_at: list[int] = []
 
         def kill() -> None:
-            while len(list(tmp_path.glob("*.lock"))) < len(PARTS):  # each node is at a part
+            while len(list(tmp_path.glob("*.lock"))) < len(PARTS):  # each node is at an object
                 time.sleep(0.02)
             cluster.remove_node(other, allow_graceful=False)
             killed_at.append(len(written(tmp_path)))

@@ -1,4 +1,4 @@
-"""A sensor of one's own: presses of a ball of known diameter make colours tell slopes, heights and other balls."""
+"""Calibrating a user's sensor: presses of a ball of given diameter make colours measure slopes, heights, other balls."""
 
 import re
 from dataclasses import replace
@@ -47,7 +47,7 @@ def pressed(diameter, centre, contact=1.6 * MM, bend=0.0):
 
 
 def lit(slope, rng):
-    """A reading (H, W, 3) of slopes (H, W, 2) under three lamps, the nearer the brighter, over its background (H, W, 3)."""
+    """A tactile image (H, W, 3) of slopes (H, W, 2) under three lamps, nearer is brighter, over its background (H, W, 3)."""
     x, y = np.meshgrid(np.linspace(-1, 1, SHAPE[1]), np.linspace(-1, 1, SHAPE[0]))
     lamps = np.array([[0.35, 0.02], [-0.17, 0.3], [-0.16, -0.29]])
     near = np.stack([1 + 0.2 * x, 1 - 0.1 * x + 0.15 * y, 1 - 0.1 * x - 0.15 * y], -1)
@@ -102,7 +102,7 @@ def test_a_bulging_membrane_takes_its_own_slope_off_the_balls():
     curved = Sensor("curved", SHAPE[::-1], (PITCH, PITCH), 0.0, 2 * MM, membrane_radius=35 * MM)
     found = calibrate_sensor(images, 8 * MM, background, sensor=curved)
     assert np.median(found.diameters) == pytest.approx(8 * MM, rel=0.03)
-    # taken for flat, its bulge passes for a tenth of the ball's curvature
+    # treated as flat, its bulge passes for a tenth of the ball's curvature
     flat = calibrate_sensor(images, 8 * MM, background, PITCH)
     press = found.presses[0]
     told = [measured_diameter(press, sensor) for sensor in (found.sensor, flat.sensor)]

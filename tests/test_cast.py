@@ -1,4 +1,4 @@
-"""Laws of simulated contact: balls whose contact is known in closed form, and rays traced one triangle at a time."""
+"""Laws of simulated contact: balls with a contact in closed form, and rays traced one triangle at a time."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The bundled parts: what the catalogue says is what the files hold, what the finder finds and what was constructed."""
+"""The bundled objects: the catalogue agrees with the files, the symmetry finder and the construction."""
 
 import hashlib
 import importlib.util

@@ -1,4 +1,4 @@
-"""Choices: every way is the default but for what it names, and the figures follow from the answers."""
+"""Choices: every variant is the default but for what it names, and the figures follow from the records."""
 
 import json
 from dataclasses import fields, replace
@@ -22,11 +22,11 @@ def told(gains, ms, mssd=5.0):
     return [Timed(gain, 2.0, 0.5, mssd, 0.4, False, ms) for gain in gains]
 
 
-# --- ways
+# --- variants
 
 
 def test_a_variant_differs_from_the_default_in_one_setting():
-    """A side known exactly leaves so few poses that the grid is smaller, too."""
+    """An exact contact face leaves so few poses that the grid is smaller."""
     for name, way in WAYS.items():
         changed = {
             f.name
@@ -39,7 +39,7 @@ def test_a_variant_differs_from_the_default_in_one_setting():
     assert all(set(way.scenes) <= set(choices.SCENES) for way in WAYS.values())
 
 
-# --- figures of answers made by hand
+# --- figures of records made by hand
 
 
 ANSWERS = {

@@ -350,7 +350,7 @@ def test_geomtact_toml_takes_precedence_over_the_metadata(tmp_path):
     assert set(sources.values()) == {str(tmp_path / "geomtact.toml")}
 
     values, sources = project.resolve({**nothing, "object": "head"}, metadata, below)
-    assert values == {"object": "head", "unit": None, "sensor": "gelslim"}  # the unit is of the file's own part
+    assert values == {"object": "head", "unit": None, "sensor": "gelslim"}  # the unit is of the file's own object
 
     (tmp_path / "geomtact.toml").write_text('unit = "mm"\n')
     values, sources = project.resolve({**nothing, "object": "head.stl"}, metadata, below)

@@ -1,4 +1,4 @@
-"""Laws of the contact classes: solids whose contacts are known by construction."""
+"""Laws of the contact classes: solids whose contacts follow from their construction."""
 
 import numpy as np
 import pytest

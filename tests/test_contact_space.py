@@ -135,8 +135,8 @@ def test_poses_around_a_place_are_found_as_by_brute_force(localizer, rng):
 
 
 def test_the_covariance_of_a_cell_is_that_of_draws_from_it(plug, rng):
-    """What touches within a cell lies about its pose as far as said, in all directions: squared by it 6 in the mean, were it
-    as wide everywhere."""
+    """The squared distance of draws from a cell's pose, by its covariance, is 6 in the mean if the cell touches
+    everywhere."""
     index = plug.index
     found = []
     for i in rng.choice(len(index), 12, p=weights(index)):
@@ -195,7 +195,7 @@ def test_the_cells_of_a_ball_cover_the_window_and_a_radius_around_it(ball, tmp_p
 
 @pytest.mark.parametrize("camera_distance", [8 * MM, 20 * MM])
 def test_a_camera_sees_a_narrower_window_the_deeper_it_looks(ball, camera_distance, tmp_path):
-    """The places from which a ball is felt d deep are those of a window 1 - d/D as wide."""
+    """The places at which a ball is touched d deep are those of a window 1 - d/D as wide."""
     sensor = replace(ball.sensor, housing_depth=None, camera_distance=camera_distance)
     index = open_index(ball.mesh, sensor, None, 20_000, tmp_path)
     d = np.array(index.resolution.penetrations)
@@ -417,7 +417,7 @@ def test_an_interrupted_build_leaves_no_entry(tmp_path):
 
 
 def _build_slowly(folder, log):
-    """Run in a process of its own."""
+    """Run in a separate process."""
     real = store.build
 
     def counted(*args, **kwargs):
@@ -558,7 +558,7 @@ def test_poses_that_are_not_cast_cannot_touch(name, request, curved_sensor, monk
 
 
 def test_an_object_much_larger_than_its_sensor_is_sampled_though_it_rarely_touches():
-    """One in 400 of the poses within reach, for the housing is in the way."""
+    """One in 400 of the poses within reach, for the housing excludes the others."""
     solid = trimesh.creation.box((600 * MM, 500 * MM, 10 * MM))
     poses = ContactSpace(Mesh(solid.vertices, solid.faces, "plate", "m"), Sensor.load("gelsight-mini"))
     T, depth = poses.sample(64, np.random.default_rng(0))

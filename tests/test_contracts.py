@@ -230,7 +230,7 @@ def test_masks_without_a_rim_are_harmless(refiner, shape, block):
 
 @each_refiner
 def test_a_surface_in_millimetres_converges_nowhere(refiner, block, pressed):
-    """Units wrong by a thousand: nothing meets, and nothing is claimed."""
+    """Units wrong by a thousand: nothing meets, and no correspondence is reported."""
     (surface, _), (T, problem, _) = block, pressed
     wrong = Surface(1e3 * surface.points, surface.normals)
     result = refiner(wrong, SPREAD).refine(problem, T[None])
@@ -377,7 +377,7 @@ def test_a_motion_keeps_the_uniform_distribution_and_all_mass(part, motion, requ
 @each_motion
 @each_part
 def test_components_of_a_distribution_spread_independently(part, motion, request, rng):
-    """Whatever few cells hold: those of few rotations are spread by another way than those of all."""
+    """However few cells hold mass: few rotations are spread by another method than all of them."""
     index = request.getfixturevalue(part).index
     spread, possible = MotionKernel(index, motion), index.possible
     mass = weights(index)[possible] * rng.random(len(possible))

@@ -42,7 +42,7 @@ def read(array, kind="auto"):
     ],
 )
 def test_another_unit_is_refused_with_its_conversion(depth, unit, conversion):
-    """Of the conversions that are named, one is right, and each makes a touch that the gel can feel."""
+    """Of the conversions that are named, one is right, and each makes a touch within the gel's depth."""
     given = ball(max(depth, 20e-3 * 1.01 * unit)) / unit  # deep enough to be over 10 max_penetration
     for array in (given, given.astype(np.float32)):
         with pytest.raises(ImageError, match=re.escape(conversion)) as error:

@@ -1,4 +1,4 @@
-"""Laws of the classical descriptors: what each one tells and what it is blind to, on any grid, for any contact."""
+"""Laws of the classical descriptors: what each one measures and what it ignores, on any grid, for any contact."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -101,7 +101,7 @@ def test_distance_grows_with_the_turn(name):
 
 @pytest.mark.parametrize("shape", [(24, 32), (96, 128), (240, 320)])
 def test_the_same_contact_on_another_grid_lies_near(descriptor, shape):
-    """Nearer than other contacts by far; gradients and normals know the rim's steps, so they change more."""
+    """Nearer than other contacts by far; gradients and normals depend on the rim's steps, so they change more."""
     same, *others = distance(descriptor, ellipse(shape=shape), ellipse(), ellipse(4, 3, 5, 5), hook())
     assert same < (0.6 if descriptor.name in ("hog", "fpfh") else 0.2) * min(others)
 

@@ -1,4 +1,4 @@
-"""Laws of distances between poses: brute force over the symmetry group says the same."""
+"""Laws of distances between poses: brute force over the symmetry group gives the same."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def near_poses(n, rng, spread=0.3):
 
 
 def by_brute_force(distance, T, others, over, n=1440):
-    """Least distance over the symmetry group, its continuous part in ``n`` steps."""
+    """Least distance over the symmetry group, its continuous subgroup in ``n`` steps."""
     mesh = distance.mesh
     here = apply(T, distance.points)
     out = []

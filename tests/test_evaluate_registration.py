@@ -1,4 +1,4 @@
-"""Registration judged: what a contact tells is what the simulator says, and every method starts where the others do."""
+"""Evaluation of registration: observability agrees with the simulator, and every method has the same starting poses."""
 
 import io
 import json
@@ -50,7 +50,7 @@ def touches_of(space, n, elastic=None, noise=CLEAN):
 
 
 def pressed_in_the_middle(space, depth=0.8e-3):
-    """A pose (4, 4) of the part, unturned, with its middle above the window's."""
+    """A pose (4, 4) of the object, unturned, with its middle above the window's."""
     T = np.eye(4)
     T[:3, 3] = [0.7e-3, -0.4e-3, 20e-3] - space.mesh.centre
     settled, ok = space.settle(T[None], depth)
@@ -75,7 +75,7 @@ def test_a_ball_constrains_its_position_and_not_its_rotation(ball, elastic):
 
 def test_information_is_that_of_the_outline(ball):
     """A disk of radius a shifted along x moves its outline by the cosine of the normal, which is a half in mean square: pi a
-    over the noise's correlation, sqrt(pi) times its length, is told, per noise variance; to a fifth, at such pixels."""
+    over the noise's correlation, sqrt(pi) times its length, is the information, per noise variance; to a fifth."""
     T = pressed_in_the_middle(ball)
     mask = simulate_mask(ball, T, False)
     problem = make_problem(mask, SENSOR)
@@ -92,7 +92,7 @@ def test_a_touch_that_no_motion_changes_constrains_nothing():
 
 
 def test_observability_depends_on_the_grid_and_not_on_the_unit_of_rotation():
-    """A quarter of the grid's step, in shifts and in turns, parts what is told from what is not."""
+    """A quarter of the grid's step, in shifts and in turns, separates observable from unobservable directions."""
     spread, length = Spread(np.radians(6) / np.sqrt(12), 4e-3 / np.sqrt(12)), 2e-3
     step = np.repeat([np.radians(6) * length, 4e-3], 3)
     for factor, expected in ((0.99, 6), (1.01, 0)):
@@ -103,7 +103,7 @@ def test_observability_depends_on_the_grid_and_not_on_the_unit_of_rotation():
 def test_agreement_counts_directions():
     spread, length = Spread(0.1, 1e-3), 10e-3
     sharp = np.diag(100 / spread.metres(length) ** 2)
-    rows = np.random.default_rng(0).normal(size=(6, 6))  # all is told, however it is measured
+    rows = np.random.default_rng(0).normal(size=(6, 6))  # all is observable, however it is measured
     assert agreement(sharp, rows, spread, length) == 1 and agreement(0 * sharp, rows, spread, length) == 0
     assert agreement(sharp, rows[:0], spread, length) == 0 and agreement(0 * sharp, rows[:0], spread, length) == 1
     half = sharp.copy()
@@ -119,7 +119,7 @@ def grid_of(space):
 
 @pytest.mark.parametrize("name, turned", [("sphere", [0.0, 0.3, 0.2]), ("rod", [0.0, 0.0, 0.3])])
 def test_a_symmetry_direction_is_not_observable(name, turned):
-    """The same contact, the part turned within its symmetry: no error, however the part lies to the pixels."""
+    """The same contact, the object turned within its symmetry: no error, however the object lies to the pixels."""
     space = ContactSpace(shape(name).with_symmetry(), Sensor("s", (320, 240), (0.07e-3, 0.07e-3), 20e-3, 2e-3))
     T = se3.transform(
         se3.exp([0, 0, 0.4, 0, 0, 0])[:3, :3] @ se3.exp([0, np.pi / 2, 0, 0, 0, 0])[:3, :3], [1e-3, 0.5e-3, 0]

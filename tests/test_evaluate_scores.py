@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
 def evaluate(folder):
     """Runs ``python -m tools.studies scores`` on small grids, with calibrations from few touches; checks the exit status.
 
-    Touches of the same part and kind are made once for all tests.
+    Touches of the same object and kind are made once for all tests.
     """
     made, make = {}, study.make_touches
 
@@ -59,7 +59,7 @@ def evaluate(folder):
 
 @pytest.fixture(scope="module")
 def whole(evaluate, folder):
-    """A study of three scores on two parts: its file's content, what was printed, and its picture."""
+    """A study of three scores on two objects: its file's content, what was printed, and its picture."""
     out, plot = folder / "whole.json", folder / "whole.png"
     done = evaluate("ball", "hex_nut", "--scores", *NAMES, "--out", out, "--plot", plot)
     return json.loads(out.read_text()), done.stdout, plot
@@ -150,7 +150,7 @@ def test_the_screen_shows_a_table_for_each_object_and_one_over_all(whole):
 
 @pytest.fixture
 def stopped(whole, tmp_path):
-    """The file as it is after a kill: the last part's second score has four of its touches, and the third none."""
+    """The file as it is after a kill: the last object's second score has four of its touches, and the third none."""
     content = json.loads(json.dumps(whole[0]))
     del content["overall"]
     found = content["parts"]["hex_nut"]["scores"]
@@ -293,7 +293,7 @@ def test_the_picture_is_drawn_from_the_file_alone(whole):
     assert picture == plot.read_bytes(), "the same file gives the same picture"
     shown = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"))
     assert min(shown.shape[:2]) > 300 and shown.std() > 5
-    # one part alone, and a file that a kill left without any figures, are drawn too
+    # one object alone, and a file that a kill left without any figures, are drawn as well
     one = {**content, "parts": {"ball": content["parts"]["ball"]}}
     assert np.asarray(Image.open(io.BytesIO(draw_scores(one)))).shape[1] < shown.shape[1]
     bare = {"settings": content["settings"], "parts": {"ball": {"scores": {"l1": {}}}}}

@@ -62,7 +62,7 @@ def test_a_shift_moves_every_point_as_far(nut, rng):
 
 
 def test_mssd_of_a_turn_is_the_chord_of_the_farthest_corner(rng):
-    """For a brick without symmetry but the identity known, in closed form."""
+    """For a brick without symmetry but the identity the group is given in closed form."""
     brick = trimesh.creation.box((20 * MM, 30 * MM, 50 * MM))
     mesh = Mesh(brick.vertices, brick.faces, "brick", "m")
     for angle in (0.1, 1.0, 3.0):
@@ -137,7 +137,7 @@ def test_touches_repeat_and_only_elastic_ones_are_computed_anew(localizer):
 
 
 def test_the_energy_score_is_least_for_the_distribution_that_truths_come_from(rng):
-    """Of distributions of a part without and with symmetry that are shifted, too narrow or too wide."""
+    """Of distributions of an object without and with symmetry that are shifted, too narrow or too wide."""
     for name in ("bracket", "hex_nut", "ball"):
         mesh = load_mesh(name).with_symmetry()
 
@@ -210,7 +210,7 @@ def test_a_study_reports_the_figures_of_the_posterior(localizer):
     whole = proper.summarise(outcomes, 5.0)["all"]
     assert whole["recall"]["1"][0] == np.mean([o.mssd_mm <= 10 for o in outcomes])
     assert sum(whole["levels"]["counts"]) == sum(whole["tarp"]["counts"]) == 8
-    # told of a ball's centre alone, which one touch fixes to a millimetre or two
+    # of a ball's centre alone, which one touch fixes to a millimetre or two
     assert all(-0.2 < o.energy_mm <= o.mssd_mm + 3 for o in outcomes)
     assert [o.held for o in outcomes] == [o.add_mm <= 1e3 * mode_radius(localizer.mesh) for o in outcomes]
     gain = [o.gain for o in outcomes]

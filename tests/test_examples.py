@@ -1,4 +1,4 @@
-"""The examples run as they stand, in an empty folder, and come to what their pages say of them."""
+"""The examples run unchanged in an empty folder, and reach the figures of their pages."""
 
 import json
 import re
@@ -44,7 +44,7 @@ def test_touch_until_sure(example):
 
 @pytest.mark.slow
 def test_the_pencils_ends_constrain_most(example, tmp_path):
-    """A touch of its middle tells nothing of which way round it lies; one of its ends does."""
+    """A touch of its middle does not constrain which end lies where; one of its ends does."""
     said = example("docs/examples/pencil.py").splitlines()
     ranked = [line[:24].strip() for line in said if "discards" in line]
     assert len(ranked) == 7 and "end" in ranked[0] and ranked[0] != "finger in the middle"

@@ -1,4 +1,4 @@
-"""Poses go to other tools and come back the same; a covariance says the same in their order and frame."""
+"""Poses go to other tools and come back the same; a covariance is the same in their order and frame."""
 
 from types import SimpleNamespace
 
@@ -47,7 +47,7 @@ def test_bop_results_come_back(poses, tmp_path):
 
 
 def test_a_ros_covariance_is_that_of_the_moved_poses(poses, rng):
-    """Drawn in the object's frame, poses scatter about the mean as the message says: positions, and turns about fixed axes."""
+    """Samples in the object's frame scatter about the mean as the message states: positions, and turns about fixed axes."""
     root = rng.normal(size=(6, 6)) * 1e-3
     mode = SimpleNamespace(T=poses[0], covariance=root @ root.T, probability=0.5)
     message = to_ros(mode, "base", 12.25)

@@ -69,7 +69,7 @@ def test_steps_are_separate_faces_and_feet_are_one():
 
 
 def test_a_rail_hides_no_pad_beside_it():
-    """The larger of two faces that look the same way is an edge, which asks for no finer grid, the other is none."""
+    """The larger of two faces of one direction is an edge, which asks for no finer grid, the other is none."""
     base, rail, pad = (trimesh.creation.box(size) for size in ((100, 24, 10), (100, 1.9, 8), (13, 13, 6)))
     rail.apply_translation((0, 10.5, 5))
     pad.apply_translation((0, -2, 4))

@@ -16,7 +16,7 @@ TIMES = [1.7e9 + i / 30 + 1e-3 * (i * 0.618 % 1) for i in range(300)]
 
 
 def ordered(stems):
-    """The stems of shuffled names in the order taken, and what is said of it."""
+    """The stems of shuffled names in the order taken, and the note on it."""
     stems = list(stems)
     random.Random(0).shuffle(stems)
     paths = in_order(Path(f"{stem}.png") for stem in stems)
@@ -123,7 +123,7 @@ def test_numbers_that_sort_bring_none(names):
 
 
 def warned(folder, names, times):
-    """What is said of files written in a folder at times [s]."""
+    """The notes on files written in a folder at times [s]."""
     for name, at in zip(names, times, strict=True):
         (folder / name).touch()
         os.utime(folder / name, (at, 1.7e9 + at))

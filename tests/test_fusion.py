@@ -1,4 +1,4 @@
-"""Several sensors at once: products, shares of cells, sensors that feel nothing, and sensors that disagree."""
+"""Several sensors at once: products, shares of cells, sensors without contact, and sensors that disagree."""
 
 import json
 from dataclasses import replace
@@ -22,7 +22,7 @@ from geomtact.sensing.reading import write_image
 
 
 def world(touches, rng):
-    """A random pose of the object in the world, and those of the sensors that feel ``touches``."""
+    """A random pose of the object in the world, and those of the sensors that ``touches`` names as in contact."""
     T = se3.transform(se3.random_rotations(1, rng)[0], rng.uniform(-0.2, 0.2, 3))
     return T, np.stack([T @ se3.inverse(touch.T_sensor_object) for touch in touches])
 
@@ -32,7 +32,7 @@ def single(localizer, touch, T):
 
 
 def carried(localizer, rng, pairs):
-    """So many pairs of sensors that touch: the places of poses drawn within cells of the first, and the poses at the second."""
+    """``n`` pairs of sensors that touch: places of poses drawn within cells of the first, and poses at the second."""
     index, space = localizer.index, localizer.space
     T, _ = space.sample(2 * pairs, rng)
     for here, there in zip(T[::2], T[1::2], strict=True):
@@ -43,8 +43,8 @@ def carried(localizer, rng, pairs):
 
 
 def test_a_sensor_in_the_same_place_sees_each_place_in_itself(plug):
-    """Carried nowhere, a place lies in its own: a height is known to the grid's own coarseness, so that a share is left of it,
-    never more than all; and what the other sensor knows is asked of that place and of its neighbours at most."""
+    """A place carried by the identity lies in itself: its height is uncertain by the grid's step, so that it keeps a share,
+    never more than all; and of the other sensor at most that place and its neighbours are looked up."""
     index = plug.index
     transfer = CellTransfer(index, index, np.eye(4))
     share = transfer.shares().sum(0)
@@ -58,7 +58,7 @@ def test_a_sensor_in_the_same_place_sees_each_place_in_itself(plug):
 
 @pytest.mark.parametrize("pairs", slow_but((6, 12), 6))
 def test_shares_equal_the_frequencies_of_simulation(plug, rng, pairs):
-    """Of poses drawn within cells, as many touch a second sensor as the cells' shares say, within a factor of two."""
+    """Of poses drawn within cells, as many touch a second sensor as the cells' shares predict, within a factor of two."""
     expected, happened = [], []
     for transfer, places, T in carried(plug, rng, pairs):
         expected.append(transfer.mean(np.ones(len(plug.index)))[1][places].mean())
@@ -68,7 +68,7 @@ def test_shares_equal_the_frequencies_of_simulation(plug, rng, pairs):
 
 @pytest.mark.parametrize("pairs", slow_but((6, 12), 6))
 def test_sensors_without_contact_are_reached_at_the_stated_frequency(plug, rng, pairs):
-    """Of poses drawn within cells, as many reach a second sensor, however deep, as their shares say; and those that do, more."""
+    """Of poses drawn within cells, as many reach a second sensor, at any depth, as the shares predict; or more."""
     expected, happened = [], []
     for transfer, places, T in carried(plug, rng, pairs):
         expected.append(transfer.reached()[places])
@@ -93,7 +93,7 @@ def test_more_uncertain_extrinsics_spread_the_shares(plug, rng):
 
 
 def test_a_pose_outside_the_approach_does_not_touch(flat_nut):
-    """A nut known to lie on its face never touches a sensor that looks at it from the side."""
+    """A nut that lies on its face never touches a sensor that looks at it from the side."""
     side = se3.transform(se3.exp([np.pi / 2, 0, 0, 0, 0, 0])[:3, :3], np.zeros(3))
     transfer = CellTransfer(flat_nut.index, flat_nut.index, side)
     assert transfer.mean(np.ones(len(flat_nut.index)))[1].max() == 0
@@ -116,7 +116,7 @@ def test_doubtful_places_are_carried_roughly_but_without_bias(plug, rng):
 def test_sensors_with_the_same_errors_count_as_one(rng):
     log_prior, fields = np.full(5000, -np.log(5000.0)), rng.normal(size=(3, 5000))
     three = np.ones(3, bool)
-    # told apart by what they say, they count all but in full, as do sensors without contact
+    # distinguished by their measurements, they count all but in full, as do sensors without contact
     np.testing.assert_allclose(_shares(log_prior, fields, three), 1 / 1.2, atol=0.03)
     np.testing.assert_allclose(_shares(log_prior, fields[[0, 0, 0]], three), 1 / 3, atol=1e-6)
     np.testing.assert_allclose(_shares(log_prior, fields[[0, 1, 0]], three), 1 / np.array([2.1, 1.2, 2.1]), atol=0.05)
@@ -241,7 +241,7 @@ def test_no_contact_anywhere_leaves_the_poses_that_do_not_touch(plug, rng):
 
 @pytest.mark.parametrize("order", [[0, 1], [1, 0]])
 def test_sensors_without_contact_never_exclude_the_truth_for_a_later_one(plug, order):
-    """Two of them stay half a millimetre before the part, in either order; a touch comes later."""
+    """Two of them stay half a millimetre before the object, in either order; a touch comes later."""
     empty = np.zeros(plug.sensor.image_size_px[::-1], bool)
     for seed in range(4):
         touches = random_touches(plug.space, 3, 50 + seed)
@@ -267,7 +267,7 @@ def test_sensors_that_exclude_each_other_are_named(plug, rng):
 
 
 def test_an_improbable_sensor_is_a_warning(plug, rng):
-    """Support far below chance is said in words; agreement is not."""
+    """Support far below chance is a warning; agreement is not."""
     touches = random_touches(plug.space, 3, 10)
     _, sensors = world(touches, rng)
     fused = fuse([single(plug, touch, T) for touch, T in zip(touches, sensors, strict=True)])
@@ -298,8 +298,8 @@ def test_a_prior_counts_once(plug, rng):
     assert slope == pytest.approx(1, abs=0.1)
 
 
-def test_a_posterior_of_another_frame_is_a_prior(plug, rng):
-    """One after the other, two sensors do not rule out the truth, and tell more than each alone."""
+def test_the_posterior_of_one_sensor_is_a_prior_for_another(plug, rng):
+    """One after the other, two sensors do not exclude the truth, and give more information than each alone."""
     gains = []
     for seed in range(50, 58):
         touches = random_touches(plug.space, 2, seed)
@@ -329,7 +329,7 @@ def test_an_image_that_counts_twice_is_a_warning(plug, rng):
 
 
 def test_a_repeated_touch_adds_hardly_any_evidence(plug):
-    """Two sensors at one place show the same, so that together they say about what each says."""
+    """Two sensors at one place show the same, so that together they are about as informative as one."""
     touch = random_touches(plug.space, 1, 13)[0]
     sensors = np.stack([np.eye(4), se3.transform(np.eye(3), [0, 0, 2e-6])])
     once = plug.localize(touch.mask, "mask", effort="fast").log_evidence
@@ -424,7 +424,7 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_jaw_on_a_plain_rod_leaves_the_shift_along_it_open(make_localizer):
-    """Both fingers feel the same all along: no mode claims to know where along the rod they hold it."""
+    """Both fingers see the same all along: no mode is certain where along the rod they hold it."""
     bar = trimesh.creation.cylinder(6e-3, 0.1, sections=64)
     rod = make_localizer(Mesh(bar.vertices, bar.faces, "rod", "m").with_symmetry(), "gelslim", max_poses=8_000)
     lying = se3.transform(se3.exp([0, np.pi / 2, 0, 0, 0, 0])[:3, :3], [0.0, 0.0, 5e-3])  # its axis along x, 1 mm deep
@@ -459,9 +459,9 @@ def test_the_pose_uncertainty_of_extrinsics_equals_their_propagated_errors(rng):
 
 @pytest.mark.slow
 def test_wrong_extrinsics_are_a_warning_and_right_ones_hardly_ever(plug):
-    """Each of the sensors but the first off by 5 mm, in a direction of its own: unless the rig is said to be known no better.
+    """Each sensor but the first is off by 5 mm in a random direction: a warning, unless the stated uncertainty covers it.
 
-    Were one right rig in ten warned of, three of six would be once in 63 times.
+    Were one right set of extrinsics in ten warned of, three of six would be once in 63 times.
     """
     rng = np.random.default_rng(5)
     told, last = {"right": 0, "off": 0, "known to be": 0}, {}
@@ -484,7 +484,7 @@ def test_wrong_extrinsics_are_a_warning_and_right_ones_hardly_ever(plug):
     assert told["right"] <= 2 and told["off"] >= told["right"] + 3 and told["known to be"] == 0, told
     exact = plug.localize(masks, "mask", T_world_sensor=off, extrinsics_std=ExtrinsicsStd())
     assert np.array_equal(exact.log_prob, last["off"].log_prob)
-    # a mode is told no better than the rig
+    # a mode is no more certain than the extrinsics
     for mode in last["known to be"].modes(3):
         assert np.linalg.eigvalsh(mode.covariance[3:, 3:]).min() >= 0.99 * 5e-3**2
     assert poor_agreement(np.inf) and not poor_agreement(None)

@@ -124,7 +124,7 @@ def test_a_broken_file_is_read_or_refused_in_one_line(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", ["toml", "yaml", "poses.json", "actions.json", "csv", "txt"])
 def test_text_saved_otherwise_than_as_utf_8_is_refused_as_that(kind, tmp_path):
-    """As some editors save it; for JSON that says less, by what was expected."""
+    """As some editors save it; for JSON whose message is shorter, by what was expected."""
     made, read, _ = KINDS[kind]
     path = tmp_path / f"file.{kind}"
     path.write_bytes(made().decode().encode("utf-16"))

@@ -1,4 +1,4 @@
-"""Heights: what counts as contact, how likely poses are, and which part it is."""
+"""Depth maps: what counts as contact, how likely poses are, and object identification."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -135,7 +135,7 @@ def test_heights_measure_the_depth_and_the_size_of_a_ball(balls, elastic):
     assert mode.T[:3, 3] == pytest.approx(T[:3, 3], abs=0.06 * MM)
     assert posterior.log_evidence > other.localize(height.astype(np.float32)).log_evidence + 1
     masks = [each.localize(simulate_mask(ball.space, T, elastic)).log_evidence for each in (ball, other)]
-    assert abs(masks[0] - masks[1]) < 1  # a mask hardly tells
+    assert abs(masks[0] - masks[1]) < 1  # a mask hardly does
 
 
 def test_a_gel_at_rest_shows_its_background_and_slopes_that_face_a_lamp_are_brighter(rng):
@@ -161,7 +161,7 @@ def test_a_rendered_tactile_image_gives_its_contact_back(rng):
 
 @pytest.mark.parametrize("n", slow_but((2, 6), 2))
 def test_a_prior_on_the_depth_is_compared_with_the_whole_press(ball, rng, n):
-    """A height map is compared by a contour some way up; how deep the ball lies is not told by that contour's size."""
+    """A depth map is compared by a contour some height up; that contour's size does not measure how deep the ball lies."""
     for T in ball.space.sample(n, rng, (1.3 * MM, 1.6 * MM))[0]:
         height = ball.simulate(T).height
         told = []

@@ -1,4 +1,4 @@
-"""Which part is it: probabilities of parts by their evidence."""
+"""Object identification: probabilities of objects by their evidence."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ from tools.studies.identify.study import Told, identify_scenes, summarise
 
 @pytest.fixture(scope="module")
 def drawer(cache_dir, few_touches):
-    """Three parts unlike each other."""
+    """Three objects of different contacts."""
 
     def part(name, shape):
         mesh = Mesh(shape.vertices, shape.faces, name, "m")
@@ -39,15 +39,15 @@ def drawer(cache_dir, few_touches):
 
 
 def touches(localizer, n=1, seed=0):
-    """What the sensor feels at poses drawn from the contact pose space."""
+    """The contacts at poses drawn from the contact pose space."""
     T = localizer.space.sample(n, np.random.default_rng(seed), (3e-4, 1.5e-3))[0]
     return [localizer.simulate(each).mask for each in T]
 
 
 @pytest.mark.parametrize(("n", "errors"), [(40, 2), pytest.param(160, 3, marks=pytest.mark.slow)])
 def test_touches_are_identified_among_those_of_other_objects(drawer, n, errors):
-    """In the mean own evidence is no smaller than another part's (a Kullback-Leibler divergence is not negative). A ball's is
-    larger by far; the corners of a rod and of a block are alike. Few touches are called unlike their own part."""
+    """The mean evidence of the true object is largest (a Kullback-Leibler divergence is not negative). A ball's is
+    larger by far; the corners of a rod and of a block are alike. Few touches are outliers of their own object."""
     unlike = []
     for own in drawer:
         found = [
@@ -117,7 +117,7 @@ def test_unlike_all_are_outliers_or_unexplained_touches_of_each_object(drawer, s
 @pytest.mark.parametrize("scenes", slow_but((1, 2), 1))
 @pytest.mark.parametrize("flat", slow_but((0, 2), 2))
 def test_three_noisy_touches_of_an_object_are_not_unlike_it(drawer, flat, scenes):
-    """Rigid and elastic gels in turn; some scenes of each part that has flats."""
+    """Rigid and elastic gels in turn; some scenes of each object that has flats."""
     for scene in simultaneous_touches(drawer[flat].space, scenes, 3, 1):
         masks = [touch.mask for touch in scene.touches]
         assert not identify([drawer[flat]], masks, kind="mask", T_world_sensor=scene.T_world_sensor, seed=1).is_unknown

@@ -1,4 +1,4 @@
-"""A reading that cannot be what it is said to be is found out; real ones, left as they are, are not accused."""
+"""A faulty tactile image is detected; real ones, left as they are, are not suspected."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def torn(image, level):
 
 @pytest.fixture(scope="module")
 def sets(data_folder):
-    """For each set of real readings, its background and images, as 0..1."""
+    """For each set of real tactile images, its background and images, as 0..1."""
 
     def read(path):
         return read_image(path)[..., :3] / 255.0

@@ -44,7 +44,7 @@ def test_an_error_sideways_or_down_needs_as_much_clearance_as_it_is_long_and_one
 
 
 def test_the_recess_is_the_volume_that_the_object_sweeps_upwards(mesh, rng):
-    """Held against the least distance from the part of points all the way down, a tenth of a millimetre apart."""
+    """Compared with the least distance from the object of points all the way down, a tenth of a millimetre apart."""
     fixture, up = Fixture(mesh, 100), upwards(mesh)
     about = se3.transform(np.eye(3), mesh.centre)
     xi = rng.normal(size=(3, 6)) * np.repeat([0.02, 5e-4], 3)
@@ -101,7 +101,7 @@ def test_a_grasp_is_between_surfaces_that_face_away_from_each_other(mesh):
     assert points[:, 2].min() < 0 < points[:, 2].max()
 
 
-def test_a_jaw_that_meets_nothing_has_no_contact_and_stays(nut):
+def test_a_jaw_that_meets_nothing_has_no_contact_at_its_origin(nut):
     far = se3.transform(np.eye(3), [1.0, 0, 0])
     felt = touch_with_jaw(ContactSpace(nut, SENSOR), far, np.eye(4), False, CLEAN, np.random.default_rng(0))
     assert np.array_equal(felt.T_world_sensor, [np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])])
@@ -149,9 +149,9 @@ def steps(plug):
 
 def test_the_robot_touches_again_with_one_finger_or_two(steps):
     first, second = (len(step.felt.masks) for step in steps)
-    assert 1 <= first <= 2 and first <= second <= first + 2  # one stopped by too small a contact tells nothing
+    assert 1 <= first <= 2 and first <= second <= first + 2  # one stopped by too small a contact adds no information
     for step in steps:
-        # nothing is wider off than a metre, but few poses may explain what was felt
+        # nothing is wider off than a metre, but few poses may explain the touches
         n = step.belief.effective
         assert step.decisions[1].probability == pytest.approx(n / (n + 1))
         assert step.decisions[0].probability <= step.decisions[1].probability

@@ -18,7 +18,7 @@ DEPTHS = (0.25 * MM, 0.75 * MM, 1.25 * MM, 1.75 * MM)
 
 
 def stored_cones(n, rng):
-    """An index of ``n`` places whose contacts are the contour lines of cones, and what each cone needs to be felt [m]."""
+    """An index of ``n`` places whose contacts are the contour lines of cones, and the depth at which each cone is touched [m]."""
     y, x = np.mgrid[:24, :32]
     centre = rng.uniform((6, 8), (18, 24), (n, 2))
     needed = (
@@ -41,7 +41,7 @@ def test_it_equals_the_sum_over_pixels(rng):
     score = PixelLikelihood().score(index, seen)
     weight = min(1.0, 0.25e-6 / 4e-6)
     for p, i in product(range(4), range(9)):
-        contour = 4 - masks[:, i].sum(0)  # the first penetration at which each pixel is felt
+        contour = 4 - masks[:, i].sum(0)  # the first penetration at which each pixel is in contact
         below = DEPTHS[p] - contour * 0.5 * MM
         each = []
         for t, s in product(THRESHOLDS, SOFTNESS):
@@ -54,7 +54,7 @@ def test_the_pose_that_made_the_contact_is_the_most_likely(rng):
     index, masks, needed = stored_cones(40, rng)
     hits = []
     for i in range(40):
-        for share in (0.0, 0.5):  # rigid, and as a gel would feel it
+        for share in (0.0, 0.5):  # rigid, and as a gel would show it
             felt = needed[i] <= (1 - share) * DEPTHS[2]
             if felt.sum() > 12:
                 score = PixelLikelihood().score(index, felt)
@@ -91,7 +91,7 @@ def test_a_cast_at_the_true_pose_is_more_likely_than_beside_it(plug, rng, elasti
 
 @pytest.mark.slow
 def test_a_fine_grid_localizes_the_object(make_localizer):
-    """One exact face, so that a cell is a few millimetres wide: more than the thesis's pixel distance tells."""
+    """One exact face, so that a cell is a few millimetres wide: finer than the thesis's pixel distance resolves."""
     face = [((0, 0, 1), 0.0)]
     gain = {}
     for name in ("likelihood", "l1"):

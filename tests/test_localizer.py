@@ -44,7 +44,7 @@ def test_a_press_at_the_true_pose_is_more_probable_than_chance(localizer, a_touc
 
 
 def test_the_nut_on_its_flat_is_localized_by_its_hole(flat_nut, uniform_poses):
-    """With the face known, x, y and depth of a nut pressed over the window are told by one mask."""
+    """With the contact face given, one mask constrains x, y and depth of a nut pressed over the window."""
     T, _ = uniform_poses(flat_nut)
     area = np.array([pressed(flat_nut, pose).sum() for pose in T[:80]])
     error = []
@@ -263,8 +263,9 @@ def test_a_gaussian_prior_has_the_cells_of_its_samples(plug, uniform_poses, std)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["curved", "flat_nut"])
 def test_a_prior_outlives_a_sensor_without_contact_whichever_image_it_names(name, request, uniform_poses):
-    """A sensor far away feels nothing: what it tells is the prior, the same of every image of a pose, and as a prior for another
-    sensor it says what the prior itself says there."""
+    """A sensor far away has no contact: its posterior is the prior, the same for every image of a pose.
+
+    As a prior for another sensor it has the density of the prior itself."""
     localizer = request.getfixturevalue(name)
     T, symmetry = T_WORLD @ uniform_poses(localizer)[0][0], localizer.mesh.symmetry
     far = T_WORLD.copy()
@@ -282,7 +283,7 @@ def test_a_prior_outlives_a_sensor_without_contact_whichever_image_it_names(name
 
 
 def test_an_impossible_prior_is_refused_and_a_contradicted_one_is_mostly_a_warning(plug, uniform_poses):
-    """About the true pose nothing is said; about those of far larger or smaller contacts, in a third of the cases at least."""
+    """About the true pose no warning; about those of far larger or smaller contacts, one in a third of the cases at least."""
     T = uniform_poses(plug)[0][:60]
     masks = [plug.simulate(pose).mask for pose in T]
     some = np.argsort([mask.sum() for mask in masks])[[0, 30, 59]]
@@ -293,7 +294,7 @@ def test_an_impossible_prior_is_refused_and_a_contradicted_one_is_mostly_a_warni
         warnings = plug.localize(masks[some[j]], "mask", prior=prior, effort="fast").warnings
         told[i, j] = any("contradict each other" in warning for warning in warnings)
     assert not told.diagonal().any() and told.sum() >= 2
-    # at a metre, and so many standard deviations of 10 mm away from the sensor, beside which a cell is narrow
+    # at a metre, and that many standard deviations of 10 mm away from the sensor, beside which a cell is narrow
     wide = np.diag([0.02**2] * 3 + [(10 * MM) ** 2] * 3)
     near, far = (GaussianPrior(transform(T[0, :3, :3], T[0, :3, 3] + [0, 0, k * 10 * MM]), wide) for k in (6, 12))
     for away in (GaussianPrior(transform(T[0, :3, :3], [0, 0, 1]), covariance), far):
@@ -306,7 +307,7 @@ def test_an_impossible_prior_is_refused_and_a_contradicted_one_is_mostly_a_warni
 
 @pytest.mark.parametrize("width", [0.3, 0.8, 2.0, 6.0])
 def test_a_gaussian_prior_is_the_density_of_its_samples(rng, width):
-    """What is drawn is turned as far, in the mean, as its density over evenly drawn poses says; and the wider, the more."""
+    """Samples are turned as far, in the mean, as the density over evenly drawn poses gives; and the wider, the more."""
     prior = GaussianPrior(np.eye(4), np.diag([width**2] * 3 + [1.0] * 3))
     even = transform(random_rotations(300_000, rng), rng.uniform(-3.5, 3.5, (300_000, 3)))
     weight = np.exp(prior(even))
@@ -348,7 +349,7 @@ def test_a_prior_in_the_world_frame_is_the_same_prior(plug, a_touch):
 
 
 def test_a_posterior_of_another_touch_in_the_world_is_a_prior(make_localizer):
-    """Two sensors' poses, one ball: the first touch tells the second where the ball is."""
+    """Two sensors' poses, one ball: the first touch is a prior for the second on where the ball is."""
     ball = make_localizer("ball", "gelsight-mini", max_poses=4000, touches=60)
     ball_in_world = transform(np.eye(3), [0.2, 0.1, 0.3])
     first = ball_in_world @ np.linalg.inv(transform(np.eye(3), [2 * MM, 1 * MM, 5 * MM]))
@@ -383,7 +384,7 @@ def test_a_prior_that_makes_no_sense_is_refused(ball, a_touch, prior, error, mes
 
 
 def test_a_mode_is_a_prior(localizer, a_touch):
-    """Of a ball, too, whose turns tell nothing."""
+    """Of a ball as well, whose turns are unobservable."""
     mode = localizer.localize(a_touch(localizer)[1]).modes(1)[0]
     prior = GaussianPrior(mode.T, mode.covariance)
     assert localizer.localize(a_touch(localizer)[1], prior=prior, effort="fast").log_density(mode.T) > 0
@@ -446,7 +447,7 @@ def test_an_exact_face_holds_to_a_millionth_of_a_radian(flat_nut, uniform_poses,
         assert (finite == inside).all()
 
 
-# --- the same part
+# --- the same object
 
 
 def test_millimetre_stl_and_metre_glb_give_one_posterior(make_localizer, tmp_path):
@@ -493,7 +494,7 @@ def test_the_order_of_vertices_and_faces_does_not_matter(make_localizer, rng):
 
 
 def test_probabilities_come_true(plug):
-    """Over fresh touches the truth gains information, and the credible regions hold it as often as they say."""
+    """Over fresh touches the truth gains information, and the credible regions hold it at their nominal rate."""
     touches = random_touches(plug.space, 100, seed=77)
     gain, level = [], []
     for touch in touches:
@@ -527,7 +528,7 @@ def test_prepare_loads_its_own_files(ball, cache_dir, monkeypatch):
 
 @pytest.mark.parametrize("name", slow_but(["curved", "flat_nut"], "flat_nut"))
 def test_a_prior_about_any_symmetric_image_is_the_same_prior(name, request, a_touch):
-    """Twelve turns of a nut are one pose: a camera that reports any of them knows as much."""
+    """Twelve turns of a nut are one pose: a camera that reports any of them gives the same prior."""
     localizer = request.getfixturevalue(name)
     T_true, mask = a_touch(localizer)
     seen = []

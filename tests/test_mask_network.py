@@ -1,4 +1,4 @@
-"""The network that finds contacts: what it learns from, that a run repeats, and how imprints drawn by hand judge it."""
+"""The network that finds contacts: its training images, a repeatable run, and its agreement with imprints drawn by hand."""
 
 from dataclasses import replace
 
@@ -120,7 +120,7 @@ def test_training_goes_on_from_weights_that_are_given(parts, tmp_path):
     same, _ = train_mask(parts, still, tmp_path / "still", start=weights)
     for name, value in same.state_dict().items():
         assert torch.equal(value, weights[name])
-    # those of a network that is less deep, or sees less, tell the same at first
+    # those of a network that is less deep, or sees less, start with the same output
     shallow = {name: value for name, value in weights.items() if not name.startswith("deeper.")}
     shallow["down.0.0.weight"] = shallow["down.0.0.weight"][:, :6]
     x = torch.randn(2, CHANNELS, 24, 32, generator=torch.Generator().manual_seed(1))
@@ -149,7 +149,7 @@ def test_a_written_file_records_its_inputs(tmp_path):
 
 @pytest.mark.slow
 def test_the_bundled_network_segments_unseen_presses():
-    """Its own parts have other seeds; of simulated readings it is right about most of the contact."""
+    """Its validation objects have other seeds; on simulated images it is right about most of the contact."""
     from geomtact.sensing.mask_network import _network
 
     parts = [press_part(i, 991) for i in range(4)]
@@ -275,7 +275,7 @@ def test_overlap_and_centre_are_those_of_the_circle_made_smaller(rng):
 
 
 def test_the_factor_of_one_half_is_evaluated_on_the_other():
-    """Contacts of even images fill 1 / 1.3 of the imprint, of odd ones 1 / 1.5: each is judged with the other's factor."""
+    """Contacts of even images fill 1 / 1.3 of the imprint, of odd ones 1 / 1.5: each is scored with the other's factor."""
     image = np.zeros((120, 160, 3), np.uint8)
     drawn = [Imprint(f"{i}", np.full_like(image, i), image, (80.0, 60.0, 36.0)) for i in range(8)]
     found = find(drawn, "made", lambda image, _: disk(80, 60, 36 / (1.5 if image[0, 0, 0] % 2 else 1.3)))

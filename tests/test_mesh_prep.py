@@ -97,7 +97,7 @@ def test_a_sound_mesh_is_kept_to_the_last_bit(name, tmp_path):
     scale=st.floats(0.2, 5.0),
 )
 def test_shuffled_repeated_turned_and_torn_apart_it_comes_back(seed, turned, repeated, name, scale, tmp_path):
-    """Whatever its pose and size, with its faces in any order, some stored twice or inside out, each with corners of its own."""
+    """In any pose and size, with its faces in any order, some stored twice or inside out, each with separate corners."""
     rng = np.random.default_rng(seed)
     part = load_mesh(name)
     T = se3.transform(se3.random_rotations(1, rng)[0], rng.uniform(-50, 50, 3))
@@ -309,7 +309,7 @@ def prepared(file, unit, folder):
 
 
 def apart(a, b, mask):
-    """How far apart [mm] two localizers' first modes are, in mean point distance, modulo the part's symmetry."""
+    """How far apart [mm] two localizers' first modes are, in mean point distance, modulo the object's symmetry."""
     one, other = (each.localize(mask, "mask").modes(1)[0].T for each in (a, b))
     return 1e3 * PoseDistance(a.mesh).mean(one, other[None])[0]
 

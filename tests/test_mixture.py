@@ -90,7 +90,7 @@ def mixture(shares, scores, weight, temperature):
 
 
 def density(rows):
-    """What rows say before the floor (N,), and their measure (N,)."""
+    """The densities of rows before the uniform mixture weight (N,), and their measure (N,)."""
     log_prob = posterior_log_prob(rows.score, rows.log_prior, replace(rows.calibration, floor=0.0))
     return np.exp((log_prob - rows.log_prior).astype(float)), np.exp(rows.log_prior.astype(float))
 
@@ -173,7 +173,7 @@ def test_cells_are_scored_by_the_mixture(localizer, fit, contact, above):
 
 
 def test_a_prior_weighs_the_mixture_and_does_not_change_it(localizer, rng):
-    """Scores of the cells are those without a prior: what was known before is no part of the likelihood."""
+    """Scores of the cells are those without a prior: the prior is not included in the likelihood."""
     fit, index = localizer.scorer, localizer.index
     mask, _ = two_patches(localizer)
     prior = np.full(len(index), -np.inf)

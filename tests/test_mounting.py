@@ -1,4 +1,4 @@
-"""How a sensor is mounted, and light that flickers, are no part of what touches it."""
+"""Neither a sensor's mounting nor flickering light changes the contact."""
 
 from dataclasses import replace
 
@@ -66,7 +66,7 @@ def simulated():
 
 @pytest.fixture(scope="module")
 def real(data_folder):
-    """For each set of real readings, its background and every fourth image."""
+    """For each set of real tactile images, its background and every fourth image."""
 
     def read(path):
         return read_image(path)[..., :3]
@@ -87,7 +87,7 @@ def real(data_folder):
 
 
 def agreements(pairs, method, seed):
-    """How much the contact overlaps that of each pair when both images are turned and mirrored in one way of seven."""
+    """How much the contact overlaps that of each pair when both images are turned and mirrored in one of seven orientations."""
     rng, out = np.random.default_rng(seed), []
     for image, rest in pairs:
         way = divmod(int(rng.integers(1, 8)), 2)

@@ -1,4 +1,4 @@
-"""Laws of choosing the next touch: information is what tells places apart, and there is none where all look alike."""
+"""Laws of choosing the next touch: information distinguishes places, and there is none where all look alike."""
 
 import json
 from dataclasses import replace
@@ -40,7 +40,7 @@ T_MOVED = exp([0.3, -1.2, 0.5, 0.4, -0.1, 0.7])
 
 
 def shifts(*mm):
-    """Poses (2, n, 4, 4) of an object moved without turning, each place known by two equal poses."""
+    """Poses (2, n, 4, 4) of an object moved without turning, each place given by two equal poses."""
     return np.tile(transform(np.eye(3), MM * np.array(mm, float)), (2, 1, 1, 1))
 
 
@@ -94,7 +94,7 @@ def test_information_is_between_nothing_and_the_entropy(rng):
 
 
 def test_information_of_a_binary_report():
-    """Right with 1 - e, it tells two places apart by log 2 less what the doubt takes, in the mean of what is told."""
+    """Right with probability 1 - e, it separates two places by log 2 less the doubt, in the mean over reports."""
     e = 0.01
     likelihood = np.array([[1 - e, e], [e, 1 - e]])
     assert information(likelihood) == pytest.approx(np.log(2) + np.log(1 - e))
@@ -119,7 +119,7 @@ def test_equal_outcomes_are_equally_likely_everywhere(rng):
 
 
 def test_variation_within_places_is_no_information(rng):
-    """The same spread within every place as between them: to the naive all differ, but no place is told by it."""
+    """The same spread within every place as between them: to the naive all differ, but no place is distinguished."""
     shown = rng.normal(size=(5, 100, 3))
     noise = np.full(3, 1e-3)
     assert information(likelihoods(np.ones((5, 100), bool), shown, noise)) < 0.1
@@ -137,7 +137,7 @@ def test_an_action_that_distinguishes_two_places_is_worth_log_2(block):
     at_the_end = evaluate(block, above(22), poses)
     assert at_the_end.expected_nats == pytest.approx(np.log(2), abs=0.02)
     assert at_the_end.expected_discarded == pytest.approx(0.5)
-    # how far the sensor comes tells as much as what it then shows
+    # how far the sensor comes is as informative as what it then shows
     from_the_side = Touch(transform(np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]]), [60 * MM, 0, 0]), 0.05)
     assert evaluate(block, from_the_side, poses).expected_nats == pytest.approx(np.log(2), abs=0.02)
 
@@ -196,7 +196,7 @@ def test_a_housing_that_strikes_first_shows_nothing(block):
 
 
 def test_the_pencil_is_constrained_at_its_ends(pencil):
-    """Held at a place where it looks the same all along, a pencil may be shifted, and either way round."""
+    """Held at a place where it looks the same all along, a pencil may be shifted and reversed."""
     there = [transform(np.eye(3), [x * MM, 0, 0]) for x in (-6, -2, 2, 6)]
     turned = [T @ transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) for T in there]
     poses = np.tile(np.stack(there + turned), (2, 1, 1, 1))
@@ -213,7 +213,7 @@ def test_the_pencil_is_constrained_at_its_ends(pencil):
     assert side.expected_nats < LEAST
     assert finger_in_the_middle.expected_nats == 0
     for end in ends:
-        assert end.expected_nats > 0.9 * np.log(8)  # how far the sensor comes and what it feels tell all eight
+        assert end.expected_nats > 0.9 * np.log(8)  # how far the sensor comes and its contact distinguish all eight
     assert tip_from_above.expected_nats > 0.7
     assert 0.4 < finger_at_the_end.expected_nats < np.log(2)
     assert "same" in ambiguity([side, finger_in_the_middle])
@@ -222,7 +222,7 @@ def test_the_pencil_is_constrained_at_its_ends(pencil):
 
 @pytest.fixture(scope="module")
 def on_a_facet(make_localizer, tmp_path_factory):
-    """A pencil known to be touched on one of its facets or the opposite one; and R (3, 3) that lays that facet on the sensor."""
+    """A pencil that is touched on one of its facets or the opposite one; and R (3, 3) that lays that facet on the sensor."""
     part = load_mesh(pencil_file(tmp_path_factory.mktemp("pencil")), "mm")
     facet = part.normals[np.argmax(part.areas)]
     R = np.linalg.svd(facet[None])[2]
@@ -232,7 +232,7 @@ def on_a_facet(make_localizer, tmp_path_factory):
 
 @pytest.mark.slow
 def test_after_a_touch_on_its_side_a_pencil_is_touched_at_an_end(on_a_facet):
-    """From the posterior of a simulated touch, with the pencil known to lie on a facet."""
+    """From the posterior of a simulated touch, with the facets as contact faces."""
     localizer, R = on_a_facet
     T, _ = localizer.space.settle(transform(R, np.zeros(3)), 1 * MM)
     posterior = localizer.localize(localizer.simulate(T[0]).mask, T_world_sensor=np.eye(4))
@@ -275,7 +275,7 @@ def test_ranked_by_nats_for_the_cost_and_the_same_for_the_same_seed(posterior):
 def test_ties_keep_the_order_given(posterior):
     away = Touch(transform(np.eye(3), [5.0, 0, 0]), 0.01)
     touches = grid_of_touches(posterior)
-    near = touches[next_touch(posterior, touches, n=32)[0].number - 1]  # the one that tells most
+    near = touches[next_touch(posterior, touches, n=32)[0].number - 1]  # the most informative one
     ranked = next_touch(posterior, [away, near, away, near], n=32)
     assert [a.number for a in ranked] == [2, 4, 1, 3]
     assert ranked[2].expected_nats == 0

@@ -1,4 +1,4 @@
-"""Laws of outlines: the nearer, the likelier, whatever the grid; a gel sinks as its solver says; the search climbs."""
+"""Laws of outlines: the nearer, the likelier, on any grid; a gel sinks as its solver predicts; the search climbs."""
 
 import numpy as np
 import pytest

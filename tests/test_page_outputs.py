@@ -15,7 +15,7 @@ mode probability centre
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Where commands run, with a cache of its own, so at the full size."""
+    """Where commands run, with a separate cache, so at the full size."""
     folder = tmp_path_factory.mktemp("pages")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GEOMTACT_CACHE", str(folder / "cache"))

@@ -43,7 +43,7 @@ def of_a_known_side(content):
 
 
 def counted(some):
-    """How many answers are right, how many of these carry a warning, how many are wrong, how many of these are silent."""
+    """How many estimates are right, how many of these carry a warning, how many are wrong, how many of these are undetected."""
     warned = [each.warned for each in some if not each.wrong]
     return len(warned), sum(warned), len(some) - len(warned), sum(each.silent for each in some)
 

@@ -1,4 +1,4 @@
-"""A localizer and its posteriors go to other processes and come back the same; what cannot says so."""
+"""A localizer and its posteriors go to other processes and come back the same; one that cannot is an error."""
 
 import copy
 import multiprocessing
@@ -25,7 +25,7 @@ def downwards(T):
 
 
 def check_same(a, b):
-    """To the last bit, all that a posterior answers."""
+    """To the last bit, every result of a posterior."""
     assert (a.frame, a.contact, a.seed, a.warnings, a.log_evidence) == (
         b.frame,
         b.contact,

@@ -1,4 +1,4 @@
-"""A board of pins tells how many millimetres a pixel is, through a lens that distorts."""
+"""A board of pins measures how many millimetres a pixel is, through a lens that distorts."""
 
 import numpy as np
 import pytest

@@ -42,7 +42,7 @@ def simple_polygon(n, rng, straight=0):
 
 
 def untangled(ring):
-    """The corners in an order in which no two sides cross: each crossing that is undone makes the way round shorter."""
+    """The corners in an order in which no two sides cross: each crossing that is undone makes the outline shorter."""
     n = len(ring)
     i, j = np.triu_indices(n, 2)
     while True:
@@ -435,7 +435,7 @@ def test_skipped_elements_are_noted():
 @pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])
 def test_ply_headers_end_in_any_line_ending(end):
     head, body = as_ply(*BOX, "binary_big_endian").split(b"end_header\n")
-    # a body that begins as a line ends is not taken for one
+    # a body that begins as a line ends is not mistaken for one
     assert measured(read_ply((head + b"end_header\n").replace(b"\n", end) + body)) == pytest.approx((376, 480))
 
 
@@ -510,7 +510,7 @@ def test_several_solids_of_text_are_one_mesh():
     [
         (WHOLE[:-50], "is cut short: expected 684 bytes .*, found 634"),
         (WHOLE[:-7], "is cut short"),
-        # two boxes, of which the header counts the first: both readings close
+        # two boxes, of which the header counts the first: both interpretations close
         (
             as_stl(np.concatenate([BOX[0], BOX[0] + 20]), np.concatenate([BOX_TRIANGLES, BOX_TRIANGLES + 8]), 12),
             "for 24",

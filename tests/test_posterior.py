@@ -89,7 +89,7 @@ def test_information_gain_is_minus_entropy(localizer, posteriors):
 def test_the_density_integrates_to_one(localizer, posteriors, uniform_poses):
     """Its mean over poses drawn uniformly, without the index, is 1 within its standard error and the grid's coarseness."""
     posterior = posteriors(localizer)
-    # flattened, so that two hundred poses can tell: a mixture with the uniform of the posterior's square root
+    # flattened, so that two hundred poses are enough: a mixture with the uniform of the posterior's square root
     w = localizer.index.mass(posterior.cells, runs_of(posterior))
     p = np.exp(0.25 * posterior.log_prob + 0.75 * np.log(w))
     flat = replace(posterior, log_prob=np.log(p / p.sum()))
@@ -278,7 +278,7 @@ def test_modes_returns_as_many_as_asked_for_in_any_order_of_cells(plug, posterio
 
 
 def test_samples_follow_the_probabilities_of_the_cells(localizer, posteriors, samples):
-    """Also those of cells on the border of the space: grouped by share, draws come as often as the masses say."""
+    """Also those of cells on the border of the space: grouped by share, samples come as often as their mass."""
     posterior, index = posteriors(localizer), localizer.index
     T = samples(localizer)
     depth = localizer.space.penetration(T)
@@ -488,7 +488,7 @@ def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_
         halved = np.exp(reweight_cells(before, before.cells[row], likelihood, others_factor=0.5).log_prob.astype(float))
         assert halved.sum() == pytest.approx(q.sum(), rel=1e-5)
         assert halved[others].sum() / halved[row].sum() == pytest.approx(0.5 * q[others].sum() / q[row].sum(), rel=1e-4)
-        # where what was known before counts for nothing, the likelihood alone is the density
+        # where the prior counts for nothing, the likelihood alone is the density
         anew = reweight_cells(before, before.cells[row], likelihood, image_power=0.0)
         density = row_log_density(anew, row)
         np.testing.assert_allclose(density - density[0], likelihood - likelihood[0], atol=1e-4)

@@ -19,7 +19,7 @@ NATS, SHARE, PERCENT = 0.03 + 0.05, 0.03, 0.1 + 0.05
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Gives what words of the command line, or Python code, print; with a cache of its own, so at the full size."""
+    """Gives what words of the command line, or Python code, print; with a separate cache, so at the full size."""
     folder = tmp_path_factory.mktemp("quickstart")
 
     def run(words, capsys=None):

@@ -1,4 +1,4 @@
-"""Standard error is geomtact's own, and no file name is too strange: what succeeds says nothing that a library wrote."""
+"""Standard error holds geomtact's lines alone, and no file name is too unusual: success prints no library's messages."""
 
 import json
 import os
@@ -23,7 +23,7 @@ CLAIMED = "from geomtact.cli.shell import claim_output, tell; claim_output()\n"
 
 
 def python(code, *options, **variables):
-    """What a Python of its own writes to both streams, and its exit status."""
+    """What a separate Python process writes to both streams, and its exit status."""
     done = subprocess.run(
         [sys.executable, *options, "-c", code], capture_output=True, cwd=ROOT, env={**os.environ, **variables}
     )

@@ -1,4 +1,4 @@
-"""Laws of reading an image: which kind it is, what is refused and how, and the contact in real RGB readings."""
+"""Laws of loading an image: its kind, the errors of bad files, and the contact in real RGB tactile images."""
 
 import csv
 import re
@@ -542,7 +542,7 @@ def test_the_real_digit_without_contact_shows_none(data_folder, rng):
 
 
 def test_simulated_digit_images_give_rounded_patches(data_folder):
-    """Each of 20 readings: one patch that holds most of the mask, without holes, near the contact on the axis."""
+    """Each of 20 images: one patch that holds most of the mask, without holes, near the contact on the axis."""
     from scipy import ndimage
 
     folder = data_folder / "hsp_digit_sim_ycb"

@@ -1,4 +1,4 @@
-"""Real readings: balls pressed into a GelSight Mini lie where the eye sees them, and the simulated DIGIT of others runs
+"""Real tactile images: balls pressed into a GelSight Mini lie where the eye sees them, and the simulated DIGIT of others runs
 from RGB to a report. ``pytest -s`` prints a table of all presses."""
 
 import csv
@@ -154,7 +154,7 @@ def _of_marker(row, sensor):
 
 @pytest.fixture(scope="module")
 def marker(data_folder, tmp_path_factory, few_touches):
-    """A localizer of a marker on a DIGIT that others simulated, and the posterior of each of their readings with its
+    """A localizer of a marker on a DIGIT that others simulated, and the posterior of each of their images with its
     pose, but for how deep it presses: [(posterior, T)]."""
     folder = data_folder / "hsp_digit_sim_ycb"
     localizer = Localizer.prepare(
@@ -189,7 +189,7 @@ def test_tactile_images_of_another_simulator_localize_the_marker(marker):
     depths = np.array(localizer.index.resolution.penetrations)
     gains = []
     for posterior, T in read:
-        # how deep the marker presses is not known: the mean density over the depths that touch
+        # the marker's depth is unknown: the mean density over the depths that touch
         settled, touches = localizer.space.settle(np.tile(T, (len(depths), 1, 1)), depths)
         gains.append(np.log(np.exp(posterior.log_density(settled[touches])).mean()))
     claimed = -np.mean([posterior.entropy_nats for posterior, _ in read])

@@ -87,7 +87,7 @@ def forms_of_prior(T):
     """A prior about ``T`` (4, 4) in every form, but for a posterior."""
     gaussian = GaussianPrior(T, np.diag(STD**2))
     cloud = T @ exp(np.random.default_rng(4).normal(0, 0.2 * STD, (1100, 6)))
-    cloud[0] = T  # off it, those of a known face hardly touch as the approach allows
+    cloud[0] = T  # off it, those of an exact contact face hardly touch as the approach allows
     return {
         "Gaussian": gaussian,
         "function": lambda others: gaussian(others),
@@ -102,7 +102,7 @@ def test_modes_are_the_images_nearest_to_a_prior(name, request, a_touch, rng):
     T, mask = a_touch(localizer)
     T = T_WORLD @ an_image(localizer, T, rng)
     forms = forms_of_prior(T)
-    del forms["Gaussian"]  # which takes seconds; it is tried on the way to the disk
+    del forms["Gaussian"]  # which takes seconds; it is tried before the disk
     for prior in forms.values():
         posterior = localizer.localize(mask, T_world_sensor=T_WORLD, prior=prior, effort="fast")
         plain = replace(posterior, reference=None)

@@ -1,4 +1,4 @@
-"""Refinement brings poses nearer in what the contact tells, leaves the rest alone, and never claims too much."""
+"""Refinement improves poses in observable directions, leaves the rest alone, and is never overconfident."""
 
 import dataclasses
 
@@ -99,7 +99,7 @@ def test_covariance_covers_the_error_where_the_model_holds(block):
 
 @pytest.mark.parametrize("refiner", REFINERS)
 def test_a_face_beyond_the_window_constrains_nothing_and_nothing_drifts(refiner):
-    """All pixels in contact: no rim. One straight edge: only the shift across it (and turn along it) is told."""
+    """All pixels in contact: no rim. One straight edge: only the shift across it (and turn along it) is observable."""
     plate = trimesh.creation.box((80e-3, 60e-3, 5e-3))
     surface, caster = scene(plate, 80000)
     spread = SPREAD
@@ -125,7 +125,7 @@ def test_a_face_beyond_the_window_constrains_nothing_and_nothing_drifts(refiner)
         assert len(result.observable[0]) >= 1
         along = se3.apply(result.T[0] @ se3.inverse(start), problem.centre[None])[0] - problem.centre
         assert abs(along[1]) < 0.05e-3
-        # a straight edge along the pixels is known to half a pixel
+        # a straight edge along the pixels is located to half a pixel
         better += told_error(result, T, result.T[0]) < 0.3 * told_error(result, T, start) + 0.5 * 0.3e-3
     # a start that lifts the plate off the membrane has no wall near the rim
     assert converged >= 18 and better >= converged - 1
@@ -149,7 +149,7 @@ def test_a_ball_constrains_its_position_along_the_membrane_only(refiner, ball):
 
 
 def test_result_does_not_depend_on_the_object_frame(block):
-    """The same part in another frame: same poses of the part, and covariances that agree about the contact."""
+    """The same object in another frame: same poses of the object, and covariances that agree about the contact."""
     surface, caster = block
     T = facing_down(1e-3, -1e-3, 0.8e-3, 9e-3, turn=0.4)
     problem = make_problem(touch(caster, T), SENSOR)
@@ -204,7 +204,7 @@ def test_specks_have_no_rim_and_a_curved_membrane_lifts_it():
 
 @pytest.mark.slow
 def test_open3d_repeats_itself_to_the_last_digit(pin, a_touch):
-    """Its sums run over threads, and a rim that tells little turns another order of adding into another pose."""
+    """Its sums run over threads, and a weakly constrained rim turns another order of adding into another pose."""
     mask = pin.localize(a_touch(pin)[1], effort="fast").observation.contact.mask
     problem = make_problem(mask, pin.sensor)
     starts = pin.index.poses(leading_cells(pin.localize(a_touch(pin)[1], effort="fast"), 3))
@@ -220,7 +220,7 @@ def ring(radius=4e-3):
 
 
 def unsound():
-    """Readings that break registration written for clean ones, by name: (mask, height)."""
+    """Images that break registration written for clean ones, by name: (mask, height)."""
     x, y = SENSOR.pixel_centres()
     disk = np.hypot(x, y[:, None]) < 4e-3
     two = (np.hypot(x - 5e-3, y[:, None]) < 2e-3) | (np.hypot(x + 5e-3, y[:, None]) < 2e-3)
@@ -256,7 +256,7 @@ def test_unsound_images_end_in_a_sound_result(refiner, name, block):
 
 
 def test_a_third_of_outliers_leaves_the_pose_where_it_belongs(block):
-    """Points of the outline moved anywhere in the window: what is told is still told to half a pixel, by median."""
+    """Points of the outline moved anywhere in the window: observable directions stay within half a pixel, by median."""
     surface, caster = block
     errors, before, believed = [], [], []
     for seed in range(30):
@@ -290,7 +290,7 @@ def test_a_surface_drawn_point_to_point_comes_nearer_too(block):
 
 
 def test_heights_constrain_directions_that_the_outline_does_not(ball):
-    """How deep a ball is pressed: an outline may belong to a gel that sinks around it, heights say."""
+    """How deep a ball is pressed: an outline may belong to a gel that sinks around it, heights measure it."""
     surface, caster = ball
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -329,7 +329,7 @@ def test_gel_that_hangs_free_beside_a_punch_moves_nothing_sideways(size, soft):
 
 
 def test_missing_heights_are_no_border_of_the_contact(block):
-    """Where heights are missing nothing is known: neither an outline nor membrane that was not met."""
+    """Where heights are missing nothing is measured: neither an outline nor membrane that was not met."""
     _, caster = block
     contact = caster.contact(SENSOR, facing_down(0, 0, 0.8e-3, 9e-3))
     gap = np.zeros(contact.mask.shape, bool)
@@ -379,7 +379,7 @@ def test_a_spread_of_zero_and_a_surface_of_one_point_are_refused():
 
 
 def test_contacts_of_two_sensors_together_constrain_directions_that_each_leaves_open():
-    """Two edges of a plate at right angles: each tells the shift across itself, both tell the place."""
+    """Two edges of a plate at right angles: each constrains the shift across itself, both constrain the place."""
     plate = trimesh.creation.box((80e-3, 60e-3, 5e-3))
     surface, caster = scene(plate, 80000)
     T_world_object = np.eye(4)

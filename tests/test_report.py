@@ -1,4 +1,4 @@
-"""The report says what the posterior says: in plain numbers, in result.json, in one picture and in one page."""
+"""The report shows the posterior: in plain numbers, in result.json, in one picture and in one page."""
 
 import io
 import json
@@ -213,8 +213,9 @@ window.addEventListener("load", () => setTimeout(() => {
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with")
 @pytest.mark.slow
 def test_the_page_in_a_browser(touch, tmp_path):
-    """Without a network it opens without an error, draws the part, and changes modes on click and by key: each picture is another
-    one, but that of the first mode comes back as it was."""
+    """Without a network it opens without an error, draws the object, and changes modes on click and by key.
+
+    Each picture is another one, but that of the first mode comes back as it was."""
     posterior, modes, simulate = touch
     write_all(tmp_path, posterior, modes, alone(posterior, simulate))
     page = tmp_path / "tried.html"
@@ -282,7 +283,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 
 
 def test_observable_directions_match_finite_differences(rng):
-    """A motion about the contact is told by as much of it as lies outside the motions that the contact does not tell."""
+    """A motion about the contact is observable by as much of it as lies outside the unobservable motions."""
     T = se3.transform(se3.random_rotations(1, rng)[0], rng.normal(size=3) * 0.02)
     about, length, step = rng.normal(size=3) * 0.01, 0.013, 1e-7
     scale = np.array([length] * 3 + [1] * 3)
@@ -450,7 +451,7 @@ def test_pictures_open(touch):
 
 @pytest.mark.slow
 def test_several_sensors_are_shown_in_their_order(plug, rng):
-    """A row for each, also for one that felt nothing, with what it would show at each mode."""
+    """A row for each, also for one without contact, with its predicted contact at each mode."""
     from geomtact.report.figure import draw
 
     touches = random_touches(plug.space, 2, 5)

@@ -1,4 +1,4 @@
-"""Laws of the rotation grid: every rotation has one cell, cells are as large as they say, symmetry makes no difference."""
+"""Laws of the rotation grid: every rotation has one cell, cells have their stated size, symmetry makes no difference."""
 
 from functools import cache
 
@@ -121,7 +121,7 @@ def test_symmetry_saves_what_it_makes_equal(symmetry):
         assert n == 1
     elif kind == "axis":
         assert n < 36864 / 20
-    else:  # cells on the border of the part that is kept are kept whole
+    else:  # cells on the border of the kept region are kept whole
         assert 36864 / order <= n < 1.6 * 36864 / order
 
 
@@ -360,7 +360,7 @@ def random_cones(rng, count):
 
 
 def within(cone, n, rng):
-    """Directions (n, 3) uniform over a cone, not by the grid's way: about +z, then mirrored onto the cone."""
+    """Directions (n, 3) uniform over a cone, by another method than the grid's: about +z, then mirrored onto the cone."""
     v, half = cone
     angle, turn = 2 * np.arcsin(np.sqrt(rng.random(n)) * np.sin(half / 2)), rng.uniform(0, 2 * np.pi, n)
     a = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], 1)
@@ -381,7 +381,7 @@ def test_each_cone_weighs_its_share_of_the_area(symmetry, rng):
     for level, cones in trials:
         directions = Directions.make(SYMMETRIES[symmetry], cones, level)
         here, there = (set(cells_in(directions, cone, 2000, rng)) for cone in cones)
-        if here & there:  # two cones in one cell cannot be told apart
+        if here & there:  # two cones in one cell cannot be distinguished
             continue
         area = np.array([np.sin(half / 2) ** 2 for _, half in cones])
         weight = [directions.weights[allowed(directions.vectors, [cone])].sum() for cone in cones]

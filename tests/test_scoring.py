@@ -1,4 +1,4 @@
-"""Laws of the scores: brute force agrees, a contact is most like itself, and a score is trusted as far as it tells."""
+"""Laws of the scores: brute force agrees, a contact is most like itself, and a score's weight follows its information."""
 
 import json
 from types import SimpleNamespace
@@ -170,7 +170,7 @@ def test_dust_is_dropped_beside_a_large_contact_and_kept_alone():
 
 
 def test_dust_is_found_however_much_of_it_there_is():
-    """Beside a contact, as many single pixels as fit: more than labels of 16 bits could tell apart, in the larger image."""
+    """Beside a contact, as many single pixels as fit: more than labels of 16 bits can distinguish, in the larger image."""
     for h, w in ((400, 400), (640, 640)):
         mask = np.zeros((h, w), bool)
         mask[::2, ::2] = True
@@ -196,7 +196,7 @@ def test_the_likelihood_is_student_t(ball, rng, freedom):
 
 
 def test_fitting_recovers_the_t_distribution_that_was_drawn_from(ball, monkeypatch):
-    """Against its stored moments each touch is off by a draw from a known t distribution."""
+    """Against its stored moments each touch is off by a sample of a given t distribution."""
     rng = np.random.default_rng(3)
     truth = some_moments(ball)
     n = 6000
@@ -217,7 +217,7 @@ def test_the_scores_rank_the_true_pose_high(name, request):
     localizer = request.getfixturevalue(name)
     index = localizer.index
     touches = simulate_touches(index, 24, seed=8)
-    # the thesis's own, l1, fails, as the thesis says
+    # the thesis's own, l1, fails, as the thesis reports
     for name, scorer in (("moments", localizer.scorer.evidence_model.moments), ("iou", OVERLAPS["iou"])):
         w = np.asarray(index.weight).ravel()
         above = []
@@ -238,7 +238,7 @@ class Useless:
 
 
 class Oracle:
-    """Knows the true cell of each of some touches."""
+    """Has the true cell of each of some touches."""
 
     name = "oracle"
 
@@ -265,7 +265,7 @@ def test_a_useless_score_is_not_trusted(ball):
 
 
 def test_the_calibration_is_the_one_that_gains_most(ball):
-    """The gain of every temperature and floor, worked out from the posterior that localize would give."""
+    """The gain of every temperature and mixture weight, worked out from the posterior that localize would give."""
     index = ball.index
     touches = simulate_touches(index, 12, seed=6)
     found = fit_calibration(OVERLAPS["iou"], index, touches)
@@ -326,8 +326,8 @@ def test_a_touch_that_comes_out_otherwise_changes_no_other(plug, monkeypatch):
 
 @pytest.mark.slow
 def test_simulated_touches_are_as_often_where_a_cell_hardly_touches_as_poses_are(cache_dir):
-    """A plate on a sensor with a housing: a little tilt lets its far end strike, so many a pose lies in a cell of which, at the
-    cell's own rotation, little touches."""
+    """A plate on a sensor with a housing: a little tilt lets its far end strike, so that many a pose lies in a
+    cell of which little touches at the cell's rotation."""
     solid = trimesh.creation.box((60e-3, 40e-3, 2e-3))
     plate = Mesh(solid.vertices, solid.faces, "plate", "m").with_symmetry()
     index = open_index(plate, Sensor.load("gelsight-mini"), None, 20_000, cache_dir, None)
@@ -361,10 +361,10 @@ def test_an_unknown_score_names_the_nearest(ball):
 
 @pytest.mark.slow
 def test_an_object_whose_touches_are_all_equal_is_refused(make_localizer, monkeypatch, tmp_path):
-    """A slab known to lie on its face fills the window nearly everywhere: only its rim tells anything."""
+    """A slab that lies on its face fills the window nearly everywhere: only its rim is informative."""
     trimesh.creation.box((200, 200, 20)).export(tmp_path / "slab.stl")
     slab = load_mesh(tmp_path / "slab.stl", "mm")
-    monkeypatch.setattr("geomtact.scoring.fitted._LEAST_GAIN", 1.5)  # its rim tells more than the usual limit
+    monkeypatch.setattr("geomtact.scoring.fitted._LEAST_GAIN", 1.5)  # its rim is more informative than the usual limit
     with pytest.raises(
         MeshError, match="^slab: cannot be localized.* all alike: at [5-9]. % .* fills the window"
     ) as error:

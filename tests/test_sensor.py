@@ -201,7 +201,7 @@ def test_the_simulated_digit_sees_its_touches_where_they_are(data_folder, tool):
 
 
 def test_the_simulated_digit_predicts_the_outlines_of_its_images(data_folder, tool):
-    """Judged on triplets 3 and 4, which the fit has not seen: the change falls at the predicted outline."""
+    """Evaluated on triplets 3 and 4, which the fit has not seen: the change falls at the predicted outline."""
     sensor = Sensor.load("digit-hsp")
     touches = [t for t in tool.load_touches(data_folder / "hsp_digit_sim_ycb") if t.name.endswith(("_3/0", "_4/2"))]
     assert len(touches) == 10

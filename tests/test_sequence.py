@@ -64,7 +64,7 @@ def index(request):
 
 
 def test_a_sensor_that_hardly_moves_changes_nothing(index, rng):
-    """Neither the place nor the penetration that was known."""
+    """Neither the place nor the penetration that was given."""
     motion_kernel, moved = MotionKernel(index, STILL), se3.transform(np.eye(3), [1e-6, 0, 0])
     cells = np.sort(rng.choice(index.possible, 20, replace=False))
     before = Mixture(cells, rng.dirichlet(np.ones(20)), 0.0)
@@ -151,7 +151,7 @@ def test_one_frame_is_a_touch(flat_nut, creeping):
 
 
 def gains(posteriors, trajectory):
-    """Log density at the truth, as no less than that of a floor of one in ten thousand."""
+    """Log density at the truth, bounded below by a uniform mixture weight of one in ten thousand."""
     truth = trajectory.T_sensor_object
     return [max(p.log_density(T), np.log(1e-4)) for p, T in zip(posteriors, truth, strict=True)]
 
@@ -236,7 +236,7 @@ def test_a_frame_given_twice_counts_once(flat_nut, creeping):
 
 
 def test_a_frame_that_the_prior_was_made_from_is_a_warning(flat_nut, creeping):
-    """Also of a prior that is what was known after many frames."""
+    """Also of a prior that is the posterior of many frames."""
     masks = creeping[0][0].masks
     known = list(track(flat_nut, masks[:3]))[-1]
     assert len(known.provenance.images) == 3

@@ -1,4 +1,4 @@
-"""Stability: each sweep changes what it says and nothing else, and its figures follow from the answers."""
+"""Robustness: each sweep changes the stated quantity and nothing else, and its figures follow from the records."""
 
 import json
 from dataclasses import replace
@@ -84,8 +84,8 @@ def test_a_sequence_is_evaluated_at_its_last_frame(flat_nut, monkeypatch):
 
 @pytest.mark.parametrize("degrees", [0, 10, 90])
 def test_a_jaw_closes_along_lines_that_are_so_far_apart(plug, a_touch, degrees):
-    """The second sensor looks against the first, but for the angle, along a line through the first one's origin, and feels the
-    part as deep as it is told to."""
+    """The second sensor looks against the first, but for the angle, along a line through its origin, and presses the
+    object as deep as asked."""
     T, _ = a_touch(plug)
     second = opposed(T, np.radians(degrees), 0.7, plug.space, 1 * MM)
     assert second is not None
@@ -200,7 +200,7 @@ def test_the_outline_cut_off_is_counted_in_pixel_edges():
     assert cut_off(mask) == pytest.approx(0.3)
 
 
-# --- answers
+# --- records
 
 
 def test_an_unperturbed_world_gives_the_localizers_own_posteriors(plug, here):
@@ -259,7 +259,7 @@ def test_figures_follow_from_the_records():
     answers = [
         Answer(2.0, 1.0, 0.3, 1.0, 0.9, False),  # right
         Answer(1.0, 1.0, 0.7, 1.0, 0.9, True),  # right, and yet warned
-        Answer(-1.0, 1.0, 0.95, 50.0, 0.9, False),  # wrong, and nothing says so
+        Answer(-1.0, 1.0, 0.95, 50.0, 0.9, False),  # an undetected failure
         Answer(0.0, 1.0, 0.6, 50.0, 0.2, False),  # wrong, not sure
         Answer(-np.inf, 1.0, 1.0, np.inf, 0.9, True),  # wrong, warned
     ]
@@ -359,7 +359,7 @@ def test_a_level_that_no_touch_fulfils_is_left_out_and_the_others_are_evaluated_
     assert [at["level"] for at in part["sweeps"]["specks"]["levels"]] == [0, 2, 20, 60]
 
 
-def test_an_unperturbed_object_is_touched_once(plug, monkeypatch):
+def test_unperturbed_touches_are_shared_by_all_sweeps(plug, monkeypatch):
     known, sweep = [], SWEEPS["noise"]
     at_home = [level for level in sweep.levels if level == 1e3 * MODERATE.outline_rms]
     first = list(stability.swept(plug, sweep, at_home[0], 2, 1, "fast", known))

@@ -1,4 +1,4 @@
-"""Symmetry: the groups of known solids come out in any frame, and every element maps the surface onto itself."""
+"""Symmetry: the groups of simple solids come out in any frame, and every element maps the surface onto itself."""
 
 import time
 
@@ -69,7 +69,7 @@ def test_a_real_object_with_faces_of_no_area_has_its_symmetry(data_folder):
 
 
 def check_maps_onto_itself(symmetry: Symmetry, vertices, faces, tolerance):
-    """By brute force over all faces, apart from the finder's own way; both ways round since a group holds its inverses."""
+    """By brute force over all faces, apart from the finder's method; in both directions since a group holds its inverses."""
     # In millimetres: trimesh's closest point takes small areas for none.
     mesh = trimesh.Trimesh(vertices / MM, faces, process=False)
     points, _ = trimesh.sample.sample_surface(mesh, 12, seed=5)

@@ -1,4 +1,4 @@
-"""Taxim's colour tables: read as the colours of a sensor, they tell the slopes from which they show colours."""
+"""Taxim's colour tables: used as the colours of a sensor, they give the slopes whose colours they show."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Laws of the poses that feel like a touch, of what they leave open, and of the page that shows the thesis beside us."""
+"""Laws of the poses with equivalent contacts, of the ambiguity they leave, and of the page that compares with the thesis."""
 
 import json
 import re
@@ -47,7 +47,7 @@ def rod(tmp_path_factory, cache_dir):
 
 @pytest.fixture(scope="module")
 def seen(rod):
-    """Touches of the rod's middle and of one end, with the poses that feel alike and the overlap that it takes."""
+    """Touches of the rod's middle and of one end, with the equivalent poses and the overlap that makes them so."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "STARTS", 60)
         patch.setattr(search, "_JUDGED", 30)
@@ -196,7 +196,7 @@ def test_an_interrupted_ambiguity_study_resumes_and_keeps_its_results(flat_nut, 
 
 
 def _cells(page, heading, column=0):
-    """Rows of the first table below a heading, by what stands in ``column``."""
+    """Rows of the first table below a heading, by their entry in ``column``."""
     below = page[page.index(heading) :]
     table = below[below.index("\n|") + 1 :].split("\n\n")[0].splitlines()
     rows = [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in table[2:]]

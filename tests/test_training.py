@@ -1,4 +1,4 @@
-"""Laws of training: parts are solid, touches belong to the cells they name, noise stays in its range, runs repeat."""
+"""Laws of training: objects are solid, touches belong to the cells they name, noise stays in its range, runs repeat."""
 
 import os
 import subprocess
@@ -180,7 +180,7 @@ def test_training_learns_and_a_resumed_run_ends_where_a_whole_one_does(scenes, t
 
 
 def test_the_gain_of_a_network_equals_that_of_its_posterior(scenes):
-    """The loss is minus the log density at the truth: 0 for a network that tells nothing apart."""
+    """The loss is minus the log density at the truth: 0 for a network that distinguishes nothing."""
     network = Encoder(16, 4)
     with torch.no_grad():
         for head in network.heads.values():

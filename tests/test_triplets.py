@@ -39,7 +39,7 @@ def marker(scenes):
 
 
 def knows(T, told):
-    """The ``localize`` of one who knows that the object is at ``T``, and keeps in ``told`` what it is given."""
+    """A ``localize`` that is certain that the object is at ``T``, and keeps its arguments in ``told``."""
 
     def localize(images, kind, background, T_world_sensor, **options):
         told.append((images, kind, background, T_world_sensor))
@@ -71,7 +71,7 @@ def test_the_world_moves_and_nothing_else(scenes, data_folder):
 
 
 def test_a_tactile_image_shows_the_object_where_it_is(marker):
-    """The contact read from each picture covers the one cast at its known pose."""
+    """The contact found in each picture covers the one cast at its true pose."""
     localizer, some = marker
     for triplet in some[1:2]:
         background = read_image(triplet.background)

@@ -1,4 +1,4 @@
-"""Laws of the live view: it shows where the posterior says that the part may be, and is served to a browser."""
+"""Laws of the live view: it shows the object at the poses of the posterior, and is served to a browser."""
 
 import importlib
 import importlib.util
