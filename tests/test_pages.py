@@ -30,10 +30,10 @@ def listed(values, form=".0f"):
     return f"{', '.join(most)} and {last}"
 
 
-def of_a_known_side(content):
+def of_a_known_contact_face(content):
     scenes = [content["parts"][part]["scenes"]["known side"] for part in PARTS]
-    ways = "this side alone", "this side, 1 mode", "balanced"
-    five, one, unknown = (listed([s["figures"][way]["mssd_mm_median"] for s in scenes]) for way in ways)
+    variants = "this side alone", "this side, 1 mode", "balanced"
+    five, one, unknown = (listed([s["figures"][variant]["mssd_mm_median"] for s in scenes]) for variant in variants)
     (more,) = zip(*(scene["modelled"].values() for scene in scenes), strict=True)
     times = sorted(f["time_ratio"] for f in more)
     yield f"they add {listed([between(f['adds']) for f in more], '')} on the pin, the damping pin, the head and the elbow"
@@ -49,7 +49,7 @@ def counted(some):
 
 
 def endured(content):
-    alike, beyond, jaw, rigs = Counter(), [], [], []
+    alike, beyond, jaw, extrinsics = Counter(), [], [], []
     for part, own in content["parts"].items():
         for name, sweep in own["sweeps"].items():
             for at in sweep["levels"]:
@@ -57,18 +57,18 @@ def endured(content):
                 alike.update([(part, *told)] * well)
                 beyond += told * (not well)
                 jaw += told * (name == "jaw")
-                rigs += told * (name.startswith("rig") and not well)
+                extrinsics += told * (name.startswith("rig") and not well)
     same = max(alike.values())
     yield f"{({9: 'Nine', 10: 'Ten'}).get(same, same)} of these levels are the same touches"
-    row = "of {} that are right {} carry a warning ({:.1%}), and of {:,} that are wrong {} say it neither"
+    row = "of {} right ones {} carry a warning ({:.1%}), and of {:,} wrong ones {} are undetected"
     right, warned, *wrong = counted([each for _, *told in alike for each in told])
     yield filled(row, right, warned, warned / right, *wrong)
-    yield "{2:,} answers are wrong, and {3} of them say so neither way".format(*counted(beyond))
+    yield "{2:,} estimates are wrong, and {3} of them are undetected".format(*counted(beyond))
     yield "of {} right ones {} carry a warning".format(*counted(jaw))
-    yield "of {2} wrong answers {3} say nothing".format(*counted(rigs))
+    yield "of {2} wrong estimates {3} are undetected".format(*counted(extrinsics))
 
 
-def told_together(content):
+def stated_together(content):
     at = {}
     for name, sweep in content["together"].items():
         for level in sweep["levels"]:
@@ -84,30 +84,30 @@ def told_together(content):
     yield f"at no level more than one in {({9: 'nine'}).get(one_in, one_in)}"
     for name, unit in {"rig_shift": " mm", "rig_turn": "°"}.items():
         warned = listed([100 * at[name][level]["warned"] for level in (1, 2, 5, 10)])
-        yield f"{warned} %{' of the answers' * (unit == ' mm')} at 1, 2, 5 and 10{unit}"
+        yield f"{warned} %{' of the estimates' * (unit == ' mm')} at 1, 2, 5 and 10{unit}"
     silent = sum(f["n"] for level, f in at["slips"].items() if level and not f["warned"])
     yield f"none of {silent} sequences with slips carries a warning"
     yield from (filled(sentence, **at) for sentence in SENTENCES)
 
 
 SENTENCES = [
-    "From 16 to 2 mm² a touch tells {area[16][gain_mean]:.1f} to {area[2][gain_mean]:.1f} nats",
-    "at 1 mm² {area[1][gain_mean]:.1f}, at 0.5 mm² {area[0.5][gain_mean]:.1f}, at 0.1 mm² nothing; it claims as little (",
+    "From 16 to 2 mm² a touch gives {area[16][gain_mean]:.1f} to {area[2][gain_mean]:.1f} nats",
+    "at 1 mm² {area[1][gain_mean]:.1f}, at 0.5 mm² {area[0.5][gain_mean]:.1f}, at 0.1 mm² nothing; it expects as little (",
     "({area[1][claimed_mean]:.1f}, {area[0.5][claimed_mean]:.1f} and {area[0.1][claimed_mean]:.1f}), and a third",
-    "{size[5][gain_mean]:.1f} nats are told where {size[5][claimed_mean]:.1f} are claimed, and {size[5][ninety][share]:.0%} of",
-    "with pixels 10 % larger than said {pitch[10][ninety][share]:.0%}. No warning comes",
+    "{size[5][gain_mean]:.1f} nats are gained where {size[5][claimed_mean]:.1f} are expected, and {size[5][ninety][share]:.0%} of",
+    "with pixels 10 % larger than stated {pitch[10][ninety][share]:.0%}. No warning comes",
     "of flat ones {kind[1][ninety][share]:.0%} of {kind[1][n]}, of cylinders {kind[4][ninety][share]:.0%} (",
     "of contacts of several patches {kind[5][ninety][share]:.0%} of {kind[5][n]} (",
-    "({kind[5][claimed_mean]:.1f} nats claimed for {kind[5][gain_mean]:.1f})",
+    "({kind[5][claimed_mean]:.1f} nats expected for {kind[5][gain_mean]:.1f})",
     "show two patches {shown[2][ninety][share]:.0%} of the truths lie in the 90 % region, of those that show three or more",
-    "three or more {shown[3][ninety][share]:.0%} ({shown[3][claimed_mean]:.1f} nats claimed for {shown[3][gain_mean]:.1f})",
+    "three or more {shown[3][ninety][share]:.0%} ({shown[3][claimed_mean]:.1f} nats expected for {shown[3][gain_mean]:.1f})",
     "of one {shown[1][ninety][share]:.0%}",
-    "({jaw[0][gain_mean]:.1f} nats told, {jaw[0][claimed_mean]:.1f} claimed)",
+    "({jaw[0][gain_mean]:.1f} nats gained, {jaw[0][claimed_mean]:.1f} expected)",
 ]
 COUNTS = [
-    ("no-more-than-needed", of_a_known_side, "modes"),
+    ("no-more-than-needed", of_a_known_contact_face, "modes"),
     ("stability", endured, "stability"),
-    ("stability", told_together, "stability"),
+    ("stability", stated_together, "stability"),
 ]
 
 

@@ -74,7 +74,8 @@ def modelled(part, content):
         both = one.get(name), (three | side).get(name)
         adds = [f and ("0.00" if not any(f["adds"]) else between(f["adds"], "+.2f")) for f in both]
         times = [f and f"x {cut(f['time_ratio'])}" for f in both]
-        yield [name, *(told or "" for told in (adds[0], times[0], adds[1], times[1]))]
+        figures = (adds[0], times[0], adds[1], times[1])
+        yield [name.replace("known side", "known contact face"), *(figure or "" for figure in figures)]
 
 
 def ways(part, content):
@@ -110,14 +111,15 @@ def elsewhere_simulated(content):
         low, middle, high = map(form, f[f"{key}_quartiles"])
         return f"{middle} ({low} to {high})"
 
-    row = "{shown} | {touches} | {} | {} | {} | {compatible:.0%} | {touched:.0%} | {} | {} | "
+    row = "{} | {touches} | {} | {} | {} | {compatible:.0%} | {touched:.0%} | {} | {} | "
     for f in content["figures"]:
         lengths = spread(f, "position_mm"), cut(f["position_mm_mean"]), spread(f, "add_s_mm")
         nats = spread(f, "gain"), spread(f, "claimed")
-        told = "{gain_mean:.1f} / {claimed_mean:.1f} | {}"
+        means = "{gain_mean:.1f} / {claimed_mean:.1f} | {}"
         if not f["touches"]:
-            nats, told = ("0", "0"), "0 / 0 |"
-        yield cells(row + told, *lengths, *nats, regions(f), **f)
+            nats, means = ("0", "0"), "0 / 0 |"
+        shown = "tactile image" if f["shown"] == "reading" else f["shown"]
+        yield cells(row + means, shown, *lengths, *nats, regions(f), **f)
 
 
 def followed(content):
@@ -281,11 +283,11 @@ TABLES = [
     *(("no-more-than-needed", f"The {PARTS[part]}:", partial(modelled, part), "choices") for part in PARTS),
     *(("speed-accuracy", f"The {PARTS[part]}:", partial(ways, part), "choices") for part in PARTS),
     ("speed-accuracy", "| gain [nats] /", sides, "choices"),
-    ("several-sensors", "| part |", touches, "touches"),
+    ("several-sensors", "| object |", touches, "touches"),
     ("several-sensors", "| shown |", elsewhere_simulated, "triplets"),
     ("tracking", "| method |", followed, "track"),
-    ("next-touch", "| part |", until_sure, "next_touch"),
-    ("kitting", "| part |", placed, "kitting"),
+    ("next-touch", "| object |", until_sure, "next_touch"),
+    ("kitting", "| object |", placed, "kitting"),
     ("which-part", "| touches |", identified, "identification"),
     ("registration", "| method | success", from_everywhere, "registration"),
     ("registration", "| method | error", from_grid, "registration"),
@@ -295,9 +297,9 @@ TABLES = [
     ("benchmark", "| pixels |", simulation, "peers"),
     ("benchmark", "| score | pin", scores, "scores"),
     ("benchmark", "| contact |", kinds, "classes", "flat"),
-    ("benchmark", "| part |", answers, "localize"),
+    ("benchmark", "| object |", answers, "localize"),
     ("stability", "| sweep |", sweeps, "stability"),
-    ("stability", "| part |", answers, "housing"),
+    ("stability", "| object |", answers, "housing"),
 ]
 
 
