@@ -142,4 +142,4 @@ def test_a_few_variants_are_evaluated_where_they_differ():
     assert choices.scenes_of(ways) == ["known side"]
     assert choices.scenes_of(choices.ways_of([])) == list(choices.SCENES) == choices.scenes_of({DEFAULT: WAYS[DEFAULT]})
     refused = CliRunner().invoke(studies, ["choices", "hex_nut", "--way", "one mode"])
-    assert refused.exit_code == 2 and "no way to localize named 'one mode'" in refused.output
+    assert refused.exit_code == 2 and "no variant named 'one mode'" in refused.output

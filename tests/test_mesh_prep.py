@@ -347,7 +347,7 @@ def test_a_curved_step_file_is_localized_within_its_tessellation(few_touches, tm
     ("name", "content", "unit", "words"),
     [
         ("a.stl", b"", "mm", "the file is empty"),
-        ("a.txt", b"x", "mm", "not a mesh format known here"),
+        ("a.txt", b"x", "mm", "not a supported mesh format"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "mm", "only points or lines|found nothing"),
         ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "NaN"),
         ("a.obj", b"v 0 0 3e38\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "mm", "beyond 1e9"),

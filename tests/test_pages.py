@@ -94,7 +94,7 @@ SENTENCES = [
     "From 16 to 2 mm² a touch gives {area[16][gain_mean]:.1f} to {area[2][gain_mean]:.1f} nats",
     "at 1 mm² {area[1][gain_mean]:.1f}, at 0.5 mm² {area[0.5][gain_mean]:.1f}, at 0.1 mm² nothing; it expects as little (",
     "({area[1][claimed_mean]:.1f}, {area[0.5][claimed_mean]:.1f} and {area[0.1][claimed_mean]:.1f}), and a third",
-    "{size[5][gain_mean]:.1f} nats are gained where {size[5][claimed_mean]:.1f} are expected, and {size[5][ninety][share]:.0%} of",
+    "{size[5][gain_mean]:.1f} nats are gained where {size[5][claimed_mean]:.1f} are expected, and {size[5][ninety][share]:.0%}",
     "with pixels 10 % larger than stated {pitch[10][ninety][share]:.0%}. No warning comes",
     "of flat ones {kind[1][ninety][share]:.0%} of {kind[1][n]}, of cylinders {kind[4][ninety][share]:.0%} (",
     "of contacts of several patches {kind[5][ninety][share]:.0%} of {kind[5][n]} (",

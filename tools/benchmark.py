@@ -82,7 +82,7 @@ def machine() -> dict[str, Any]:
 
 
 def rays(part: str, sensor_name: str) -> dict[str, Any]:
-    """Camera rays per second against the part, one thread and two."""
+    """Camera rays per second against the object, one thread and two."""
     from geomtact.contact_space.space import ContactSpace
     from geomtact.geometry.mesh_file import load_mesh
     from geomtact.sensing.cast import Caster
@@ -100,7 +100,7 @@ def rays(part: str, sensor_name: str) -> dict[str, Any]:
 
 
 def in_process(what: str, *args: Any) -> dict[str, Any]:
-    """``_prepare`` or ``_localize`` in a process of its own, so that peak memory is its own."""
+    """``_prepare`` or ``_localize`` in a separate process, so that peak memory is its own."""
     command = [sys.executable, __file__, f"--{what}", *map(str, args)]
     return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
 

@@ -36,7 +36,7 @@ CAMERA_DISTANCE = 0.02205  # of the bundled digit-hsp [m]
 
 @dataclass(frozen=True)
 class Touch:
-    """One reading: its name, its row of poses_sensors.txt, how strongly each pixel changed, how far the object is."""
+    """One tactile image: its name, its row of poses_sensors.txt, how strongly each pixel changed, how far the object is."""
 
     name: str
     row: Array

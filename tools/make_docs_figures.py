@@ -183,7 +183,7 @@ def one_map() -> Figure:
 
 
 def first_result() -> Figure:
-    """What the quick start finds: the touch, three of the modes, and how broad the answer is."""
+    """What the quick start finds: the touch, three of the modes, and how broad the posterior is."""
     localizer = Localizer.prepare("pin", sensor="gelslim")
     posterior = localizer.localize(str(SAMPLE))
     modes = posterior.modes(5)

@@ -50,7 +50,7 @@ class Triple:
 
 @dataclass(frozen=True)
 class Step:
-    """What the posterior after some touches says: samples (n, 4, 4), nats, the first mode's probability and error [mm]."""
+    """The posterior after some touches: samples (n, 4, 4), nats, the first mode's probability and error [mm]."""
 
     samples: Array
     gain: float

@@ -77,7 +77,7 @@ def opengl(missing: dict[str, str]) -> str:
 
 
 def in_process(child: str, threads: int, settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """The rows of ``retrieval`` or ``simulation`` with so many threads, which libraries read when they are loaded."""
+    """The rows of ``retrieval`` or ``simulation`` with ``threads`` threads, which libraries read when they are loaded."""
     few = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads))
     few["LP_NUM_THREADS"] = str(threads if threads > 1 else 0)  # of Mesa's llvmpipe; 0 leaves it the caller's
     command = [sys.executable, __file__, "--child", child, "--threads", str(threads)]

@@ -48,16 +48,16 @@ def main(
         str, typer.Option(help="By whose window units are proposed and ambiguity is judged.")
     ] = "gelslim",
     ambiguity: Annotated[
-        bool, typer.Option("--ambiguity", help="Draw how ambiguous a touch is, all over the part.")
+        bool, typer.Option("--ambiguity", help="Draw how ambiguous a touch is, all over the object.")
     ] = False,
     add_to: Annotated[
-        Path | None, typer.Option(help="Folder to whose catalogue the parts are added: meshes/ of this checkout.")
+        Path | None, typer.Option(help="Folder to whose catalogue the objects are added: meshes/ of this checkout.")
     ] = None,
-    description: Annotated[str, typer.Option(help="Of the part, for the catalogue.")] = "",
-    licence: Annotated[str, typer.Option(help="Of the part, for the catalogue.")] = "unknown",
+    description: Annotated[str, typer.Option(help="Of the object, for the catalogue.")] = "",
+    licence: Annotated[str, typer.Option(help="Of the object, for the catalogue.")] = "unknown",
     as_json: Annotated[bool, typer.Option("--json", help="Print all results as JSON, and nothing else there.")] = False,
 ) -> None:
-    """Repair meshes, prove what that changed, and say in which unit and with which symmetry they are parts."""
+    """Repair meshes, prove what that changed, and say in which unit and with which symmetry they are objects."""
     from meshprep.reading import states_own_unit
     from meshprep.repair import STEPS
 
@@ -148,7 +148,7 @@ def prepare(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[s
 
 
 def _draw_ambiguity(result: dict[str, Any], out: Path, sensor: str) -> None:
-    """Beside each part's mesh a picture of how much a touch tells there; an index is built for it, about a minute."""
+    """Beside each object's mesh a picture of the expected gain of a touch there; an index is built for it, about a minute."""
     from meshprep.ambiguity import draw_ambiguity
 
     from geomtact.files import write_bytes
@@ -160,7 +160,7 @@ def _draw_ambiguity(result: dict[str, Any], out: Path, sensor: str) -> None:
 
 
 def _bounded(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[str, Any]:
-    """:func:`prepare` in a process of its own, which may crash, hang or grow without harm."""
+    """:func:`prepare` in a separate process, which may crash, hang or grow without harm."""
     began = time.monotonic()
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
@@ -185,7 +185,7 @@ def _bounded(file: Path, name: str, out: Path, options: dict[str, Any]) -> dict[
     worker.join()
     if result is None:
         result = {"file": str(file), "name": name, "outcome": "refused", "reason": reason}
-    if result["outcome"] == "refused":  # nothing of an earlier run may be taken for its result
+    if result["outcome"] == "refused":  # nothing of an earlier run may pass for its result
         for suffix in (".ply", ".png") if (out / f"{name}.json").is_file() else ():
             (out / f"{name}{suffix}").unlink(missing_ok=True)
         (out / f"{name}.json").unlink(missing_ok=True)
@@ -197,7 +197,7 @@ def _work(pipe: Any, file: Path, name: str, out: Path, options: dict[str, Any]) 
 
 
 def _resident(pid: int | None) -> int:
-    """Bytes of memory that a process holds; 0 where that cannot be told."""
+    """Bytes of memory that a process holds; 0 where that is unknown."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
         return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
@@ -241,7 +241,7 @@ def _said(result: dict[str, Any]) -> str:
 
 
 def _next(result: dict[str, Any], out: Path, named: bool, sensor: str) -> str:
-    """The command that localizes the first of a file's parts, by its name in the catalogue or by its file."""
+    """The command that localizes the first of a file's objects, by its name in the catalogue or by its file."""
     part = result["parts"][0]
     which = part if named else f"{shlex.quote(str(out / f'{part}.ply'))} --unit {result['unit']}"
     return f"next: geomtact localize IMAGE --object {which} --sensor {shlex.quote(sensor)}"

@@ -1,4 +1,4 @@
-"""A part's entry in a catalogue, by which its name serves wherever a mesh path does."""
+"""An object's entry in a catalogue, which makes its name valid wherever a mesh path is."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add(
     Raises
     ------
     Refused
-        A name cannot be one of a part, or another part has it, or the catalogue cannot be read; then nothing was written.
+        A name cannot be one of an object, or another object has it, or the catalogue cannot be read; then nothing was written.
     """
     catalogue = folder / "catalogue.toml"
     text = catalogue.read_text("utf-8") if catalogue.is_file() else ""
@@ -57,7 +57,7 @@ def _parsed(text: str, catalogue: Path) -> dict[str, Any]:
 
 
 def catalogue_entry(path: Path, unit: str, licence: str, description: str, symmetry: Symmetry) -> str:
-    """The TOML table of the part in a file."""
+    """The TOML table of the object in a file."""
 
     def numbers(values: np.ndarray) -> str:
         return "[" + ", ".join(f"{v + 0.0:.9g}" for v in values) + "]"
@@ -90,7 +90,7 @@ def generators(symmetry: Symmetry) -> list[tuple[np.ndarray, int]]:
     ):
         angle = float(np.linalg.norm(vector))
         axis = np.round(vector / angle, 9)
-        axis *= np.sign(axis[np.flatnonzero(axis)[0]])  # either way round it generates the same turns
+        axis *= np.sign(axis[np.flatnonzero(axis)[0]])  # in either direction it generates the same turns
         trial = [*chosen, (axis + 0.0, round(2 * np.pi / angle))]
         larger = len(group_of([2 * np.pi / n * a for a, n in trial], symmetry.centre))
         if larger > size:

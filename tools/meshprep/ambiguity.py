@@ -1,4 +1,4 @@
-"""How ambiguous a touch is, all over a part: at how many other places a sensor would feel the same."""
+"""How ambiguous a touch is, all over a part: at how many other places a sensor would show the same contact."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.se3 import transform
 
 _POSES = 150_000  # of the index
-_TOUCHES = 400  # all over the part
+_TOUCHES = 400  # all over the object
 
 
 def draw_ambiguity(mesh: Mesh, sensor: str) -> bytes:
-    """A PNG: the part from two sides, coloured by what a touch there, straight onto the surface, is expected to tell [nats]."""
+    """A PNG: the object from two sides, coloured by what a touch there, straight onto the surface, is expected to gain [nats]."""
     where, told = ambiguity(mesh, sensor)
     if not len(where):
-        raise Refused(f"{mesh.name}: no touch straight onto its surface is felt by {sensor}")
+        raise Refused(f"{mesh.name}: no touch straight onto its surface has contact on {sensor}")
     surface = Surface(1e3 * mesh.vertices, mesh.faces.astype(np.int64))
     tree = cKDTree(1e3 * where)
 
@@ -37,8 +37,8 @@ def draw_ambiguity(mesh: Mesh, sensor: str) -> bytes:
 
 
 def ambiguity(mesh: Mesh, sensor: str, touches: int = _TOUCHES, max_poses: int = _POSES) -> tuple[Array, Array]:
-    """Points (n, 3) [m] all over ``mesh`` where a sensor that comes straight onto the surface feels it, and the nats (n,) its
-    posterior then claims to know: the fewer, the more other places feel the same."""
+    """Points (n, 3) [m] all over ``mesh`` where a sensor that comes straight onto the surface touches it, and the nats (n,) its
+    posterior then expects to gain: the fewer, the more other places show the same contact."""
     localizer = Localizer.prepare(mesh, sensor=sensor, max_poses=max_poses)
     space: ContactSpace = localizer.space
     points, normals = mesh.sample_surface(touches, seed=0)

@@ -90,12 +90,12 @@ def _about_an_edge(surface: Surface, edges: Faces, face: Faces, half: NDArray[np
     out = opposite - surface.vertices[low]
     out = out - (out @ axis)[:, None] * axis
     x = out[0] / max(float(np.linalg.norm(out[0])), 1e-300)
-    # faces that lie on each other are told apart by the way they are walked, not by rounding: what they bound does not join
+    # faces that lie on each other are distinguished by their direction, not by rounding: what they bound does not join
     angle = np.round((np.arctan2(out @ np.cross(axis, x), out @ x) + 1e-7) % (2 * np.pi), 6)
     forwards = edges[half, 0] == low
     turn = np.lexsort((~forwards, angle))
     todo, pairs = turn.tolist(), []
-    if forwards.sum() * 2 != len(half):  # who bounds what cannot be told: neighbours are paired
+    if forwards.sum() * 2 != len(half):  # who bounds what is ambiguous: neighbours are paired
         pairs = [turn[i : i + 2] for i in range(0, len(turn) - 1, 2)]
         return half[np.array(pairs)].reshape(-1, 2)
     # seen along the axis, a face walked forwards has its solid on the side of greater angles' opposite: the solid lies between

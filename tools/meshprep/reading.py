@@ -58,7 +58,7 @@ def read(path: Path, unit: str | None, sensor: Sensor, of_several: bool = False)
     if unit not in (None, "auto", *UNITS):
         raise Refused(f"unknown unit {given!r}; give --unit, one of {', '.join(UNITS)}, or auto for a proposal")
     if suffix not in FORMATS:
-        raise Refused(f"not a mesh format known here; give one of {' '.join(FORMATS)}")
+        raise Refused(f"not a supported mesh format; give one of {' '.join(FORMATS)}")
     if not path.is_file():
         raise Refused("no such file")
     if path.stat().st_size == 0:
@@ -98,7 +98,7 @@ def _scene(path: Path):
             raise Refused("STEP files need cascadio; install the extra with pip install 'geomtact[step]'") from None
         options = {"tol_linear": TESSELLATION, "tol_angular": 0.1}
     try:
-        # process=False: trimesh would merge, drop and reorder by rules of its own. From bytes: a name need not be UTF-8
+        # process=False: trimesh would merge, drop and reorder by its own rules. From bytes: a name need not be UTF-8
         same = {"file_type": path.suffix[1:].lower(), "process": False, "skip_materials": True}
         return trimesh.load_scene(io.BytesIO(path.read_bytes()), **same, **options)
     except ImportError as error:
@@ -159,8 +159,8 @@ def _proposal(surface: Surface, sensor: Sensor) -> str:
     """Which units would make sense of a size, in words."""
     window = 2 * float(np.hypot(*sensor.half_window))
     sizes = {unit: surface.size * scale for unit, scale in UNITS.items()}
-    # a part that a gripper holds: from a tenth of the window to twenty windows
+    # an object that a gripper holds: from a tenth of the window to twenty windows
     likely = [unit for unit, size in sizes.items() if 0.1 * window <= size <= 20 * window]
     words = ", ".join(f"{1e3 * sizes[u]:.3g} mm across in {u}" for u in likely or sizes)
-    lead = "likely" if likely else "no unit makes it a part to be touched"
-    return f"the unit is for you to say; {lead}: {words} (the window of {sensor.name} is {1e3 * window:.0f} mm). Give --unit"
+    lead = "likely" if likely else "no unit makes it an object to be touched"
+    return f"the unit is yours to give; {lead}: {words} (the window of {sensor.name} is {1e3 * window:.0f} mm). Give --unit"

@@ -1,4 +1,4 @@
-"""The repairs, one after the other: each takes a surface and gives a better one, and says in words what it changed."""
+"""The repairs, one after the other: each takes a surface and gives a better one, and names what it changed."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def degenerate(work: Work, options: Options) -> None:
     # a sheet of no thickness has two sides: without both nothing opens; a face stored twice, turned, is one face
     best = min((once, cancelled), key=lambda some: work.surface.with_faces(some).open_edges)
     if not len(best):
-        raise Refused("its faces cover each other from both sides and enclose nothing; give a solid part")
+        raise Refused("its faces cover each other from both sides and enclose nothing; give a solid object")
     repeats = len(faces) - len(best)
     surface, flat = _without_slivers(work.surface.with_faces(best))
     said = [(lines, "shrunk to a line"), (repeats, "repeated"), (flat, "of no area")]
@@ -148,7 +148,7 @@ def winding(work: Work, options: Options) -> None:
         meshes.meshing_re_orient_faces_coherently()
         surface = _kept_exactly(_surface(meshes), surface)
         if len(surface.faces) != len(before):
-            raise Refused("the surface has only one side (as a Moebius strip has); export the part as a solid")
+            raise Refused("the surface has only one side (as a Moebius strip has); export the object as a solid")
     surface = _outwards(surface, work.coherent)
     turned = int((canonical(surface.faces) != before).any(1).sum())
     if turned:
@@ -199,7 +199,7 @@ def bodies(work: Work, options: Options) -> None:
     if keep.all():
         return
     if not keep.any():
-        raise Refused("the surface encloses no volume; give a solid part")
+        raise Refused("the surface encloses no volume; give a solid object")
     work.dropped.append(surface.with_faces(surface.faces[~keep[body]]).tidied())
     work.surface = surface.with_faces(surface.faces[keep[body]]).tidied()
     work.changes["bodies"] = f"{int((~keep).sum())} of {count} bodies dropped"
@@ -220,7 +220,7 @@ def intersections(work: Work, options: Options) -> None:
         meshes.generate_boolean_union(first_mesh=0, second_mesh=0)
     except pymeshlab.PyMeshLabException:
         raise Refused(
-            f"{crossing} faces pass through others, and what they enclose cannot be told; unite the bodies in CAD"
+            f"{crossing} faces pass through others, and what they enclose is ambiguous; unite the bodies in CAD"
         ) from None
     work.surface = cut_up(_kept_exactly(_surface(meshes), surface)).tidied()
     work.changes["intersections"] = f"{crossing} faces passed through others: united"
@@ -233,7 +233,7 @@ def coarser(work: Work, options: Options) -> None:
         return
     from meshprep.proof import distances
 
-    for share in (0.0, 0.5, 0.75, 0.9):  # of the way from what is wanted back to what there is
+    for share in (0.0, 0.5, 0.75, 0.9):  # share of the step from the target back to the present surface
         wanted = int(options.max_faces + share * (len(surface.faces) - options.max_faces))
         meshes = _meshset(surface)
         meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=wanted, preservetopology=True, qualitythr=0.5)
@@ -298,7 +298,7 @@ def _outwards(surface: Surface, coherent: bool) -> Surface:
     is turned, with all that lies in it. Else what lies in an odd number of others is a cavity.
     """
     volume = surface.volumes
-    if surface.open_edges:  # what lies where is told once all is closed
+    if surface.open_edges:  # what lies where is decided once all is closed
         turn = volume < 0 if len(volume) == 1 else np.zeros(len(volume), bool)
     else:
         contains, crosses = surface.contained

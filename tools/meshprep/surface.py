@@ -25,7 +25,7 @@ class Surface:
     ----------
     vertices : (V, 3)
     faces : (F, 3) indices into vertices
-    polygons : the faces of the file as it holds them, if they were read; with vertices of their own
+    polygons : the faces of the file as it holds them, if they were read; with their own vertices
     owner : (F,) which of the polygons each face is of
     """
 
@@ -156,7 +156,7 @@ class Surface:
         return owner
 
     def encloses(self, points: Array) -> NDArray[np.bool_]:
-        """Whether ``points`` (n, 3) lie inside, whichever way the faces look."""
+        """Whether ``points`` (n, 3) lie inside, whichever direction the faces have."""
         scene, (middle, scale) = self.scene
         return scene.compute_occupancy(((points - middle) / scale).astype(np.float32), nsamples=3).numpy() > 0.5
 

@@ -26,7 +26,7 @@ from geomtact.versions import versions
 
 
 def write(before: Surface, work: Work, name: str, unit: str, out: Path, options: dict[str, Any]) -> dict[str, Any]:
-    """Prove what was done, and write it; what the JSON file says.
+    """Prove what was done, and write it; the content of the JSON file.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def write(before: Surface, work: Work, name: str, unit: str, out: Path, options:
             f"{after.open_edges} of {len(uses)} edges are left open, one at ({where}) mm; close the surface in CAD"
         )
     proof = prove(before, work)
-    if proof.largest > bound + 1e-6 * before.size:  # no distance is known better
+    if proof.largest > bound + 1e-6 * before.size:  # no distance is more exact
         where = ", ".join(f"{mm * x:.4g}" for x in proof.worst)
         raise Refused(
             f"the repaired surface lies {mm * proof.largest:.3g} mm from the original at ({where}) mm, more than "

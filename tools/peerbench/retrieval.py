@@ -56,7 +56,7 @@ def own_ways(score: Callable[[Any], Any], size: float, threads: int) -> list[Way
 
 
 def vector_ways(index: Any, name: str, threads: int) -> tuple[list[Way], float]:
-    """Ways to compare vectors: the network's by their distance, small images by their cosine."""
+    """Variants of comparing vectors: the network's by their distance, small images by their cosine."""
     from geomtact.contact_space.store import default_cache_dir
     from geomtact.scoring.catalogue import descriptor_of, fingerprint
     from geomtact.scoring.vectors import describe_index
@@ -93,7 +93,7 @@ def vector_ways(index: Any, name: str, threads: int) -> tuple[list[Way], float]:
 
 
 def bit_ways(index: Any, name: str, threads: int) -> tuple[list[Way], float]:
-    """Ways to count the pixels in which packed masks differ."""
+    """Variants of counting the pixels in which packed masks differ."""
     from geomtact.scoring import overlap
 
     overlap._THREADS = threads

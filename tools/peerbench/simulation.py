@@ -70,7 +70,7 @@ def compare(own: Any, depths: Any) -> dict[str, Any]:
 
 
 def depth_ways(mesh: Any, sensor: Any, shape: tuple[int, int], caster: Any, draw: Any) -> list[Way]:
-    """Ways from poses (n, 4, 4) to depths (n, h, w) [m], and the casts alone of rays that are there."""
+    """Variants from poses (n, 4, 4) to depths (n, h, w) [m], and the casts alone of rays that are there."""
     import open3d as o3d
 
     pool, distance, middle = ThreadPoolExecutor(caster.threads), sensor.camera_distance, caster._centre

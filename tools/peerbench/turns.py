@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Way:
-    """One way to an answer: ``run`` maps an item to it. It reads so many ``bytes``, and gets ``most`` items at most."""
+    """One variant: ``run`` maps an item to its result. It reads ``bytes`` bytes, and gets ``most`` items at most."""
 
     method: str
     run: Callable[[Any], Any]
@@ -21,9 +21,9 @@ class Way:
 
 
 def take_turns(ways: list[Way], items: Iterable[Any], judge: Callable[[Any, Any], dict[str, Any]]) -> None:
-    """Notes what each way takes for each item, one way after the other; the first item is not counted.
+    """Measures the time of each variant for each item, one after the other; the first item is not counted.
 
-    ``judge`` compares an answer with that of geomtact, which is the first way.
+    ``judge`` compares a result with that of geomtact, which is the first variant.
     """
     for k, item in enumerate(items):
         own = None

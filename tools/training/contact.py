@@ -30,7 +30,7 @@ class Settings:
     batch: int = 32
     rate: float = 3e-3
     weight_decay: float = 1e-4
-    validation: int = 40  # parts that are never trained on
+    validation: int = 40  # objects that are never trained on
     seed: int = 0
 
 
@@ -60,12 +60,12 @@ def train_mask(
     """Train on all ``parts`` but the last ``settings.validation``; a stopped run goes on from ``folder``. ``start`` holds weights
     to start from.
 
-    Returns the network and its curve: cross entropy over the steps, and overlap (IoU) with the contact on parts never seen.
+    Returns the network and its curve: cross entropy over the steps, and overlap (IoU) with the contact on objects never seen.
 
     Raises
     ------
     InputError
-        Too few parts, or weights of another network to start from.
+        Too few objects, or weights of another network to start from.
     GeomtactError
         The loss is not a number any more; the last good state stays in ``folder``.
     """

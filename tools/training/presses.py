@@ -36,7 +36,7 @@ CURVED, BULGES = (
     0.5,
     (25e-3, 120e-3),
 )  # share of gels that bulge towards the object, and the radius of their membrane [m]
-_AROUND = 30  # px beyond what is shown, in which a part goes on
+_AROUND = 30  # px beyond what is shown, in which an object goes on
 _TRIES = 6
 _LEAST = 60  # px of contact
 
@@ -58,7 +58,7 @@ class Presses:
 def make_presses(
     folder: Path, n: int, seed: int, progress: Progress | None = None, processes: int = 2
 ) -> list[Presses]:
-    """Of ``n`` parts, in order; those that ``folder`` holds already are read."""
+    """Of ``n`` objects, in order; those that ``folder`` holds already are read."""
     found = made_once(folder, n, partial(press_part, seed=seed), Presses, "pressing parts", progress, processes)
     return [presses for presses in found if len(presses.seen)]
 

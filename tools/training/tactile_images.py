@@ -30,7 +30,7 @@ _DRAWS = 4
 def random_reading(
     height: NDArray[np.floating], rng: np.random.Generator, rest: NDArray[np.floating] | float = 0.0
 ) -> tuple[Image, Image]:
-    """A reading (h, w, 3) of a gel pressed in by ``height`` (h, w) [px], and its background (h, w, 3). Untouched it lies at
+    """A tactile image (h, w, 3) of a gel pressed in by ``height`` (h, w) [px], and its background (h, w, 3). Untouched it lies at
     ``rest`` (h, w) [px] towards the camera."""
     h, w = height.shape
     flat = np.zeros((h, w), np.float32) + np.asarray(rest, np.float32)
@@ -81,8 +81,8 @@ def random_lamps(shape: tuple[int, int], rng: np.random.Generator, rim: float = 
 
 
 def _photographed(light: Image, rng: np.random.Generator) -> Array:
-    """Readings of ``light`` (2, h, w, 3), 1 what a camera tells at most: the second, without contact, of a random brightness in
-    each channel, at times so bright in one that much of the image is blown out."""
+    """Tactile images of ``light`` (2, h, w, 3), 1 what a camera tells at most: the second, without contact, of a
+    random brightness in each channel, at times so bright in one that much of the image is blown out."""
     exposure = np.clip(rng.uniform(0.15, 0.75) + rng.normal(0, 0.1, 3), 0.08, 0.95)
     if rng.random() < BRIGHT:
         exposure[rng.integers(3)] = rng.uniform(0.8, 1.2)

@@ -1,4 +1,4 @@
-"""``python -m tools.studies choices``: what each way of localizing tells and costs, on the same touches."""
+"""``python -m tools.studies choices``: information gain and cost of each variant, on the same touches."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ def judge_choices(
     unit: Unit = None,
     sensor: study_options.SensorName = "gelslim",
     touches: Annotated[
-        int, typer.Option("--touches", min=2, help="How many scenes of each kind, for each part.")
+        int, typer.Option("--touches", min=2, help="How many scenes of each kind, for each object.")
     ] = 100,
     seed: Seed = 3,
     weights: Annotated[
         list[Path] | None,
         typer.Option(
             "--weights",
-            help="Weights that 'geomtact train' wrote: an encoder of another size, or the thesis's network; each is a way more.",
+            help="Weights of 'geomtact train': an encoder of another size, or the thesis's network; each is a further variant.",
             show_default=False,
         ),
     ] = None,
     only: Annotated[
         list[str] | None,
         typer.Option(
-            "--way", help="Judge this way beside the default, not all; may be given again.", show_default=False
+            "--way", help="Judge this variant beside the default, not all; may be given again.", show_default=False
         ),
     ] = None,
     out: study_options.Out = None,
@@ -51,10 +51,10 @@ def judge_choices(
         Path | None, typer.Option("--plot-modelled", help="PNG of what each thing modelled adds.")
     ] = None,
 ) -> None:
-    """Judge choices: efforts, grids, scores, registration, calibration and known sides, each against the default.
+    """Judge choices: efforts, grids, scores, registration, calibration and contact faces, each against the default.
 
-    All ways meet each touch in turn. Everything is prepared anew in a folder that is removed afterwards, so that the time of
-    preparing is known too. Prints tables, and writes all answers to --out.
+    All variants meet each touch in turn. Everything is prepared anew in a folder that is removed afterwards, so that the time of
+    preparing is measured. Prints tables, and writes all estimates to --out.
     """
     from geomtact.contact_space.store import FORMAT
     from geomtact.evaluation import identity
@@ -102,7 +102,7 @@ def _judge(
     seed: int,
     save: Any,
 ) -> None:
-    """Prepare every way and localize what is left of the scenes, in every way."""
+    """Prepare every variant and localize the remaining scenes with each."""
     import tempfile
 
     from tools.studies.choices import study as choices
@@ -134,7 +134,7 @@ def _judge(
 
 
 def _summarise(part: dict[str, Any]) -> None:
-    """Write the figures of each kind of scene beside its answers."""
+    """Write the figures of each kind of scene beside its estimates."""
     from tools.studies.choices import study as choices
 
     for scene in part["scenes"].values():
@@ -163,10 +163,10 @@ def _print(name: str, part: Mapping[str, Any]) -> None:
             numbers = [f"{part['ways'][way]['poses']:,}", study_file.figure(ready, 0)]
             on_front = "*" if way in scene["front"]["gain_mean"] else ""
             rows.append([way + on_front, part["ways"][way]["choice"], gain, f"{f['mssd_mm_median']:.1f}", ms, *numbers])
-        typer.echo(f"{name}, {kind}; * no other way is as fast and tells as much")
+        typer.echo(f"{name}, {kind}; * Pareto-optimal in time and gain")
         print_table(["way", "choice", *headings], rows, headings)
         if scene["beaten_by"]:
-            typer.echo(f"the default is slower and tells less than: {', '.join(scene['beaten_by'])}")
+            typer.echo(f"the default is slower and gains less than: {', '.join(scene['beaten_by'])}")
         rows = [
             [what, "{:+.2f} ({:+.2f} to {:+.2f})".format(*f["adds"]), f"{f['time_ratio']:.2f}"]
             for what, f in scene["modelled"].items()

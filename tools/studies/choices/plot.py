@@ -16,10 +16,10 @@ _TICKS = (-5, -2, -1, -0.5, -0.2, -0.1, 0, 0.1, 0.2, 0.5, 1, 2, 5)  # nats
 
 
 def draw_costs(content: Mapping[str, Any]) -> bytes:
-    """A PNG with a row for each part and, for several, one for their mean: information and error against the time of one touch
-    and of three sensors, error of a known side, and information against the time of preparing.
+    """A PNG with a row for each object and, for several, one for their mean: information and error against the time of one touch
+    and of three sensors, error of a known contact face, and information against the time of preparing.
 
-    The line joins the ways that no other is as fast and as good as; the default is ringed, the thesis's network boxed.
+    The line joins the Pareto-optimal variants; the default is ringed, the thesis's network boxed.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -35,7 +35,7 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
         ("one touch", "ms", "mssd", "time of a touch [ms]", "one touch: median MSSD [mm]", -1),
         ("three sensors", "ms", "gain", "time of three touches [ms]", "three sensors: information [nats]", 1),
         ("three sensors", "ms", "mssd", "time of three touches [ms]", "three sensors: median MSSD [mm]", -1),
-        ("known side", "ms", "mssd", "time of a touch [ms]", "known side: median MSSD [mm]", -1),
+        ("known side", "ms", "mssd", "time of a touch [ms]", "known contact face: median MSSD [mm]", -1),
         ("one touch", "ready", "gain", "time of preparing [s]", "one touch: information [nats]", 1),
     )
     judged = [panel for panel in panels if any(panel[0] in points for points in rows.values())]
@@ -48,7 +48,7 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
         for axes, (scene, x, y, xlabel, ylabel, best) in zip(line, judged, strict=True):
             known = {n: (p[x], p[y]) for n, p in points.get(scene, {}).items()}
             some = {n: (a, b) for n, (a, b) in known.items() if a is not None and b is not None}
-            if x == "ready":  # most ways are prepared as the default is
+            if x == "ready":  # most variants are prepared as the default is
                 some = {n: p for n, p in some.items() if n == _DEFAULT or p[0] != some[_DEFAULT][0]}
             named.append((axes, _draw(axes, some, {n: looks[ways[n]["choice"]] for n in some}, best)))
             axes.set_xlabel(xlabel)
@@ -66,7 +66,7 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
 
 
 def draw_modelled(content: Mapping[str, Any]) -> bytes:
-    """A PNG: what each thing modelled adds [nats] for each part and kind of scene, with paired 95 % intervals."""
+    """A PNG: the ablations [nats] for each object and kind of scene, with paired 95 % intervals."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -106,7 +106,7 @@ def draw_modelled(content: Mapping[str, Any]) -> bytes:
 
 
 def _points(part: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float | None]]]:
-    """For each kind of scene what each way takes and tells, but for those calibrated otherwise: they lie on the default."""
+    """For each kind of scene the time and gain of each variant, but for those calibrated otherwise: they lie on the default."""
     return {
         scene: {
             name: {
@@ -123,7 +123,7 @@ def _points(part: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float | No
 
 
 def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float | None]]]:
-    """The means over all parts of the ways that all have; None where one is not known."""
+    """The means over all parts of the variants that all have; None where one is missing."""
     out: dict[str, dict[str, dict[str, float | None]]] = {}
     for scene, ways in parts[0].items():
         for name in [each for each in ways if all(each in part[scene] for part in parts)]:

@@ -1,6 +1,6 @@
-"""What each choice brings and what it costs: the same touches localized in one way after another.
+"""What each choice brings and what it costs: the same touches localized by one variant after another.
 
-Every way is the default but for one choice. All ways meet each touch in turn, so that their times may be compared.
+Every variant is the default but for one choice. All variants meet each touch in turn, so that their times may be compared.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ _ONE, _ALL = SCENES[:1], SCENES[:2]
 
 @dataclass(frozen=True)
 class Way:
-    """One way to localize.
+    """One variant of localizing.
 
     Attributes
     ----------
     choice : in what it differs from the default
-    scenes : that it is judged on
-    cone : half angle [rad] about the known side to which touches are restricted; None for all directions
+    scenes : that it is evaluated on
+    cone : half angle [rad] about the known contact face to which touches are restricted; None for all directions
     quotient : whether poses that look alike by symmetry count as one
     noise, elastic : of the touches that the score is calibrated on, as of ``scoring.calibration.simulate_touches``
     kind : of the image: "mask" or "height"
@@ -71,7 +71,7 @@ class Way:
 
     @property
     def prepared(self) -> tuple[Any, ...]:
-        """What has to be prepared for it; ways with the same share it."""
+        """What has to be prepared for it; variants with the same share it."""
         return self.scorer, self.max_poses, self.cone, self.quotient
 
 
@@ -102,7 +102,7 @@ WAYS = {
 
 _THESIS_POSES = 150_000  # of its discretisation (6.1.2)
 
-# what is modelled: (the way without it, the way with it), both of which count nats from the same uniform
+# what is modelled: (the variant without it, the variant with it), both of which count nats from the same uniform
 MODELLED = {
     "every cell, not blocks": ("fast", DEFAULT),
     "outlines, pixels and 25 modes (exact)": (DEFAULT, "exact"),
@@ -133,11 +133,11 @@ def ways_of(weights: Sequence[Path], only: Sequence[str] = ()) -> dict[str, Way]
     Raises
     ------
     UsageError
-        No way has that name.
+        No variant has that name.
     """
     for name in only:
         if name not in WAYS:
-            raise UsageError(f"no way to localize named {name!r}{nearest_name(name, list(WAYS))}")
+            raise UsageError(f"no variant named {name!r}{nearest_name(name, list(WAYS))}")
     out = {name: way for name, way in WAYS.items() if not only or name in (DEFAULT, *only)}
     for path in weights:
         if about(path).get("architecture") == THESIS:
@@ -149,7 +149,7 @@ def ways_of(weights: Sequence[Path], only: Sequence[str] = ()) -> dict[str, Way]
 
 @dataclass(frozen=True)
 class Timed(Answer):
-    """An answer, with the time [ms] that localizing took."""
+    """An estimate, with the time [ms] that localizing took."""
 
     ms: float
 
@@ -166,7 +166,7 @@ class Scene:
 
 
 def scenes_of(ways: Mapping[str, Way]) -> list[str]:
-    """The kinds of scenes on which some way is judged beside the default."""
+    """The kinds of scenes on which some variant is evaluated beside the default."""
     compared = [way for name, way in ways.items() if name != DEFAULT] or list(ways.values())
     return [kind for kind in SCENES if any(kind in way.scenes for way in compared)]
 
@@ -174,7 +174,7 @@ def scenes_of(ways: Mapping[str, Way]) -> list[str]:
 def prepare(
     mesh: Mesh, sensor: Sensor, way: Way, cache_dir: Path, progress: Progress | None = None
 ) -> tuple[Localizer, float | None]:
-    """The localizer of a way, and the seconds that preparing it took; None where it was in the cache."""
+    """The localizer of a variant, and the seconds that preparing it took; None where it was in the cache."""
     approach = None if way.cone is None else [(upwards(mesh), way.cone)]
     if not way.quotient:
         mesh = replace(mesh, symmetry=Symmetry("none", np.eye(4)[None], None, mesh.centre))
@@ -192,7 +192,7 @@ def prepare(
 def make(kind: str, localizer: Localizer, n: int, seed: int) -> list[Scene]:
     """``n`` scenes of a kind, rigid and elastic in turn, with moderate noise; ``localizer`` is the default's.
 
-    Where a height map shows contact it is off by a smooth field, as strong as the sensor's file says.
+    Where a height map shows contact it is off by a smooth field, as strong as the sensor's file states.
     """
     if kind == "three sensors":
         scenes = simultaneous_touches(localizer.space, n, _SENSORS, seed)
@@ -216,7 +216,7 @@ def _height(space: ContactSpace, touch: Touch, seed: list[int]) -> Array:
 def localized(
     localizers: Mapping[str, Localizer], ways: Mapping[str, Way], scenes: Sequence[Scene], kind: str, seed: int
 ) -> Iterator[dict[str, Timed]]:
-    """For each scene what every way says of it."""
+    """For each scene the estimate of every variant."""
     mesh = localizers[DEFAULT].mesh
     for scene in scenes:
         out = {}
@@ -237,7 +237,8 @@ def localized(
 
 
 def summarise(answers: Mapping[str, Sequence[Timed]]) -> dict[str, dict[str, Any]]:
-    """Figures of each way on the same scenes; gains are of the truths not ruled out, times [ms] the 10, 50 and 90 % quantiles."""
+    """Figures of each variant on the same scenes; gains are of the truths not ruled out, times [ms]
+    the 10, 50 and 90 % quantiles."""
     out = {}
     for name, some in answers.items():
         gain = np.array([a.gain for a in some])
@@ -254,9 +255,9 @@ def summarise(answers: Mapping[str, Sequence[Timed]]) -> dict[str, dict[str, Any
 
 
 def front(figures: Mapping[str, Mapping[str, Any]], what: str = "gain_mean", best: int = 1) -> list[str]:
-    """The ways that no other is as fast and as good as, the fastest first; ``best`` is 1 where more of ``what`` is better.
+    """The Pareto-optimal variants, the fastest first; ``best`` is 1 where more of ``what`` is better.
 
-    Ways that rule out more truths than the default does are left out, and of gains those that count from another uniform.
+    Variants that rule out more truths than the default does are left out, and of gains those that count from another uniform.
     """
     out: list[str] = []
     leader = -np.inf
@@ -273,27 +274,27 @@ def front(figures: Mapping[str, Mapping[str, Any]], what: str = "gain_mean", bes
 
 
 def beaten_by(answers: Mapping[str, Sequence[Timed]], figures: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The ways that are faster than the default, and tell more even at the lower end of the paired 95 % interval."""
+    """The variants that are faster than the default, and gain more even at the lower end of the paired 95 % interval."""
     own = figures[DEFAULT]["ms_quantiles"][1]
     faster = [name for name, f in figures.items() if f["ms_quantiles"][1] < own and _comparable(figures, name)]
     return [name for name in faster if adds(answers[DEFAULT], answers[name])[1] > 0]
 
 
 def _comparable(figures: Mapping[str, Mapping[str, Any]], name: str, alike: bool = True) -> bool:
-    """Whether a way rules out no more truths than the default, and if ``alike`` counts gains from the same uniform."""
+    """Whether a variant rules out no more truths than the default, and if ``alike`` counts gains from the same uniform."""
     same = name not in WAYS or WAYS[name].cone == WAYS[DEFAULT].cone or not alike
     return same and bool(figures[name]["ruled_out"] <= figures[DEFAULT]["ruled_out"])
 
 
 def adds(without: Sequence[Answer], with_it: Sequence[Answer]) -> list[float]:
-    """Mean of what is told more [nats], and its paired 95 % bootstrap interval, where neither rules the truth out."""
+    """Mean further gain [nats], and its paired 95 % bootstrap interval, where neither rules the truth out."""
     pairs = [(a.gain, b.gain) for a, b in zip(without, with_it, strict=True)]
     more = np.array([b - a for a, b in pairs if np.isfinite(a) and np.isfinite(b)])
     return mean_with_interval(more, np.random.default_rng(0)) if len(more) else [0.0, -np.inf, np.inf]
 
 
 def modelled(answers: Mapping[str, Sequence[Timed]]) -> dict[str, dict[str, Any]]:
-    """What each thing modelled adds [nats], of those whose two ways were judged; and its time as a factor."""
+    """The ablations [nats], of those whose two variants were evaluated; and its time as a factor."""
     out = {}
     sizes = {f"{name}, not {_ENCODER}": (_ENCODER, name) for name in answers if name.startswith("encoder ")}
     for what, (without, with_it) in (MODELLED | sizes).items():

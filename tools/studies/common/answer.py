@@ -1,4 +1,4 @@
-"""What was told of one touch, or of one scene, held against the truth."""
+"""The estimate of one touch, or of one scene, compared with the truth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tools.studies.common.study import CERTAIN, WRONG_MM
 
 @dataclass(frozen=True)
 class Answer:
-    """What was told of one touch, or one scene. Lengths in millimetres, information in nats.
+    """The estimate of one touch, or one scene. Lengths in millimetres, information in nats.
 
     Attributes
     ----------
@@ -24,7 +24,7 @@ class Answer:
     claimed : minus the entropy
     level : credible level of the true pose
     mssd_mm, probability : of the first mode; inf and 0 where there is none
-    warned : whether a warning came with it; an error in place of an answer counts as one
+    warned : whether a warning came with it; an error in place of an estimate counts as one
     """
 
     gain: float
@@ -40,11 +40,11 @@ class Answer:
 
     @property
     def silent(self) -> bool:
-        """Wrong, and nothing says so."""
+        """Wrong, without a sign of it: an undetected failure."""
         return self.wrong and self.probability >= CERTAIN and not self.warned
 
 
-REFUSED = Answer(-np.inf, 0.0, 1.0, np.inf, 0.0, True)  # an error took the answer's place
+REFUSED = Answer(-np.inf, 0.0, 1.0, np.inf, 0.0, True)  # an error took the estimate's place
 
 
 def judged(mesh: Mesh, T: Array, posterior: Posterior, nearest: Array | None = None) -> Answer:

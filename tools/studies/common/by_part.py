@@ -1,4 +1,4 @@
-"""A study of several parts, each by a process of its own or by the machines of a Ray cluster."""
+"""A study of several objects, each by a process of its own or by the machines of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tools.studies.common import study_file
 
 
 def thesis_parts(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a study, with the parts that are meant where none is named."""
+    """The options of a study, with the objects that are meant where none is named."""
     from tools.studies.common.study import THESIS_PARTS
 
     return {**options, "parts": options["parts"] or list(THESIS_PARTS)}
@@ -26,8 +26,8 @@ def by_part(
 ) -> Command:
     """The study ``judge`` of a ``schema``, which takes ``parts`` and ``out``, with the options --jobs and --ray.
 
-    Of each part a task makes a file of its own by the same options, with the parts that are ``meant`` by them; what the files
-    hold goes into ``--out``, from where the study goes on as one that was stopped after its last part.
+    Of each object a task makes a separate file by the same options, with the objects that are ``meant`` by them; what the files
+    hold goes into ``--out``, from where the study goes on as one that was stopped after its last object.
     """
 
     @functools.wraps(judge)
@@ -46,21 +46,21 @@ def by_part(
 
 
 def _judge_apart(judge: Command, schema: str, options: Mapping[str, Any], jobs: int | None, ray: str | None) -> None:
-    """Put what each part's task finds into ``out``.
+    """Put what each object's task finds into ``out``.
 
     Raises
     ------
     UsageError
         There is no ``out``.
     InputError
-        Some parts cannot be judged; what was found of the others is in ``out``.
+        Some objects cannot be evaluated; what was found of the others is in ``out``.
     """
     from geomtact.contact_space.store import default_cache_dir
     from geomtact.errors import UsageError
 
     out: Path | None = options["out"]
     if out is None:
-        raise UsageError("--jobs and --ray need --out, the file in which what is found of the parts comes together")
+        raise UsageError("--jobs and --ray need --out, the file in which what is found of the objects comes together")
     parts = [str(part) for part in options["parts"]]
     names = [Path(part).stem for part in parts]
     if twice := next((name for name in names if names.count(name) > 1), None):
@@ -83,7 +83,7 @@ def _judge_apart(judge: Command, schema: str, options: Mapping[str, Any], jobs: 
     try:
         do_all(quietly, tasks, parts, "judged", jobs, ray)
     finally:
-        for file in files:  # in the order of the parts, whichever was done first
+        for file in files:  # in the order of the objects, whichever was done first
             found = study_file.load(file, schema)["parts"]
             content["parts"] |= {name: entry for name, entry in found.items() if entry != before.get(name)}
         study_file.save(out, content)

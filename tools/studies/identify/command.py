@@ -1,4 +1,4 @@
-"""``python -m tools.studies identify``: which of several parts is touched, and is it one of them at all."""
+"""``python -m tools.studies identify``: which of several objects is touched, and is it one of them at all."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def judge_identification(
     parts: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="OBJECT...", help="Parts or mesh files; all bundled ones by default.", show_default=False
+            metavar="OBJECT...", help="Objects or mesh files; all bundled ones by default.", show_default=False
         ),
     ] = None,
     unit: Unit = None,
     sensor: study_options.SensorName = "gelslim",
     scenes: Annotated[
-        int, typer.Option("--scenes", min=1, help="How many of each part, of one to three touches.")
+        int, typer.Option("--scenes", min=1, help="How many of each object, of one to three touches.")
     ] = 20,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     effort: study_options.EffortLevel = Effort.balanced,
@@ -37,9 +37,9 @@ def judge_identification(
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Judge which part it is: touches of each of several parts, localized on all of them, and on all but the right one.
+    """Judge which object it is: touches of each of several objects, localized on all of them, and on all but the right one.
 
-    Prints how often the right part is the most probable, how often a part that is not among them is said to be foreign, and how
+    Prints how often the right object is the most probable, how often an object that is not among them is called unknown, and how
     often one that is; and writes them and every probability to --out.
     """
     from geomtact.evaluation import describe
@@ -77,7 +77,7 @@ def _print(figures: Sequence[Mapping[str, Any]]) -> None:
         "log P(right)",
         "sure and wrong",
         "foreign found",
-        "known called foreign",
+        "false alarms",
     ]
     rows = [
         [

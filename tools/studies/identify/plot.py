@@ -1,4 +1,4 @@
-"""A picture of how often the right part is told, and a foreign one found out, drawn from the study's JSON alone."""
+"""A picture of how often the right object is identified, and an unknown one detected, drawn from the study's JSON alone."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from geomtact.report.canvas import coloured, png
 
 _LINES = {
-    "right": "the right part is the most probable",
-    "foreign": "a part that is not among them is called foreign",
+    "right": "the right object is the most probable",
+    "foreign": "an object that is not among them is called unknown",
     "alarmed": "one that is among them is called foreign",
 }
 
 
 def draw_identification(content: Mapping[str, Any]) -> bytes:
-    """A PNG: shares of scenes against the number of touches, and which part is taken for which after the last."""
+    """A PNG: shares of scenes against the number of touches, and the confusion of objects after the last."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -30,7 +30,7 @@ def draw_identification(content: Mapping[str, Any]) -> bytes:
         share, low, high = 100 * np.array([f[key] for f in figures]).T
         left.errorbar(touches, share, [share - low, high - share], fmt="o-", capsize=3, color=colour, label=label)
     left.axhline(100 / len(content["parts"]), color="0.5", ls=":", lw=1, label="chance")
-    left.set(xticks=touches, ylim=(0, 102), xlabel="touches", ylabel="scenes [%]", title="Which part is it?")
+    left.set(xticks=touches, ylim=(0, 102), xlabel="touches", ylabel="scenes [%]", title="Object identification")
     left.spines[["top", "right"]].set_visible(False)
     left.legend(frameon=False, fontsize=8, loc="upper left")
 
@@ -48,5 +48,5 @@ def draw_identification(content: Mapping[str, Any]) -> bytes:
             right.text(column, row, f"{100 * share:.0f}", ha="center", va="center", color=colour, fontsize=8)
     right.set_xticks(range(len(names)), names, rotation=35, ha="right")
     right.set_yticks(range(len(names)), names)
-    right.set(xlabel="taken for", ylabel="touched", title=f"After {touches[-1]} touches [% of scenes]")
+    right.set(xlabel="identified as", ylabel="touched", title=f"After {touches[-1]} touches [% of scenes]")
     return png(canvas)

@@ -1,4 +1,4 @@
-"""Which part is it? judged: scenes of one to three touches of each of several parts, localized on all of them."""
+"""Object identification: scenes of one to three touches of each of several objects, localized on all of them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ MOST = 3  # touches
 
 @dataclass(frozen=True)
 class Told:
-    """What was told of one scene.
+    """The probabilities of one scene.
 
     Attributes
     ----------
-    scene, touches : which of the part's scenes, and from how many of its touches
-    log_probability : of each part, by its name; -inf where no pose agrees with all touches
-    unlike : by part's name, whether what is shown was said to be unlike it
+    scene, touches : which of the object's scenes, and from how many of its touches
+    log_probability : of each object, by its name; -inf where no pose agrees with all touches
+    unlike : by object's name, whether the contacts were reported as unlike it
     """
 
     scene: int
@@ -58,7 +58,7 @@ def _told(
     names = [part.mesh.name for part in parts]
     try:
         found = {each.name: each for each in identify(parts, images, **options).candidates}
-    except NoPoseAgreesError:  # of no part
+    except NoPoseAgreesError:  # of no object
         return Told(number, touches, dict.fromkeys(names, -math.log(len(names))), dict.fromkeys(names, True))
     with np.errstate(divide="ignore"):
         log_probability = {name: float(np.log(found[name].probability)) for name in names}
@@ -66,11 +66,11 @@ def _told(
 
 
 def summarise(told: Mapping[str, Sequence[Told]]) -> list[dict[str, Any]]:
-    """Figures for each number of touches over all parts, ``told`` by the name of the true one.
+    """Figures for each number of touches over all objects, ``told`` by the name of the true one.
 
-    ``right``: the share of scenes whose part is the most probable, and ``claimed``, how probable that one is said to be (mean);
-    ``probability_median`` and ``log_probability_mean`` [nats] of what the true part is given. ``foreign``: the share that is said
-    to be unlike all parts where the true one is not among them; ``alarmed``, where it is. With 95 % intervals.
+    ``right``: the share of scenes whose object is the most probable, and ``claimed``, its mean probability;
+    ``probability_median`` and ``log_probability_mean`` [nats] of what the true object is given. ``foreign``: the share reported
+    as unlike all objects where the true one is not among them; ``alarmed``, where it is. With 95 % intervals.
     """
     out = []
     for touches in range(1, MOST + 1):

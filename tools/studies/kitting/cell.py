@@ -1,8 +1,8 @@
-"""Kitting (thesis 8.3): a simulated cell in which a part is grasped, localized, touched again, and placed in a fixture.
+"""Kitting (thesis 8.3): a simulated cell in which an object is grasped, localized, touched again, and placed in a fixture.
 
-Geometric and quasi-static. The world is the gripper that holds the part, so a second gripper's closings, at known poses
-relative to it, all count in one product. The fixture is a recess of the part's own shape, wider by a clearance on all sides.
-The robot places the part only if the posterior says that it will fit; else it touches again, and at last refuses.
+Geometric and quasi-static. The world is the gripper that holds the object, so a second gripper's closings, at known poses
+relative to it, all count in one product. The fixture is a recess of the object's own shape, wider by a clearance on all sides.
+The robot places the object only if it probably fits by the posterior; else it touches again, and at last refuses.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from geomtact.sensing.contact import Contact
 from geomtact.sensing.noise import MODERATE, Noise
 from tools.studies.kitting.fixture import Fixture
 
-SURE = 0.95  # estimated probability of fitting from which the part is placed
+SURE = 0.95  # estimated probability of fitting from which the object is placed
 _DRAWS = 1000  # poses that are believed
 _ASKED = 60  # of these, by their weights, of which it is asked whether they fit
-_MISSED = 2.0  # a jaw that met nothing swept its way: that no contact is shown there counts twice
-_TRIED, _PLACES, _PRESSES = 16, 40, 3  # touches to choose from, places to tell apart, depths at which each is pressed
+_MISSED = 2.0  # a jaw that met nothing swept its path: the missing contact counts twice
+_TRIED, _PLACES, _PRESSES = 16, 40, 3  # touches to choose from, places to distinguish, depths at which each is pressed
 
 
 @dataclass(frozen=True, eq=False)
 class Felt:
-    """What fingers felt: where each stopped (n, 4, 4), in the world, and its mask (H, W), empty without contact."""
+    """The contacts of fingers: where each stopped (n, 4, 4), in the world, and its mask (H, W), empty without contact."""
 
     T_world_sensor: Array
     masks: list[NDArray[np.bool_]]
@@ -50,20 +50,20 @@ class Felt:
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """Poses ``T`` (n, 4, 4) of the part in the world, the heaviest first, and their ``weight`` (n,), which sums to 1."""
+    """Poses ``T`` (n, 4, 4) of the object in the world, the heaviest first, and their ``weight`` (n,), which sums to 1."""
 
     T: Array
     weight: Array
 
     @property
     def effective(self) -> float:
-        """How many poses of equal weight would tell as much (Kish 1965)."""
+        """How many poses of equal weight would be as informative (Kish 1965)."""
         return float(1 / (self.weight**2).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """The pose ``T_world_part`` (4, 4) by which to place the part, and the ``probability`` that it fits then."""
+    """The pose ``T_world_part`` (4, 4) by which to place the object, and the ``probability`` that it fits then."""
 
     T_world_part: Array
     probability: float
@@ -75,7 +75,7 @@ class Decision:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """After so many touches of a jaw: all that was felt, the posterior, what is believed, and a decision for each clearance."""
+    """After a number of touches of a jaw: all contacts, the posterior, the weighted poses, and a decision for each clearance."""
 
     felt: Felt
     posterior: Posterior
@@ -86,10 +86,10 @@ class Step:
 def touch_with_jaw(
     space: ContactSpace, T_world_part: Array, T_world_jaw: Array, elastic: bool, noise: Noise, rng: np.random.Generator
 ) -> Felt:
-    """The jaw closes at ``T_world_jaw`` (4, 4), each finger until the part presses 0.3 to 1.5 mm into it: nobody is told.
+    """The jaw closes at ``T_world_jaw`` (4, 4), each finger until the object presses 0.3 to 1.5 mm into it, at an unknown depth.
 
-    Where neither finger meets the part, that both met nothing is felt, at the jaw's origin. A finger stopped by too small a
-    contact tells nothing.
+    Where neither finger meets the object, that both met nothing is felt, at the jaw's origin. A finger stopped by too small a
+    contact adds no information.
     """
     stopped, touches = close_jaw(space, T_world_part, T_world_jaw, rng.uniform(*penetrations(space), 2))
     T, masks = [], []
@@ -105,10 +105,10 @@ def touch_with_jaw(
 
 
 def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.random.Generator) -> Believed:
-    """Poses drawn from ``posterior``, each weighed by how likely all that was ``felt`` is there.
+    """Poses drawn from ``posterior``, each weighed by the likelihood of all contacts ``felt``.
 
     They scatter about what registration found, and lie anywhere within cells that it did not look into. The grid's cells are
-    wider than any clearance, so their masses say too little; the pixels, cast at the pose itself, say more.
+    wider than any clearance, so their masses are too coarse; the pixels, cast at the pose itself, are finer.
     """
     poses = draw_cells(posterior, _DRAWS, rng)[0]
     mode_refiner, log_weight = ModeRefiner(space), np.zeros(len(poses))
@@ -121,10 +121,10 @@ def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.rando
 
 
 def decide(belief: Believed, fixture: Fixture, clearances: Sequence[float]) -> list[Decision]:
-    """For each of ``clearances`` [m] the probability that the part fits, placed by the pose that explains best what was felt.
+    """For each of ``clearances`` [m] the probability that the object fits, placed by the pose that explains the contacts best.
 
     P(fits | T) = W n / (n + 1), W the weight of the poses T' believed at which inv(T) T' needs no more than the clearance, n
-    how many poses are effective: where hardly any explains what was felt, that one fits itself proves nothing.
+    how many poses are effective: where hardly any explains the contacts, that one fits itself proves nothing.
     """
     even = (np.arange(_ASKED) + 0.5) / _ASKED
     drawn = np.minimum(np.searchsorted(np.cumsum(belief.weight), even), len(belief.T) - 1)
@@ -134,9 +134,9 @@ def decide(belief: Believed, fixture: Fixture, clearances: Sequence[float]) -> l
 
 
 def choose_jaw(posterior: Posterior, belief: Believed, made: Array, rng: np.random.Generator) -> Array:
-    """The jaw's pose (4, 4) whose first finger is expected to tell most about the pose (thesis 8.2).
+    """The jaw's pose (4, 4) whose first finger has the largest expected information gain (thesis 8.2).
 
-    As in ``planning.next_touch``, but the places to be told apart are drawn as for the decision, finer than the grid's cells.
+    As in ``planning.next_touch``, but the places to be distinguished are drawn as for the decision, finer than the grid's cells.
     """
     touches = grid_of_touches(posterior, made=made, seed=int(rng.integers(2**31)))
     some = [touches[i] for i in rng.permutation(len(touches))[:_TRIED]]
@@ -157,20 +157,20 @@ def kit(
     elastic: bool = True,
     noise: Noise = MODERATE,
 ) -> Iterator[Step]:
-    """Touch a part that lies at ``T_world_part`` (4, 4), unknown to the robot, up to ``touches`` times with a jaw.
+    """Touch an object that lies at ``T_world_part`` (4, 4), unknown to the robot, up to ``touches`` times with a jaw.
 
     The first closing is at the world's origin, along z. A caller who is sure enough stops asking for the next step.
 
     Raises
     ------
     InputError
-        Nothing was felt.
+        No touch had contact.
     NoPoseAgreesError
-        No pose agrees with all that was felt.
+        No pose agrees with all contacts.
     """
     felt = touch_with_jaw(localizer.space, T_world_part, np.eye(4), elastic, noise, rng)
     if not felt.masks or not felt.masks[0].any():
-        raise InputError("kit: expected a grasp with contact, no finger felt the part; take another seed")
+        raise InputError("kit: expected a grasp with contact, no finger touched the object; take another seed")
     for touch in range(1, touches + 1):
         posterior = localizer.localize(felt.masks, "mask", T_world_sensor=felt.T_world_sensor)
         belief = believe(localizer.space, posterior, felt, rng)
@@ -181,7 +181,7 @@ def kit(
 
 
 def draw_part(space: ContactSpace, rng: np.random.Generator) -> Array:
-    """A pose (4, 4) of the part at which a jaw at the world's origin grasps it, and both fingers feel it."""
+    """A pose (4, 4) of the object at which a jaw at the world's origin grasps it, and both fingers touch it."""
     least = penetrations(space)[0]
     while True:
         T_world_part = inverse(first_grasp(space.mesh, rng))

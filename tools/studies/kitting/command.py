@@ -1,4 +1,4 @@
-"""``python -m tools.studies kitting``: parts grasped, localized and placed in a fixture, in simulation."""
+"""``python -m tools.studies kitting``: objects grasped, localized and placed in a fixture, in simulation."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def judge_kitting(
     parts: study_options.ThesisParts = None,
     unit: Unit = None,
     sensor: study_options.SensorName = "gelslim",
-    runs: Annotated[int, typer.Option("--touches", min=1, help="How many of each part to place.")] = 200,
+    runs: Annotated[int, typer.Option("--touches", min=1, help="How many of each object to place.")] = 200,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     seed: Seed = 1,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Judge kitting: how many parts, grasped anyhow and localized, are placed right in a fixture, placed wrong and refused.
+    """Judge kitting: how many objects, grasped anyhow and localized, are placed right in a fixture, placed wrong and refused.
 
     Prints them for each clearance and number of touches, and writes them and every run to --out.
     """
@@ -64,5 +64,5 @@ def _print(parts: Mapping[str, Any]) -> None:
             counts = [str(f[key]) for key in ("wrong", "refused")]
             rows.append([name, f"{f['clearance_mm']:g}", str(f["touches"]), str(f["n"]), right, *counts])
     headings = ("part", "clearance [mm]", "touches", "n", "placed right", "placed wrong", "refused")
-    typer.echo("Parts placed right, with the 95 % interval of their share, placed wrong, and refused")
+    typer.echo("Objects placed right, with the 95 % interval of their share, placed wrong, and refused")
     print_table(headings, rows, headings[1:])

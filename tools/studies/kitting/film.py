@@ -1,9 +1,9 @@
-"""Kitting: a robot takes a part whose pose it does not know, touches it until it is sure, and places it in its fixture.
+"""Kitting: a robot takes an object whose pose it does not know, touches it until it is sure, and places it in its fixture.
 
-A jaw with a sensor in each finger grasps the part; a second one touches it where that tells most. The fixture is a recess of
-the part's own shape, open to above, wider by a clearance on all sides. The part is placed only if, of the poses that the
-posterior leaves, 95 % would go in. The robot is simulated. About ten seconds on two cores, after the part's touches were
-simulated once (a minute); the picture and the animation go to out/kitting.
+A jaw with a sensor in each finger grasps the object; a second one touches it where the expected gain is largest. The
+fixture is a recess of the object's own shape, open to above, wider by a clearance on all sides. The object is placed
+only if, of the poses that the posterior leaves, 95 % would go in. The robot is simulated. About ten seconds on two
+cores, after the object's touches were simulated once (a minute); the picture and the animation go to out/kitting.
 """
 
 import argparse
@@ -24,7 +24,7 @@ BLUE, RED, GREEN = "#0072B2", "#D55E00", "#009E73"
 PIXELS, CLOSING, PLACING = 120, 5, 10  # of the pictures; frames of a closing and of the placing
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--part", default="pin", help="a bundled part, or a mesh file with --unit")
+parser.add_argument("--part", default="pin", help="a bundled object, or a mesh file with --unit")
 parser.add_argument("--unit", help="of a mesh file: mm, cm, m or inch")
 parser.add_argument("--clearance-mm", type=float, default=1.0)
 parser.add_argument("--touches", type=int, default=4)
@@ -46,11 +46,11 @@ steps = []  # where no pose agrees with all touches, the next one raises geomtac
 for step in kit(localizer, fixture, truth, [clearance], rng, options.touches):
     steps.append(step)
     decision = step.decisions[0]
-    known = f"{-step.posterior.entropy_nats:.1f} nats known"
+    known = f"{-step.posterior.entropy_nats:.1f} nats gained"
     print(f"touch {len(steps)}: {known}, it fits with {100 * decision.probability:.0f} %")
     if decision.sure:
         break
-error = inverse(decision.T_world_part) @ truth  # where the part lies in the fixture's frame, were it placed
+error = inverse(decision.T_world_part) @ truth  # where the object lies in the fixture's frame, were it placed
 needed_mm = 1e3 * fixture.clearance_needed(error)[0]
 if decision.sure:
     verdict = "placed right" if needed_mm <= options.clearance_mm else "placed wrong"
@@ -59,7 +59,7 @@ else:
     verdict = "not sure, not placed"
     print(f"{verdict} (it would have needed {needed_mm:.2f} mm)")
 
-# all pictures are seen so that the part's long side lies across and the first jaw closes in the picture's plane
+# all pictures are seen so that the object's long side lies across and the first jaw closes in the picture's plane
 long = np.linalg.svd(mesh.surface_points(500) - mesh.centre, full_matrices=False)[2][0]
 across = unit(truth[:3, :3] @ long)
 away = unit(np.cross(across, [0.0, 0.1, 1.0]))
@@ -73,7 +73,7 @@ window = np.column_stack([corners, np.zeros(4)])
 
 
 def covered(T_world_part):
-    """Share (h, w) of poses (n, 4, 4) at which the part lies on a pixel's line of sight."""
+    """Share (h, w) of poses (n, 4, 4) at which the object lies on a pixel's line of sight."""
     return np.isfinite(space.caster.depths(camera, to_view @ T_world_part)).mean(0)
 
 

@@ -1,4 +1,4 @@
-"""Whether a part goes into a fixture: a recess of its own shape that is open to above, wider by a clearance on all sides."""
+"""Whether an object goes into a fixture: a recess of its own shape that is open to above, wider by a clearance on all sides."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _STEP = 0.2e-3  # m of that way, at least, between two distances: what is told i
 
 
 def upwards(mesh: Mesh) -> Array:
-    """The direction (3,) that points up, in the object's frame, where the part rests with its centre of mass lowest.
+    """The direction (3,) that points up, in the object's frame, where the object rests with its centre of mass lowest.
 
-    Of directions in which it rests about as low, as a round part may, the one in which its holes are least open to below.
+    Of directions in which it rests about as low, as a round object may, the one in which its holes are least open to below.
     """
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
     poses, _ = trimesh.poses.compute_stable_poses(solid)
@@ -34,7 +34,7 @@ def upwards(mesh: Mesh) -> Array:
 
 
 def _swept(scene: Any, reach: float, up: Array) -> float:
-    """The volume that the part, which reaches so far [m] from the origin, sweeps on its way along ``up`` (3,), up to a constant
+    """The volume that the object, which reaches so far [m] from the origin, sweeps on its way along ``up`` (3,), up to a constant
     and in units of its own."""
     s = np.linspace(-reach, reach, _RAYS)
     x, y, up = facing(-up)
@@ -44,7 +44,7 @@ def _swept(scene: Any, reach: float, up: Array) -> float:
 
 
 def _scene(mesh: Mesh) -> Any:
-    """The part about its centre, for distances and rays."""
+    """The object about its centre, for distances and rays."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -57,11 +57,11 @@ def _scene(mesh: Mesh) -> Any:
 class Fixture:
     """A recess into which ``mesh`` is lowered, in the frame of ``mesh``, before it is widened; ``n`` points judge what fits.
 
-    Its volume is what the part sweeps on its way up: where the part has a hole from side to side, nothing stands in it.
+    Its volume is what the object sweeps on its way up: where the object has a hole from side to side, nothing stands in it.
 
     Attributes
     ----------
-    up : (3,) out of the recess; by default as the part rests lowest
+    up : (3,) out of the recess; by default as the object rests lowest
     """
 
     mesh: Mesh
@@ -75,10 +75,10 @@ class Fixture:
         return rng.permutation(np.concatenate([points, rng.permutation(outermost(self.mesh.vertices))[: self.n // 5]]))
 
     def clearance_needed(self, T_fixture_part: ArrayLike) -> Array:
-        """How far (n,) [m] the part at ``T_fixture_part`` (n, 4, 4) reaches out of the recess before it is widened.
+        """How far (n,) [m] the object at ``T_fixture_part`` (n, 4, 4) reaches out of the recess before it is widened.
 
-        The largest distance of the part's surface from what it sweeps on its way up, 0 where all of it lies inside; where that
-        is hopelessly large, of a few of its points. Images under the part's symmetry need the same, without its being known.
+        The largest distance of the object's surface from what it sweeps on its way up, 0 where all of it lies inside; where that
+        is hopelessly large, of a few of its points. Images under the object's symmetry need the same, without its being known.
         """
         T = np.asarray(T_fixture_part, float).reshape(-1, 4, 4)
         out = np.array([self._farthest(apply(each, self.points[:_FEW])) for each in T])
@@ -88,7 +88,7 @@ class Fixture:
 
     def _farthest(self, points: Array, least: float = 0.0) -> float:
         """The largest distance [m] of ``points`` (m, 3) from the swept volume, or ``least`` where that is larger."""
-        # no point is farther from the swept volume than from the part
+        # no point is farther from the swept volume than from the object
         distance = self._distance(points)
         order = np.argsort(-distance)
         for i in range(0, len(order), _AT_ONCE):
@@ -100,10 +100,10 @@ class Fixture:
         return least
 
     def _from_swept(self, points: Array, distance: Array, enough: float) -> Array:
-        """Distance (m,) [m] from the swept volume of ``points`` (m, 3) that lie ``distance`` (m,) from the part; of those nearer
-        than ``enough``, only that they are.
+        """Distance (m,) [m] from the swept volume of ``points`` (m, 3) that lie ``distance`` (m,) from the object; of
+        those nearer than ``enough``, only that they are.
 
-        |p - (q + t up)| = |(p - t up) - q|: the least distance of the part from the way that leads down from p.
+        |p - (q + t up)| = |(p - t up) - q|: the least distance of the object from the way that leads down from p.
         """
         best, gone = distance.copy(), np.zeros(len(points))
         height = (points - self._lowest) @ self._up
@@ -116,7 +116,7 @@ class Fixture:
         return np.maximum(best, 0)
 
     def _distance(self, points: Array) -> Array:
-        """Signed distance (m,) [m] of ``points`` (m, 3) from the part, negative inside."""
+        """Signed distance (m,) [m] of ``points`` (m, 3) from the object, negative inside."""
         return np.asarray(
             self._scene.compute_signed_distance((points - self.mesh.centre).astype(np.float32)).numpy(), float
         )
@@ -128,7 +128,7 @@ class Fixture:
 
     @cached_property
     def _lowest(self) -> Array:
-        """The part's lowest vertex (3,)."""
+        """The object's lowest vertex (3,)."""
         return np.asarray(self.mesh.vertices[(self.mesh.vertices @ self._up).argmin()])
 
     @cached_property

@@ -1,4 +1,4 @@
-"""How many parts fit their fixture, against its clearance and the touches allowed: drawn from the study's JSON alone."""
+"""How many objects fit their fixture, against its clearance and the touches allowed: drawn from the study's JSON alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _RIGHT, _WRONG, _REFUSED = "#0072B2", "#D55E00", "#DDDDDD"
 
 
 def draw_kitting(content: Mapping[str, Any]) -> bytes:
-    """A PNG: the share placed right against the clearance, and what became of all parts against the touches allowed.
+    """A PNG: the share placed right against the clearance, and what became of all objects against the touches allowed.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def draw_kitting(content: Mapping[str, Any]) -> bytes:
             low, high = zip(*(f["interval"] for f in some), strict=True)
             bars = [[s - 100 * a for s, a in zip(share, low, strict=True)]]
             bars += [[100 * b - s for s, b in zip(share, high, strict=True)]]
-            # side by side, so that the intervals can be told apart
+            # side by side, so that the intervals do not overlap
             where = [f["clearance_mm"] * 1.05 ** (k - 0.5 * (len(parts) - 1)) for f in some]
             left.errorbar(where, share, bars, fmt="o-", color=colour, capsize=2, lw=1.4, ms=4, label=name)
             start = k * (most + 1.2)
@@ -53,7 +53,7 @@ def draw_kitting(content: Mapping[str, Any]) -> bytes:
     left.set(ylim=(0, 102), xlabel="clearance of the fixture, on all sides [mm]", ylabel="placed right [%]")
     left.set_title(f"With at most {most} touches of a jaw")
     left.legend(frameon=False, loc="lower right")
-    right.set(ylim=(0, 102), ylabel="parts [%]", title=f"At {goal:g} mm clearance, by the touches allowed")
+    right.set(ylim=(0, 102), ylabel="objects [%]", title=f"At {goal:g} mm clearance, by the touches allowed")
     for label, colour in (("placed right", _RIGHT), ("placed wrong", _WRONG), ("refused", _REFUSED)):
         right.bar(0, 0, color=colour, label=label)
     right.legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.16))

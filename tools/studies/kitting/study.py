@@ -1,4 +1,4 @@
-"""Kitting judged: how many parts are placed right, placed wrong, and refused, for each clearance and number of touches."""
+"""Kitting judged: how many objects are placed right, placed wrong, and refused, for each clearance and number of touches."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tools.studies.kitting.fixture import Fixture
 TOUCHES = 4
 CLEARANCES = (0.25e-3, 0.5e-3, 1e-3, 2e-3, 4e-3)  # m
 GOAL = 1e-3  # m: the clearance at which the robot has to be sure
-THOROUGH = 5  # with every so many-th part it goes on until it is sure at all clearances
+THOROUGH = 5  # with every so many-th object it goes on until it is sure at all clearances
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One part. For each touch, and in it for each clearance: the estimated ``probability`` that the part fits, and the
+    """One object. For each touch, and in it for each clearance: the estimated ``probability`` that the object fits, and the
     clearance ``needed_mm`` that it would truly have needed, had it been placed then."""
 
     run: int
@@ -33,15 +33,17 @@ class Outcome:
     needed_mm: list[list[float]]
 
     def placed(self, touches: int, k: int) -> int | None:
-        """After which touch, counted from 0, a robot that may make so many was first sure at clearance ``k``; None: refused."""
+        """After which touch, counted from 0, a robot that may make all of them was first sure at clearance ``k``;
+        None: refused."""
         sure = (i for i, p in enumerate(self.probability[:touches]) if p[k] >= SURE)
         return next(sure, None)
 
 
 def run_cell(localizer: Localizer, runs: int, seed: int, noise: Noise, first: int = 0) -> Iterator[Outcome]:
-    """Parts one by one, those from ``first`` on; every other one felt by an elastic gel, the rest by the rigid threshold.
+    """Objects one by one, those from ``first`` on; every other one on an elastic gel, the rest by the rigid threshold.
 
-    The robot touches until it is sure at a clearance of ``GOAL``, with every ``THOROUGH``-th part until it is at all clearances.
+    The robot touches until it is sure at a clearance of ``GOAL``, with every ``THOROUGH``-th object until it is at
+    all clearances.
     """
     fixture = Fixture(localizer.mesh)
     for run in range(first, runs):
@@ -64,7 +66,7 @@ def run_cell(localizer: Localizer, runs: int, seed: int, noise: Noise, first: in
 
 def summarise(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     """For each clearance and number of touches allowed: the shares placed ``right``, placed ``wrong`` and ``refused``, and
-    the 95 % interval of the first (Clopper and Pearson 1934). Below ``GOAL`` of every ``THOROUGH``-th part alone."""
+    the 95 % interval of the first (Clopper and Pearson 1934). Below ``GOAL`` of every ``THOROUGH``-th object alone."""
     out = []
     for k, clearance in enumerate(CLEARANCES):
         some = [o for o in outcomes if clearance >= GOAL or o.run % THOROUGH == 0]

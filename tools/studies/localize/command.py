@@ -33,9 +33,9 @@ def judge_localize(
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Judge posteriors: their gain, coverage and pose errors for each part.
+    """Judge posteriors: their gain, coverage and pose errors for each object.
 
-    Half of the touches are felt by a rigid threshold, half by an elastic gel. Prints the figures apart and together, and
+    Half of the touches are by a rigid threshold, half by an elastic gel. Prints the figures apart and together, and
     writes them and every outcome to --out.
     """
     study_file.plot(judge(parts, unit, sensor, touches, noise, effort, seed, max_poses, out, cache_dir), plot)
@@ -55,7 +55,7 @@ def judge(
     felt: Felt | None = None,
     solver: str = "geomtact",
 ) -> dict[str, Any]:
-    """Localize ``touches`` touches of each part, print the figures and write them to ``out``.
+    """Localize ``touches`` touches of each object, print the figures and write them to ``out``.
 
     ``felt`` as in ``study.make_touches``; ``solver`` names it in the file.
     """

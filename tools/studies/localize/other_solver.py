@@ -2,7 +2,7 @@
 
     python -m tools.studies.localize.other_solver pin head --touches 200 --out docs/results/judge_elastic.json
 
-geomtact's own elastic contact makes the touches that its posteriors are calibrated on; here the same touches are felt
+geomtact's own elastic contact makes the touches that its posteriors are calibrated on; here the same touches are computed
 through an independent implementation instead. tamaas prescribes the load where a touch has a depth, so the load that
 gives the depth is searched for.
 """

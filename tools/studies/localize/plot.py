@@ -1,4 +1,4 @@
-"""A picture of whether posteriors mean what they say, drawn from the study's JSON alone."""
+"""A picture of whether posteriors are calibrated, drawn from the study's JSON alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BAND = 1.63  # of a Kolmogorov band that holds 99 % of curves, in 1 / sqrt(n)
 
 def draw_answers(content: Mapping[str, Any]) -> bytes:
     """A PNG: how many truths lie in the region of each mass, and in what is nearer to a pose drawn at random; and how often a
-    right mode is among the first ones; a line for each part."""
+    right mode is among the first ones; a line for each object."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -31,14 +31,14 @@ _POINTS = 64
 
 @dataclass(frozen=True)
 class Judged(study.Outcome):
-    """An outcome, with what the whole distribution says.
+    """An outcome, with figures of the whole distribution.
 
     Attributes
     ----------
     energy_mm : energy score; its mean is least for the true distribution
     tarp : share of the posterior that is nearer than the truth to a pose drawn at random: uniform if it is calibrated
     recall : number of the first mode, of ten, that is right (``study.WRONG_MM``); 0 if none is
-    held : whether the truth lies within the first mode (``geometry.distance.mode_radius``), which says how probable that is
+    held : whether the truth lies within the first mode (``geometry.distance.mode_radius``), which states its probability
     """
 
     energy_mm: float
@@ -71,8 +71,8 @@ def energy_score(drawn: ArrayLike, T: ArrayLike, mesh: Mesh) -> float:
 
     The mean distance of a pose drawn from the truth, less half of that between two drawn: proper, since the mean distance of
     corresponding points is of negative type, and so is its mean over the images under the finite symmetries of ``mesh``, where
-    truth and drawn poses may be any of them. That mean is not 0 for the true pose itself, so that a part with such symmetries
-    scores more than nothing even if its pose is known for sure. Of a continuous symmetry those points count that it leaves in
+    truth and drawn poses may be any of them. That mean is not 0 for the true pose itself, so that an object with such symmetries
+    scores more than nothing even if its pose is certain. Of a continuous symmetry those points count that it leaves in
     place: of each point the nearest on the axis, or the centre.
     """
     drawn = np.asarray(drawn, float)

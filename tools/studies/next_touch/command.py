@@ -1,4 +1,4 @@
-"""``python -m tools.studies next-touch``: touches chosen for what they tell against random ones."""
+"""``python -m tools.studies next-touch``: touches chosen for their expected information gain against random ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
 
 SCHEMA = "geomtact/next-touch-study/1"
-_POSES = 50_000  # of a part that lies on a known side
+_POSES = 50_000  # of an object that lies on a known contact face
 
 
 def judge_next_touch(
@@ -27,7 +27,7 @@ def judge_next_touch(
     unit: Unit = None,
     sensor: study_options.SensorName = "gelslim",
     runs: Annotated[
-        int, typer.Option("--touches", min=1, help="How many times each part is touched until sure, by each policy.")
+        int, typer.Option("--touches", min=1, help="How many times each object is touched until sure, by each policy.")
     ] = 100,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     seed: Seed = 1,
@@ -35,7 +35,7 @@ def judge_next_touch(
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Judge the next touch: how many touches it takes to be sure, chosen for what they tell or at random.
+    """Judge the next touch: how many touches it takes to be sure, chosen for their expected gain or at random.
 
     Prints their numbers and pose errors, and writes them and every run to --out.
     """

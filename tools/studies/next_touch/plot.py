@@ -14,7 +14,7 @@ _STYLES = {
 
 
 def draw_touches_until_sure(content: Mapping[str, Any]) -> bytes:
-    """A PNG: for each part, the share of runs that are sure after so many touches."""
+    """A PNG: for each object, the share of runs that are sure after each number of touches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,7 +1,7 @@
-"""The next touch judged: how many more it takes until one mode is sure, chosen for what they tell or at random (thesis 8.2).
+"""The next touch judged: how many more it takes until one mode is sure, chosen for their expected gain or at random (thesis 8.2).
 
-A part lies on a table, on the side on which it rests lowest. Where, and how it is turned, is unknown. A sensor comes down on it
-again and again, wherever the planner's grid of touches allows.
+An object lies on a table, on the side on which it rests lowest. Where, and how it is turned, is unknown. A sensor
+comes down on it again and again, wherever the planner's grid of touches allows.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ POLICIES = ("best", "random")
 
 @dataclass(frozen=True)
 class Run:
-    """One part touched until sure.
+    """One object touched until sure.
 
     Attributes
     ----------
     touches : after the first, until the first mode held ``SURE``; ``MOST`` if it never did
     probability : of the first mode, at last
     mssd_mm : of the first mode, at last
-    gains : log density at the true pose after each touch that told something, the first included
+    gains : log density at the true pose after each touch with contact, the first included
     """
 
     scene: int

@@ -1,4 +1,4 @@
-"""``python -m tools.studies readings``: real readings, from the image to the contact, the height and the pose."""
+"""``python -m tools.studies readings``: real tactile images, from the image to the contact, the height and the pose."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SCHEMA = "geomtact/readings/1"
 
 def judge_readings(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="That of the data, with the readings of several sensors.")
+        Path, typer.Argument(metavar="FOLDER", help="That of the data, with the tactile images of several sensors.")
     ],
     circles: Annotated[
         Path | None,
@@ -26,10 +26,12 @@ def judge_readings(
         ),
     ] = None,
     out: study_options.Out = None,
-    sheet: Annotated[Path | None, typer.Option(help="PNG of every reading with the contact that was found.")] = None,
+    sheet: Annotated[
+        Path | None, typer.Option(help="PNG of every tactile image with the contact that was found.")
+    ] = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Judge real readings: contacts against circles drawn by hand, a calibration by the ball it did not see, balls and a
+    """Judge real tactile images: contacts against circles drawn by hand, a calibration by the ball it did not see, balls and a
     grooved plate localized by heights.
 
     Prints a table of each, and writes them and every outcome to --out.
@@ -144,7 +146,7 @@ def _print_contacts(figures: dict[str, dict[str, Any]]) -> None:
         for name, each in figures.items()
         for method, f in each.items()
     ]
-    typer.echo("Contacts against imprints drawn by hand; centre: off by so many image widths. Medians")
+    typer.echo("Contacts against imprints drawn by hand; centre: off in image widths. Medians")
     print_table(headings, rows, headings[2:])
 
 

@@ -26,8 +26,8 @@ class Groove:
     probability : of the mode
     across_mm, along_mm, deep_mm : how far it is off across the groove, along it, and in height
     turn_deg, tilt_deg : about the normal, and of it
-    told : how many directions are
-    told_along : the largest component along the groove of a direction that is told, by unit vectors
+    told : how many directions are observable
+    told_along : the largest component along the groove of an observable direction, by unit vectors
     """
 
     probability: float
@@ -41,13 +41,13 @@ class Groove:
 
 
 def localize_groove(folder: Path, cache_dir: Any = None, modes: int = 5) -> tuple[float, list[Groove]]:
-    """The log density at the true pose, and what the leading modes say, of a window of the scan: 6.6 mm by 4.9 mm, of heights
-    without noise, on a plate whose grooves go on beyond it."""
+    """The log density at the true pose, and the observable directions of the leading modes, of a window of the scan:
+    6.6 mm by 4.9 mm, of heights without noise, on a plate whose grooves go on beyond it."""
     height, pitch = read_scan(folder / "gelsight_groove_scan" / "heightmap.tmd")
     h, w = height.shape
     sensor = Sensor("groove scan", (240, 180), pitch, 0.0, 1 * MM, height_noise=0.02 * MM)
     rows, columns = slice(167, 347), slice(173, 413)  # the middle groove
-    # the plate faces the sensor: rows of what is felt run against those of what was scanned
+    # the plate faces the sensor: rows of the contact run against those of the scan
     seen = height[rows, columns][::-1]
     seen = (seen - seen.min() + 0.15 * MM).astype(np.float32)
     approach = [(np.array([0.0, 0.0, 1.0]), 0.1)]

@@ -1,4 +1,4 @@
-"""A sheet of readings: the contact that was found on each, beside the circle that was drawn by hand."""
+"""A sheet of tactile images: the contact that was found on each, beside the circle that was drawn by hand."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _COLUMNS = 10
 def draw_sheet(
     sets: Mapping[str, Sequence[tuple[Any, NDArray[np.bool_], Sequence[float]]]], factor: Mapping[str, float]
 ) -> bytes:
-    """A PNG of all readings by set, each (image (H, W, 3), contact (H, W), circle (column, row, radius) [px]); the circle is
-    divided by the set's ``factor``."""
+    """A PNG of all tactile images by set, each (image (H, W, 3), contact (H, W), circle (column, row, radius) [px]);
+    the circle is divided by the set's ``factor``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

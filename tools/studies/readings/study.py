@@ -1,4 +1,5 @@
-"""Real readings judged: contacts against circles drawn by hand, a calibration by the ball it did not see, and balls localized.
+"""Real tactile images judged: contacts against circles drawn by hand, a calibration by the ball it did not see, and
+balls localized.
 
 Hand-drawn circles mark the imprint, which is wider than the contact: one factor for each set of images and method is fitted on
 every other image and judged on the rest.
@@ -39,7 +40,7 @@ Method = Callable[[Any, Any], Mask]
 
 @dataclass(frozen=True, eq=False)
 class Imprint:
-    """A reading on which the ball's imprint was drawn by hand.
+    """A tactile image on which the ball's imprint was drawn by hand.
 
     Attributes
     ----------
@@ -126,7 +127,7 @@ def imprints_by_eye(folder: Path, circles: Path) -> list[Imprint]:
     Raises
     ------
     InputError
-        A reading is missing, or the file has not the columns of the one in ``tests``.
+        A tactile image is missing, or the file has not the columns of the one in ``tests``.
     """
     rows = [row for row in circles_of(circles, _BY_EYE) if row["inside"] == "1"]
     presses = _presses(folder)
@@ -134,8 +135,8 @@ def imprints_by_eye(folder: Path, circles: Path) -> list[Imprint]:
 
 
 def _drawn(rows: Sequence[Mapping[str, str]], columns: Sequence[str], folder: Path, background: Path) -> list[Imprint]:
-    """The readings of ``folder`` that ``rows`` name, with the circles drawn on them; ``columns`` are those of the name and of
-    the circle's column, row and radius."""
+    """The tactile images of ``folder`` that ``rows`` name, with the circles drawn on them; ``columns`` are those of
+    the name and of the circle's column, row and radius."""
     empty = read_image(background)[..., :3]
     out = []
     for row in rows:
@@ -146,7 +147,7 @@ def _drawn(rows: Sequence[Mapping[str, str]], columns: Sequence[str], folder: Pa
 
 
 def methods() -> dict[str, Method]:
-    """From a reading and its background to the contact: ours, and the classical baseline."""
+    """From a tactile image and its background to the contact: ours, and the classical baseline."""
     ours: dict[str, Method] = {name: partial(contact_mask, method=name) for name in CONTACT_METHODS}
     return ours | {"difference": largest_difference}
 

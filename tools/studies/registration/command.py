@@ -1,4 +1,4 @@
-"""``python -m tools.studies registration``: from how far off each way of refining a pose still finds home."""
+"""``python -m tools.studies registration``: from how far off each method of refinement still converges."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ def judge_registration(
         list[str] | None,
         typer.Argument(
             metavar="OBJECT...",
-            help="Parts, mesh files or bare shapes; the thesis's four and all shapes by default.",
+            help="Objects, mesh files or bare shapes; the thesis's four and all shapes by default.",
             show_default=False,
         ),
     ] = None,
     unit: Unit = None,
     sensor: study_options.SensorName = "gelslim",
-    touches: Annotated[int, typer.Option("--touches", min=1, help="How many touches of each part.")] = 200,
+    touches: Annotated[int, typer.Option("--touches", min=1, help="How many touches of each object.")] = 200,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     felt: study_options.Felt = study_options.FeltName.both,
     seed: Seed = 1,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
 ) -> None:
-    """Judge registration: from how far off each way of refining a pose finds home, all from the same starts.
+    """Judge registration: from how far off each method of refinement converges, all from the same starts.
 
     Prints success, errors and times of each method, and writes them and every trial to --out.
     """
@@ -106,7 +106,7 @@ def judge_registration(
 
 
 def parts_meant(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options, with the parts and shapes that are meant where none is named."""
+    """The options, with the objects and shapes that are meant where none is named."""
     return {**options, "parts": _named(options["parts"])}
 
 
@@ -131,7 +131,7 @@ def _print(figures: Mapping[str, Any]) -> None:
     for name, f in figures["methods"].items():
         lengths = [length(f["error_mm_median"]), length(f["drift_mm_median"])]
         rows.append([name, share(f["success"]), share(f["converged"]), *lengths, f"{f['ms_median']:.1f}"])
-    typer.echo("Over all start errors; errors in what the contact tells, drift in what it does not")
+    typer.echo("Over all start errors; errors in observable directions, drift in the others")
     print_table(headings, rows, headings[1:])
     headings = ("method", "error [mm]", "of start's", "got worse", "in 90 %", "agreement")
     rows = []
@@ -139,7 +139,7 @@ def _print(figures: Mapping[str, Any]) -> None:
         inside = None if f["coverage"] is None else f["coverage"]["0.9"]
         shares = [share(f["worse"]), share(inside), share(f["agreement"])]
         rows.append([name, length(f["error_mm_median"]), length(f["of_start"]), *shares])
-    typer.echo("From poses of the grid; in 90 %: truths inside the region that is said to hold so many")
+    typer.echo("From poses of the grid; at 90 %: truths inside the 90 % region")
     print_table(headings, rows, headings[1:])
     names = list(figures["methods"])
     rows = [

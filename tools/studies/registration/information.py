@@ -1,7 +1,7 @@
-"""What a contact tells about the pose, by the exact simulator: the bound that no registration can beat.
+"""The information of a contact about the pose, by the exact simulator: the bound that no registration can beat.
 
 The outline of a contact is displaced by sensor noise along its normal. How far it moves with the pose is measured by moving
-the object a little each way and casting, or solving the gel, again. So no method's own idea of what it sees enters.
+the object a little in each direction and casting, or solving the gel, again. So no method's own idea of what it sees enters.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 
-_STEP = 0.2e-3  # m that the contact is moved, each way
+_STEP = 0.2e-3  # m that the contact is moved, in each direction
 _BLUR = 3.0  # px
 _POINTS = 400  # of the outline, at most
 
@@ -30,7 +30,7 @@ def fisher_information(
 
     Parameters
     ----------
-    elastic : whether an elastic gel feels the contact
+    elastic : whether the gel is elastic
     problem : gives the centre and the length that zeta is measured by
     noise : of the outline: ``outline_rms`` along its normal, alike over the middle of ``correlation``
     pixel_noise : of the outline's place in a pixel, standard deviation [px]
@@ -50,10 +50,10 @@ def fisher_information(
 
 
 def split(information: Array, spread: Spread, length: float) -> tuple[Array, Array]:
-    """Matrices (6, 6) that take from a motion zeta the part that is told, and the rest; they add up to one.
+    """Matrices (6, 6) that take from a motion zeta its observable component, and the rest; they add up to one.
 
-    A direction is told that ``information`` (6, 6) fixes to a standard deviation under a quarter of the grid's step, which is
-    one length for shifts and another for turns: ``spread`` tells both.
+    A direction is observable that ``information`` (6, 6) fixes to a standard deviation under a quarter of the grid's
+    step, which is one length for shifts and another for turns: ``spread`` holds both.
     """
     measure, move, _ = observable_subspace(information, spread, length)
     kept = move @ measure
@@ -61,14 +61,14 @@ def split(information: Array, spread: Spread, length: float) -> tuple[Array, Arr
 
 
 def agreement(information: Array, rows: Array, spread: Spread, length: float) -> float:
-    """In how many of six directions, as a share, a method and ``information`` (6, 6) say the same of whether they are told.
+    """In how many of six directions, as a share, a method and ``information`` (6, 6) agree on whether they are observable.
 
-    The directions are those which ``information`` tells independently of each other; ``rows`` (r, 6) measure in zeta what the
-    method calls told.
+    The directions are those on which ``information`` is independent; ``rows`` (r, 6) measure in zeta what the
+    method calls observable.
     """
     known = spread.metres(length)
     gain, axes = np.linalg.eigh(known[:, None] * information * known)
-    basis = np.linalg.qr((rows * known).T)[0]  # (6, r), in units of what was known
+    basis = np.linalg.qr((rows * known).T)[0]  # (6, r), in units of the prior
     said = ((basis.T @ axes) ** 2).sum(0) > 0.5
     return float(np.mean((gain > GAIN) == said))
 

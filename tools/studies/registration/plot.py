@@ -52,7 +52,7 @@ def draw_registration(content: Mapping[str, Any]) -> bytes:
             grid[i, 0].set_ylabel(f"{kind}, {n:.0f} touches\nturned [deg]")
         for axes in grid[-1]:
             axes.set_xlabel("shifted [mm]")
-        within = f"within {settings['success_mm']:g} mm in what the contact tells"
+        within = f"within {settings['success_mm']:g} mm in observable directions"
         figure.suptitle(
             f"Share [%] of touches that end {within}: {', '.join(content['parts'])} on {settings['sensor']}, "
             f"{settings['noise']['name']} noise",

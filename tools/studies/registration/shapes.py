@@ -1,4 +1,4 @@
-"""Bare shapes whose contacts leave known directions open: what registration must not invent."""
+"""Bare shapes whose contacts leave given directions unobservable, which registration must not invent."""
 
 from __future__ import annotations
 

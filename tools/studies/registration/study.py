@@ -1,4 +1,4 @@
-"""Registration judged: from how far off a pose still finds home, in what the contact tells, and what it does in the rest."""
+"""Registration judged: from how far off a pose converges in observable directions, and how far it drifts in the rest."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SHIFTS_MM = (0.0, 1.0, 2.0, 4.0, 8.0)  # along the membrane
 FAR = Spread(np.radians(6), 3e-3)  # of starts that are turned and shifted by these
 FROM_GRID = 3  # starts a touch that are as far off as a grid's poses
 OWN = ("none", "icp", "filterreg", "both", "thesis")
-SUCCESS_MM = 0.5  # error in what the contact tells
+SUCCESS_MM = 0.5  # error in observable directions
 _MASK_NEIGHBOURS = 200  # within a filled mask, the nearest points alone pull nowhere
 MASK = (48, 64)  # half a pixel of such a mask is what a refined pose may lose
 
@@ -97,12 +97,12 @@ class Trial:
     touch : number of the touch, the same for all methods and start errors
     contact : one of ``contact_class.CLASSES``, or the name of a bare shape
     turn_deg, shift_mm : how far off the start is; None for one as far off as the grid's poses
-    told : how many of the six directions the contact tells
+    told : how many of the six directions are observable
     start_mm, error_mm : distance from the truth along those, before and after
     drift_mm : distance from the start along all others
-    converged : as the method says
+    converged : as the method reports
     level : mass of the region, in the observable directions, that just holds the truth; None where none is stated
-    agrees : share of directions of which method and exact simulator say the same: whether they are told
+    agrees : share of directions on whose observability method and exact simulator agree
     """
 
     touch: int
@@ -140,7 +140,7 @@ def trials(
 
     Parameters
     ----------
-    methods : by name, for starts of a given spread: methods are told how far off starts may be
+    methods : by name, for starts of a given spread: methods know how far off starts may be
     grid : on which the object is searched for
     noise : that ``touches`` were made with
     first : touches before it are left out; the others come out as if they were not
@@ -288,8 +288,8 @@ def summarise(trials: Sequence[Trial], half_pixel_mm: float) -> dict[str, Any]:
     """All figures: by method over all start errors, by method from the grid's poses, over all contacts and for each kind, success
     by contact and start error, and drift by contact.
 
-    Touches that tell nothing are left out of success and errors. ``lost`` names the cells in which FilterReg succeeds less
-    often than the best of the other libraries, beyond what chance allows.
+    Touches without an observable direction are left out of success and errors. ``lost`` names the cells in which
+    FilterReg succeeds less often than the best of the other libraries, beyond what chance allows.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The study ``samples``: what the touches are like that posteriors are judged on."""
+"""The study ``samples``: the touches that posteriors are evaluated on."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def judge_samples(
 ) -> None:
     """Describe the touches that posteriors are judged on: how deep, how large, how many run over the window's border.
 
-    Prints a table, half of the touches felt by a rigid threshold and half by an elastic gel, and writes nothing.
+    Prints a table, half of the touches by a rigid threshold and half by an elastic gel, and writes nothing.
     """
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""``python -m tools.studies scores``: scores side by side on the same touches, what they tell and what they cost."""
+"""``python -m tools.studies scores``: gain and cost of scores on the same touches."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SCHEMA = "geomtact/scores/2"
 
 @dataclass(frozen=True)
 class Options:
-    """What a study's figures depend on, beside the parts and the scores: ``felt`` is one of ``touches.GEL_KINDS``, ``only`` a
+    """What a study's figures depend on, beside the objects and the scores: ``felt`` is one of ``touches.GEL_KINDS``, ``only`` a
     class of contact or None for all."""
 
     sensor: Sensor
@@ -49,14 +49,14 @@ class Options:
 
 
 def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The parts and the scores that the command line names; by default the thesis's four parts, and all scores.
+    """The objects and the scores that the command line names; by default the thesis's four objects, and all scores.
 
-    An option takes one word, so of ``--scores l1 iou`` the second comes among ``words``, with the parts.
+    An option takes one word, so of ``--scores l1 iou`` the second comes among ``words``, with the objects.
 
     Raises
     ------
     UsageError
-        No score of that name, or neither a score nor a part.
+        No score of that name, or neither a score nor an object.
     """
     from geomtact.errors import UsageError, nearest_name
     from geomtact.geometry.catalogue import catalogue
@@ -78,7 +78,7 @@ def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], 
 
 
 def words_meant(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options, with the parts and the scores that :func:`sort_words` makes of them."""
+    """The options, with the objects and the scores that :func:`sort_words` makes of them."""
     parts, scores = sort_words(options["parts"] or [], options["scores"] or [])
     return {**options, "parts": parts, "scores": scores}
 
@@ -98,7 +98,7 @@ def judge_scores(
         ),
     ] = None,
     sensor: study_options.SensorName = "gelslim",
-    touches: Annotated[int, typer.Option("--touches", min=1, help="How many touches of each part.")] = 200,
+    touches: Annotated[int, typer.Option("--touches", min=1, help="How many touches of each object.")] = 200,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     felt: study_options.Felt = study_options.FeltName.elastic,
     effort: study_options.EffortLevel = Effort.balanced,
@@ -109,7 +109,7 @@ def judge_scores(
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Judge scores, all by default, side by side on the same touches: what they tell and what they cost.
+    """Judge scores, all by default, side by side on the same touches: their gain and their cost.
 
     Prints gain, coverage, pose errors and times of each, and writes them and every outcome to --out.
     """
@@ -153,7 +153,7 @@ def judge_scores(
 
 
 def _part(content: dict[str, Any], mesh: Mesh, sensor: Sensor) -> dict[str, Any]:
-    """What the file holds of the part on the sensor, or room for it."""
+    """What the file holds of the object on the sensor, or room for it."""
     pressed = {"object_sha256": mesh.sha256, "sensor_sha256": sensor.sha256}
     part = content["parts"].setdefault(mesh.name, {**pressed, "index_s": None, "random_add_mm": None, "scores": {}})
     held = {key: part[key] for key in pressed}
@@ -170,7 +170,7 @@ def _judge(
     save: Callable[[], None],
     cache_dir: Path | None,
 ) -> None:
-    """Judge one score on one part, from where the file ends."""
+    """Judge one score on one object, from where the file ends."""
     from geomtact.contact_space.touches import GEL_KINDS
     from geomtact.evaluation import describe
     from geomtact.inference.effort import EFFORTS
@@ -212,7 +212,7 @@ def _judge(
 
 
 def _compare(part: dict[str, Any], n: int) -> None:
-    """Write the figures of those of a part's scores that have all ``n`` touches, beside their outcomes."""
+    """Write the figures of those of an object's scores that have all ``n`` touches, beside their outcomes."""
     from geomtact.json_values import plain
     from tools.studies.scores import study as scores
 
@@ -224,7 +224,7 @@ def _compare(part: dict[str, Any], n: int) -> None:
 
 
 def _overall(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """The figures over all parts, of those scores that have been judged on each."""
+    """The figures over all objects, of those scores that have been judged on each."""
     from tools.studies.scores import study as scores
 
     entries = [part["scores"] for part in parts.values()]
@@ -237,12 +237,12 @@ def _overall(parts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _on_each(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The scores that have been judged on each part."""
+    """The scores that have been judged on each object."""
     return [name for name in entries[0] if all("figures" in some.get(name, {}) for some in entries)]
 
 
 def _by_class(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Gain and coverage by contact class, of those scores that have been judged on each part."""
+    """Gain and coverage by contact class, of those scores that have been judged on each object."""
     from tools.studies.common import study
     from tools.studies.scores import study as scores
 
@@ -265,7 +265,7 @@ def _print_classes(classes: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def _print(title: str, entries: Mapping[str, Any]) -> None:
-    """A table of what each score tells and costs: bytes are those of a pose, ready is after the index, the description
+    """A table of the gain and cost of each score: bytes are those of a pose, ready is after the index, the description
     of its contacts and the calibration."""
     headings = ["gain [nats]", "claimed", "over iou", "MSSD [mm]", "of 10", "in 50/80/90/95 %", "worst"]
     headings += ["score [ms]", "localize [ms]", "bytes", "ready [s]"]

@@ -1,4 +1,4 @@
-"""What scores tell against what they cost: a picture of ``python -m tools.studies scores``, from its JSON alone."""
+"""The gain of scores against their cost: a picture of ``python -m tools.studies scores``, from its JSON alone."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tools.studies.common.names import Named, write_names
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours without yellow, told apart by colour-blind readers too; the shape tells more scores apart
+# Okabe and Ito's colours without yellow, also distinct to the colour-blind; the shape distinguishes further scores
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9")
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X", "*")
 _SIZE = (4.6, 3.6)  # of a panel, inches
@@ -19,7 +19,7 @@ _COLUMNS = 3
 
 
 def draw_scores(content: Mapping[str, Any]) -> bytes:
-    """PNG with a panel for each part and one for their mean: gain [nats] against the time of the score [ms, log].
+    """PNG with a panel for each object and one for their mean: gain [nats] against the time of the score [ms, log].
 
     Parameters
     ----------

@@ -110,7 +110,7 @@ def bytes_per_pose(scorer: Scorer, index: Index) -> float:
 
 
 def judged(localizer: Localizer, touches: Sequence[Touch], effort: str, seed: int) -> Iterator[Scored]:
-    """Localizes each touch and says how that went, and the time of the score."""
+    """Localizes each touch; gives its outcome and the time of the score."""
     for outcome, posterior in study.judged(localizer, touches, effort, seed):
         # an image without contact is not scored
         score_ms = sum(posterior.timing_ms.get(stage, 0.0) for stage in ("score", "posterior"))
@@ -134,12 +134,12 @@ def summarise(outcomes: Sequence[Scored], iou: Sequence[Scored], random_add_mm: 
 
 
 def over_parts(entries: Sequence[Mapping[str, Any]], outcomes: Sequence[Sequence[Scored]]) -> dict[str, Any]:
-    """A score's figures over several parts: every part counts alike, and the coverage is that of all touches together.
+    """A score's figures over several objects: every object counts alike, and the coverage is that of all touches together.
 
     Parameters
     ----------
-    entries : what the JSON holds of the score, a part each
-    outcomes : on each part
+    entries : what the JSON holds of the score, an object each
+    outcomes : on each object
     """
     figures = {}
     for name, together in study.groups([o for some in outcomes for o in some]).items():

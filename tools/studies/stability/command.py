@@ -1,4 +1,4 @@
-"""``python -m tools.studies stability``: conditions made worse step by step, and whether the answers know that they are worse."""
+"""``python -m tools.studies stability``: conditions made worse step by step, and whether failures are detected."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from geomtact.cli.shell import print_table, tell
 from tools.studies.common import study_file, study_options
 
 SCHEMA = "geomtact/stability/2"
-_ALIKE = ("sensor_sha256", "scorer", "touches", "effort", "seed")  # settings that parts taken together share
+_ALIKE = ("sensor_sha256", "scorer", "touches", "effort", "seed")  # settings that objects taken together share
 _NAMES = (
     "noise, specks, depth, pitch, size, surface, faces, threshold, halo, area, border, kind, shown, detail, rig_shift, "
     "rig_turn, jaw, slips, other_part"
@@ -27,7 +27,7 @@ def judge_stability(
         list[str] | None,
         typer.Option(
             "--sweep",
-            help=f"What to make worse (docs/stability.md says how); may be repeated; all by default: {_NAMES}.",
+            help=f"What to make worse (see docs/stability.md); may be repeated; all by default: {_NAMES}.",
         ),
     ] = None,
     sensor: study_options.SensorName = "gelslim",
@@ -36,7 +36,7 @@ def judge_stability(
         typer.Option(
             "--touches",
             min=1,
-            help="How many of each part at each level that is promised to hold; a quarter at others.",
+            help="How many of each object at each level that is promised to hold; a quarter at others.",
         ),
     ] = 200,
     effort: study_options.EffortLevel = Effort.balanced,
@@ -46,9 +46,9 @@ def judge_stability(
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Judge stability: noise, wrong pixels, wrong meshes, small contacts and wrong rigs, from easy to broken.
+    """Judge stability: noise, wrong pixels, wrong meshes, small contacts and wrong sensor extrinsics, from easy to broken.
 
-    Prints for each level what is known, how often the answer is wrong, and how often nothing says so; and writes all to --out.
+    Prints for each level the gain, how often the estimate is wrong, and how often that is undetected; writes all to --out.
     """
     from geomtact.errors import UsageError, nearest_name
     from geomtact.evaluation import describe
@@ -84,12 +84,12 @@ def judge_stability(
     content["together"] = plain(_together(list(content["parts"].values())))
     study_file.save(out, content)
     if len(content["parts"]) > 1:
-        _print("all parts", {name: content["together"][name] for name in names if name in content["together"]})
+        _print("all objects", {name: content["together"][name] for name in names if name in content["together"]})
     study_file.plot(content, plot)
 
 
 def _together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The sweeps of all parts that were judged as the first one was, the answers of each level taken together."""
+    """The sweeps of all objects that were evaluated as the first one was, the estimates of each level pooled."""
     from tools.studies.stability import study as stability
 
     how = [{key: part["settings"][key] for key in _ALIKE} for part in parts]
@@ -106,13 +106,13 @@ def _together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _columns(answers: Sequence[Any]) -> dict[str, list]:
-    """Answers as they are written, a list for each field."""
+    """Estimates as they are written, a list for each field."""
     rows = [asdict(each) for each in answers]
     return {key: [row[key] if isinstance(row[key], bool) else round(row[key], 4) for row in rows] for key in rows[0]}
 
 
 def _answers(columns: Mapping[str, Sequence[Any]]) -> list[Any]:
-    """The answers that were written as ``columns``."""
+    """The estimates that were written as ``columns``."""
     from tools.studies.common.answer import Answer
 
     rows = zip(*columns.values(), strict=True)

@@ -1,4 +1,4 @@
-"""A picture of how answers hold as conditions get worse, drawn from the study's JSON alone."""
+"""A picture of how estimates hold as conditions get worse, drawn from the study's JSON alone."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any
 from geomtact.report.canvas import COLOURS, png
 
 _ACROSS = 4
-_TOGETHER = "all parts"
+_TOGETHER = "all objects"
 _LINE = 50  # letters under an axis
-_SEVENTH = "#8C564B"  # colour, of as many parts
+_SEVENTH = "#8C564B"  # colour, of as many objects
 _IN_A_ROW = 6  # of the legend
 
 
 def draw_stability(content: Mapping[str, Any]) -> bytes:
-    """A PNG: for each sweep the information told and claimed; and below how many truths the 90 % region holds, with the 99 %
-    intervals of all parts together, and how many answers are wrong while nothing says so.
+    """A PNG: for each sweep the gain and the expected gain; and below how many truths the 90 % region holds, with the 99 %
+    intervals of all objects together, and the share of undetected failures.
 
-    What is promised lies on a light ground. Parts are told apart by colour; all together are black.
+    What is promised lies on a light ground. Objects differ by colour; all together are black.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -43,9 +43,9 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
         _draw(pair, [(colours[p], some[name]) for p, some in sweeps.items() if name in some])
     handles: list[Any] = [figure.axes[0].plot([], [], "o-", color=c, label=p)[0] for p, c in colours.items()]
     styles = (
-        ("o-", "above: told, below: truths in the 90 % region"),
-        ("--", "above: claimed"),
-        (":", "below: wrong, and nothing says so"),
+        ("o-", "above: gain, below: truths in the 90 % region"),
+        ("--", "above: expected gain"),
+        (":", "below: undetected failures"),
     )
     handles += [figure.axes[0].plot([], [], style, color="0.4", label=label)[0] for style, label in styles]
     handles.append(figure.axes[0].fill_between([], [], color="0.94", label="promised to hold"))
@@ -54,9 +54,9 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
 
 
 def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
-    """One sweep of each part, with its colour, into the two axes of ``pair``, the last with intervals.
+    """One sweep of each object, with its colour, into the two axes of ``pair``, the last with intervals.
 
-    A part may lack levels that others have.
+    An object may lack levels that others have.
     """
     nats, shares = pair
     sweep = max((each for _, each in parts), key=lambda each: len(each["levels"]))

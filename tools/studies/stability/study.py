@@ -1,7 +1,7 @@
 """Stability: what is touched, and how, made worse step by step, while the localizer is left as it was prepared.
 
-Each sweep leads from what the localizer was made for to what breaks it. A wrong answer is found out if it carries a warning
-or its first mode says itself that it holds less than half; it is silent otherwise. Silent ones are what a sweep looks for.
+Each sweep leads from what the localizer was made for to what breaks it. A wrong estimate is a detected failure if it
+carries a warning or its first mode holds less than half; it is an undetected failure otherwise. A sweep looks for these.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from tools.studies.common.study import CERTAIN
 from tools.studies.stability.worlds import TRIED, World, knobbed, larger, scanned, touches
 from tools.studies.track.trajectories import random_trajectory
 
-_SENSORS = 3  # that touch at once, where the rig is wrong
-_FRAMES, _STEP = 12, 2e-3  # of a sequence, and how far the part creeps from one to the next [m]
+_SENSORS = 3  # that touch at once, where the extrinsics are wrong
+_FRAMES, _STEP = 12, 2e-3  # of a sequence, and how far the object creeps from one to the next [m]
 _OTHERS = ("gear", "connector_plug", "bracket")
 
 
@@ -48,7 +48,7 @@ class Sweep:
     levels : from easy to broken
     inside : those of them that the documentation promises to hold
     world : of one touch at a level; None for sweeps of several sensors or a sequence
-    ask : for those, answers at a level
+    ask : for those, estimates at a level
     """
 
     title: str
@@ -59,7 +59,7 @@ class Sweep:
 
 
 def _other(mesh: Mesh, number: float) -> Mesh:
-    """Another bundled part, or ``mesh`` itself for 0."""
+    """Another bundled object, or ``mesh`` itself for 0."""
     from geomtact.geometry.mesh_file import load_mesh
 
     return load_mesh(_OTHERS[int(number) - 1]) if number else mesh
@@ -78,9 +78,9 @@ def swept(
     effort: str,
     as_prepared: list[Answer] | None = None,
 ) -> Iterator[Answer]:
-    """Answers to ``n`` touches, or scenes of several sensors, at a level of a sweep.
+    """Estimates from ``n`` touches, or scenes of several sensors, at a level of a sweep.
 
-    Most sweeps begin where all is as the localizer was prepared for: ``as_prepared`` holds those answers, once they are told.
+    Most sweeps begin where all is as the localizer was prepared for: ``as_prepared`` holds those estimates, once they are made.
     """
     if sweep.ask is not None:
         yield from sweep.ask(localizer, level, n, seed, effort)
@@ -100,7 +100,7 @@ def swept(
 
 
 def _alone(localizer: Localizer, there: World, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """Answers to single touches of another world than the localizer was prepared for."""
+    """Estimates from single touches of another world than the localizer was prepared for."""
     for T, mask in touches(there, n, seed):
         posterior = localizer.localize(mask, "mask", effort=effort, seed=seed)
         answer = judged(localizer.mesh, T, posterior, _knowable(localizer.space, T))
@@ -119,7 +119,7 @@ def _knowable(space: ContactSpace, T: Array) -> Array:
 
 
 def _rigs(off: Array, localizer: Localizer, level: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """Scenes of three sensors whose poses are told wrongly, each off at random by ``level`` times ``off`` (6,) [rad, m], but the
+    """Scenes of three sensors whose stated poses are wrong, each off at random by ``level`` times ``off`` (6,) [rad, m], but the
     first."""
     rng = np.random.default_rng([seed, 7])
     for scene in simultaneous_touches(localizer.space, n, _SENSORS, seed):
@@ -129,8 +129,8 @@ def _rigs(off: Array, localizer: Localizer, level: float, n: int, seed: int, eff
 
 
 def _jaws(localizer: Localizer, level: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """Two sensors that close on the part from opposite sides, on lines through the first one's window that are ``level`` degrees
-    apart: what moves the part along both lines, or about them, either tells alike."""
+    """Two sensors that close on the object from opposite sides, on lines through the first one's window ``level`` degrees
+    apart: what moves the object along both lines, or about them, both constrain alike."""
     rng, space = np.random.default_rng([seed, 9]), localizer.space
     least, most = penetrations(space)
     made = 0
@@ -159,7 +159,7 @@ def opposed(T: Array, angle: float, way: float, space: ContactSpace, depth: floa
 
 
 def _together(localizer: Localizer, T: Array, T_world_sensor: Array, masks: list, effort: str, seed: int) -> Answer:
-    """What several sensors tell of an object at ``T`` (4, 4)."""
+    """The estimate of several sensors from an object at ``T`` (4, 4)."""
     try:
         posterior = localizer.localize(masks, "mask", T_world_sensor=T_world_sensor, effort=effort, seed=seed)
     except NoPoseAgreesError:
@@ -168,7 +168,7 @@ def _together(localizer: Localizer, T: Array, T_world_sensor: Array, masks: list
 
 
 def _sequences(localizer: Localizer, level: float, n: int, seed: int, effort: str) -> Iterator[Answer]:
-    """What is told at the last frame of sequences in which the part slips ``level`` times, at even distances; warned, if of any
+    """The estimate at the last frame of sequences in which the object slips ``level`` times, at even distances; warned, if of any
     slip."""
     slips = int(level)
     at = tuple(_FRAMES * (i + 1) // (slips + 1) for i in range(slips))
@@ -287,12 +287,12 @@ SWEEPS = {
 
 
 def summarise(answers: Sequence[Answer]) -> dict[str, Any]:
-    """Figures of the answers at one level.
+    """Figures of the estimates at one level.
 
     ``ruled_out`` is the share of truths that were given no probability; ``certain`` that of first modes which hold half or more;
-    ``found_out`` the share of wrong answers that carry a warning or hold less than half, ``alarmed`` that of right ones which
+    ``found_out`` the share of wrong estimates that carry a warning or hold less than half, ``alarmed`` that of right ones which
     carry a warning; both None where there are no such.
-    What is told and claimed is of the truths not ruled out. Coverage has 99 % intervals.
+    Gain and expected gain are of the truths not ruled out. Coverage has 99 % intervals.
     """
     gain = np.array([a.gain for a in answers])
     felt, claimed = np.isfinite(gain), np.array([a.claimed for a in answers])

@@ -1,4 +1,4 @@
-"""Worlds in which a part is touched otherwise than a localizer expects: another mesh, sensor or noise, and chosen contacts."""
+"""Worlds in which an object is touched otherwise than a localizer expects: another mesh, sensor or noise, and chosen contacts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from geomtact.sensing.patches import patches
 from geomtact.sensing.sensor import Sensor
 
 TRIED = 500  # touches, at most, for each one that is wanted
-_KNOBS = 12  # that a part has and its mesh lacks
+_KNOBS = 12  # that an object has and its mesh lacks
 _BUMP = 3e-3  # m over which a scanned surface is off alike
 
 

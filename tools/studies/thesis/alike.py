@@ -1,8 +1,8 @@
-"""Other poses of a part, touched from the same known side, that feel like a touch.
+"""Other poses of an object, touched from the same known contact face, that show the same contact as a touch.
 
-Two poses feel the same if their contacts, without noise, overlap as well as two noisy readings of one touch do. The search
-starts from the grid's poses and goes by the rigid contact, cast anew at every step, then by the contact as the gel feels it,
-which gives the verdict. No score of the library has a say.
+Two poses show the same contact if their contacts, without noise, overlap as well as two noisy tactile images of one
+touch do. The search starts from the grid's poses and goes by the rigid contact, cast anew at every step, then by the
+elastic contact, which gives the verdict. No score of the library enters.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ from geomtact.sensing.noise import Noise
 
 SPACING_MM = 3.0  # poses nearer to each other than this count as one
 STARTS = 150  # poses of the grid that are searched from
-_JUDGED, _TRIES = 60, 6  # of them felt at all; moves a round
-_NEARLY = 0.15  # overlap that a last search, by the contact as felt, may make up for
+_JUDGED, _TRIES = 60, 6  # of them in contact at all; moves a round
+_NEARLY = 0.15  # overlap that a last search, by the elastic contact, may make up for
 _SEARCH, _VERDICT, _READING = (36, 48), (72, 96), (144, 192)  # grids over the window
-_PAIRS = 8  # of noisy readings
+_PAIRS = 8  # of noisy tactile images
 Mask = NDArray[np.bool_]
 
 
 def alike(localizer: Localizer, touch: Touch, noise: Noise, rng: np.random.Generator) -> tuple[Array, float]:
-    """Poses (n, 4, 4) that feel like ``touch``, ``SPACING_MM`` apart, the true one first; and the overlap needed."""
+    """Poses (n, 4, 4) that show the same contact as ``touch``, ``SPACING_MM`` apart, the true one first; and the
+    overlap needed."""
     space, index, true = localizer.space, localizer.index, touch.T_sensor_object
     sensor, along = space.sensor, space.sensor.along
     needed = overlap_of_readings(simulate_mask(space, true, touch.elastic, along(_READING)), space, noise, rng)
@@ -67,7 +68,7 @@ def overlap(mask: Mask, others: Mask) -> Array:
 
 
 def overlap_of_readings(mask: Mask, space: ContactSpace, noise: Noise, rng: np.random.Generator) -> float:
-    """Median overlap of two noisy readings of the contact ``mask`` (h, w), specks left out."""
+    """Median overlap of two noisy tactile images of the contact ``mask`` (h, w), specks left out."""
     area = space.sensor.pixel_area(mask.shape)
     readings = [without_specks(spoilt(mask, space, noise, rng), area) for _ in range(2 * _PAIRS)]
     return float(np.median([overlap(a, b) for a, b in zip(readings[::2], readings[1::2], strict=True)]))

@@ -1,4 +1,4 @@
-"""What one touch leaves open, whoever reads it: how far apart the poses lie that feel the same.
+"""The ambiguity of one touch: how far apart the poses lie that show the same contact.
 
 No method can know which of these poses it is. A guess need not be one of them, and may lie between; but by the triangle
 inequality even the best one is off by half of what the best among them is, or more. The search for them (``evaluation.alike``)
@@ -23,9 +23,9 @@ from tools.studies.thesis.alike import SPACING_MM, STARTS, alike
 from tools.studies.thesis.known_approach import Outcome, touches_of_side
 from tools.studies.thesis.known_approach import summarise as table
 
-DISTINCTIVE_MM = 10.0  # a touch is distinctive if no pose that feels the same lies farther off
+DISTINCTIVE_MM = 10.0  # a touch is distinctive if no pose that shows the same contact lies farther off
 DRAWS = 200  # poses of a posterior
-REGION = 0.9  # of a posterior's mass, within which poses count as told
+REGION = 0.9  # of a posterior's mass, within which poses count as held
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Ambiguity:
     Attributes
     ----------
     side, touch : number of the side, and of the touch from there
-    poses : how many feel the same, ``alike.SPACING_MM`` apart, the true one among them
-    needed : overlap (IoU) of contacts that feel the same: the median of two noisy readings of the true pose
+    poses : how many show the same contact, ``alike.SPACING_MM`` apart, the true one among them
+    needed : overlap (IoU) at which contacts count as the same: the median of two noisy tactile images of the true pose
     span_mm : from the true pose to the farthest of them
     random_mm : expected error of one of them guessed at random
     least_mm : expected error of the best guess among them, were each of them as likely to be the true one
@@ -74,13 +74,13 @@ def judge_side(
 
 
 def errors(between: Array) -> tuple[float, float, float]:
-    """Span, and expected errors of a guess and of the best guess, from the distances (n, n) between poses that feel the same, the
+    """Span, and expected errors of a guess and of the best guess, from the distances (n, n) between such poses, the
     true one first."""
     return float(between[0].max()), float(between[0].mean()), float(between.mean(0).min())
 
 
 def held(posterior: Posterior, T: Array, distance: PoseDistance, rng: np.random.Generator) -> tuple[float, float]:
-    """Precision and recall of a posterior, of the poses ``T`` (n, 4, 4) that feel the same."""
+    """Precision and recall of a posterior, of the poses ``T`` (n, 4, 4) that show the same contact."""
     if not posterior.contact:
         return 0.0, 0.0
     drawn, radius = posterior.sample(DRAWS, rng), mode_radius(distance.mesh)

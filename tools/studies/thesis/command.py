@@ -1,4 +1,4 @@
-"""``python -m tools.studies thesis``: the thesis's Table 1, on parts touched from a known side."""
+"""``python -m tools.studies thesis``: the thesis's Table 1, on objects touched from a known contact face."""
 
 from __future__ import annotations
 
@@ -20,27 +20,29 @@ if TYPE_CHECKING:
     from geomtact.sensing.sensor import Sensor
 
 SCHEMA = "geomtact/thesis-table/2"
-_POSES = 50_000  # of a part that is touched from a known side
+_POSES = 50_000  # of an object that is touched from a known contact face
 
 
 def judge_thesis_table(
     parts: study_options.ThesisParts = None,
     unit: Unit = None,
     sensor: study_options.SensorName = "gelslim",
-    sides: Annotated[int, typer.Option("--sides", min=1, help="From how many sides each part is touched.")] = 5,
+    sides: Annotated[int, typer.Option("--sides", min=1, help="From how many sides each object is touched.")] = 5,
     touches: Annotated[int, typer.Option("--touches", min=1, help="How many touches from each side.")] = 40,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     felt: study_options.Felt = study_options.FeltName.elastic,
     effort: study_options.EffortLevel = Effort.exact,
     ambiguity: Annotated[
-        int, typer.Option("--ambiguity", min=0, help="For how many of them to seek all poses that feel the same.")
+        int,
+        typer.Option("--ambiguity", min=0, help="For how many of them to seek all poses that show the same contact."),
     ] = 0,
     seed: Seed = 1,
     out: study_options.Out = None,
     plot: study_options.Plot = None,
     cache_dir: CacheDir = None,
 ) -> None:
-    """Judge one touch from a known side, as in the thesis's Table 1: the most probable pose, refined, and the best of ten.
+    """Judge one touch from a known contact face, as in the thesis's Table 1: the most probable pose, refined, and the
+    best of ten.
 
     Prints median errors, absolute and normalised, and writes them and every outcome to --out; with --ambiguity also what the
     first touches from each side leave open, whoever reads them.
@@ -78,7 +80,7 @@ def _judge_part(
     out: Path | None,
     cache_dir: Path | None,
 ) -> None:
-    """Judge what ``content`` does not hold yet of a part; a side that was not finished is touched anew."""
+    """Judge what ``content`` does not hold yet of an object; a side that was not finished is touched anew."""
     from geomtact.localizer import Localizer
     from tools.studies.thesis import ambiguity as open_set
     from tools.studies.thesis import known_approach
@@ -153,8 +155,9 @@ def _print(parts: Mapping[str, Any]) -> None:
             rows.append([name, kind, str(table["best"]["n"]), *(left if kind == "all" else [""] * len(left)), *ours])
     if rows:
         typer.echo(
-            "What a touch leaves open, whoever reads it, and the errors on touches that leave much and little: medians. "
-            "Precision: mean share of the posterior at poses that feel the same; recall: mean share of these in its 90 % region"
+            "The ambiguity of a touch, and the errors on touches that leave much and little: medians. "
+            "Precision: mean share of the posterior at poses that show the same contact; "
+            "recall: mean share of these in its 90 % region"
         )
         numbers = [
             "touches",

@@ -1,9 +1,9 @@
-"""Figures 8, 10, 14 and 15 of the thesis, of this project's own parts and touches: 8 shows where pixel distance fails, 10 what
+"""Figures 8, 10, 14 and 15 of the thesis, of this project's own objects and touches: 8 shows where pixel distance fails, 10 what
 normalised errors look like, 14 and 15 contacts added one by one.
 
     python -m tools.studies.thesis.figures [8] [10] [15] [--out FOLDER]
 
-Without numbers all are drawn, 14 as the first column of 15. About three minutes on two cores, after the four parts' touches
+Without numbers all are drawn, 14 as the first column of 15. About three minutes on two cores, after the four objects' touches
 were simulated once (a minute each); pictures and their figures (JSON) go to out/thesis.
 """
 
@@ -92,7 +92,7 @@ def pose_errors():
 
 
 def contacts_added():
-    """Figures 14 and 15: a scene of each part, localized from its first touch, its first two, and so on."""
+    """Figures 14 and 15: a scene of each object, localized from its first touch, its first two, and so on."""
     figure = Figure(figsize=(15, 2.25 * len(THESIS_PARTS)), dpi=90, layout="constrained")
     grid, told = figure.subplots(len(THESIS_PARTS), 8, width_ratios=[1, 1.1] * 4), {}
     for row, name in zip(grid, THESIS_PARTS, strict=True):
@@ -137,14 +137,14 @@ def outline(axes, mask):
 
 
 def lying(mesh):
-    """A rotation (4, 4) about the part's centre that lays its long side across a picture."""
+    """A rotation (4, 4) about the object's centre that lays its long side across a picture."""
     long = np.linalg.svd(mesh.surface_points(500) - mesh.centre, full_matrices=False)[2]
     across, away = unit(long[0]), unit(long[2] + 0.5 * long[1])
     return transform(np.stack([across, np.cross(away, across), away]), np.zeros(3))
 
 
 def overlay(axes, caster, T, other, half):
-    """The part at ``T``, shaded, and at ``other``, tinted orange, seen along z; the picture is 2 ``half`` [m] wide."""
+    """The object at ``T``, shaded, and at ``other``, tinted orange, seen along z; the picture is 2 ``half`` [m] wide."""
     camera = Sensor("view", (PIXELS, PIXELS), (2 * half / PIXELS,) * 2, 0.0, 1.0)
     image = np.ones((PIXELS, PIXELS, 3))
     depths = caster.depths(camera, np.stack([T, other]))

@@ -1,8 +1,8 @@
-"""The thesis's Table 1: one touch from a side that is known, anywhere on the part, turned in any way about the normal (7.1).
+"""The thesis's Table 1: one touch of a known contact face, anywhere on the object, turned in any way about the normal (7.1).
 
-A robot that lowers a part onto the sensor knows which way it came. The errors of the grid's pose at the heart of the most
-probable mode are given before and after refinement, by this project and by the thesis's own way; and those of the answer, and of
-the best of ten poses and of ten modes.
+A robot that lowers an object onto the sensor knows its approach. The errors of the grid's pose at the heart of the most
+probable mode are given before and after refinement, by this project and by the thesis's own method; and those of the
+estimate, and of the best of ten poses and of ten modes.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class Outcome:
     ----------
     side : number of the side that is touched
     error_mm : of each of ``ROWS``: the heart of the grid's most probable mode, that pose refined, refined as in the thesis, and
-        the first mode of what ``localize`` says; the best of the ten most probable poses, as in the thesis, of the grid and of
-        what ``localize`` says; and the best of the ten modes of each, no two of which are neighbours
+        the first mode of ``localize``; the best of the ten most probable poses, as in the thesis, of the grid and of
+        ``localize``; and the best of the ten modes of each, no two of which are neighbours
     random_mm : expected ADD of a random guess, touching from that side
     """
 
@@ -91,7 +91,7 @@ def touches_of_side(
 def judge_side(
     localizer: Localizer, side: int, n: int, seed: int, noise: Noise, effort: str, elastic: bool | None
 ) -> Iterator[Outcome]:
-    """``n`` touches of a part whose approach ``localizer`` knows; ``elastic`` as in ``touches.random_touches``."""
+    """``n`` touches of an object whose approach ``localizer`` knows; ``elastic`` as in ``touches.random_touches``."""
     distance, random_mm = PoseDistance(localizer.mesh), expected_random_add(localizer)
     for touch in touches_of_side(localizer, side, n, seed, noise, elastic):
         errors = [

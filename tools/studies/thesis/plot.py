@@ -1,5 +1,5 @@
-"""A picture of how the errors of one touch from a known side are distributed, drawn from the study's JSON alone (the thesis's
-Figure 12)."""
+"""A picture of how the errors of one touch from a known contact face are distributed, drawn from the study's JSON
+alone (the thesis's Figure 12)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BIN, _MOST = 0.05, 1.6  # normalised error
 
 
 def draw_thesis(content: Mapping[str, Any]) -> bytes:
-    """A PNG: for each part, and before and after refinement, how many touches have which normalised error."""
+    """A PNG: for each object, and before and after refinement, how many touches have which normalised error."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

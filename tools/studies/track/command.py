@@ -20,7 +20,7 @@ def judge_track(
     parts: study_options.ThesisParts = None,
     unit: Unit = None,
     sensor: study_options.SensorName = "gelslim",
-    trajectories: Annotated[int, typer.Option("--touches", min=1, help="How many trajectories of each part.")] = 200,
+    trajectories: Annotated[int, typer.Option("--touches", min=1, help="How many trajectories of each object.")] = 200,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     effort: study_options.EffortLevel = Effort.balanced,
     seed: Seed = 1,
@@ -30,7 +30,7 @@ def judge_track(
 ) -> None:
     """Judge tracking: the filter over a sequence against independent frames and against the thesis's own filter.
 
-    Prints gain, coverage and how often each loses the part, and writes them and every trajectory to --out.
+    Prints gain, coverage and how often each loses the object, and writes them and every trajectory to --out.
     """
     from geomtact.evaluation import describe
     from geomtact.json_values import plain

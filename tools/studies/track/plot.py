@@ -38,7 +38,7 @@ def draw_track(content: Mapping[str, Any]) -> bytes:
         place += len(own) + 1
     right.axhline(0, color="0.4", lw=0.8)
     right.set_xticks([])
-    right.set_xlabel("trajectories, part by part")
+    right.set_xlabel("trajectories, object by object")
     right.set_ylabel("filter less independent frames [nats]")
     right.set_title("Each trajectory, mean over its frames")
     right.legend(frameon=False, fontsize=8, loc="lower right")

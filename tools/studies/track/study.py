@@ -26,7 +26,7 @@ from tools.studies.track.trajectories import FEATURELESS, Trajectory, random_tra
 # Ours, each frame alone, and the thesis's 50 poses that count each frame in full
 METHODS = ("filter", "frames", "thesis")
 FRAMES = 16
-STRETCH = 10  # frames without features that begin every other pair of trajectories, where the part has such
+STRETCH = 10  # frames without features that begin every other pair of trajectories, where the object has such
 LOST = 0.01  # share below which the true mode counts as lost: of all mass, or of what the frame alone gives it
 LIVE = 50_000  # cells at which a step of the filter is timed
 SPEED = 4e-3  # m from frame to frame, half of what the thesis's motion allows
@@ -36,7 +36,7 @@ _POINTS = 128  # of the surface, for distances
 
 @dataclass(frozen=True)
 class Followed:
-    """What each of ``METHODS`` told of one trajectory, a number a frame.
+    """The figures of each of ``METHODS`` on one trajectory, a number a frame.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ def make_trajectory(localizer: Localizer, number: int, seed: int, frames: int, n
 def follow(
     localizer: Localizer, n: int, seed: int, frames: int, noise: Noise, effort: str, first: int = 0
 ) -> Iterator[Followed]:
-    """Trajectories ``first`` to ``n`` of a part, each frame localized once and put through every filter."""
+    """Trajectories ``first`` to ``n`` of an object, each frame localized once and put through every filter."""
     distance = PoseDistance(localizer.mesh, _POINTS)
     radius = mode_radius(localizer.mesh) + cell_width(localizer.index, distance)
     for number in range(first, n):

@@ -1,4 +1,4 @@
-"""Sequences of touches with known poses, to judge filters on: an object that creeps over the sensor, pressed all the while."""
+"""Sequences of touches with true poses, to judge filters on: an object that creeps over the sensor, pressed all the while."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def random_trajectory(
     Parameters
     ----------
     speed : mean point distance from one frame to the next [m]; 0 stands still
-    featureless : in so many frames, the first ones, the contact is flat or a cylinder's
+    featureless : number of frames, the first ones, in which the contact is flat or a cylinder's
     slips : frames at which the object is suddenly at another pose of the contact pose space
     elastic : True for an elastic gel, False for the thesis's threshold; its noise is drawn anew in every frame
 

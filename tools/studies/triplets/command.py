@@ -67,7 +67,7 @@ def _print(figures: Sequence[dict[str, Any]]) -> None:
         regions.append([*name, *study_file.inside(f), *shares, f"{f['ms_quartiles'][1]:.0f}"])
     typer.echo("Medians with quartiles; triplets in which the first mode touches all three sensors")
     print_table(headings, rows, headings[1:])
-    typer.echo("Percentage of truths inside the region of each mass, true poses ruled out, sensors said to disagree")
+    typer.echo("Percentage of truths inside the region of each mass, true poses ruled out, warnings of a sensor")
     said = ["touches", *study_file.masses(), "ruled out", "warned", "ms"]
     print_table(["shown", *said], regions, said)
 

@@ -45,7 +45,7 @@ class Triplet:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the first ``touches`` sensors of a triplet told. Lengths in millimetres, information in nats.
+    """The figures of the first ``touches`` sensors of a triplet. Lengths in millimetres, information in nats.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Outcome:
     position_mm : from the object's centre in the first mode to its true place; inf where no pose agreed
     add_s_mm, probability : of the first mode
     touching : how many of all three sensors the object touches in the first mode, see :func:`touching`
-    warned : whether a sensor was said to disagree
+    warned : whether a warning named a sensor as disagreeing
     ms : that localizing took
     """
 
@@ -114,8 +114,8 @@ def sensor_pose(row: ArrayLike, sensor: Sensor) -> Array:
 def judge(
     localizer: Localizer, triplets: Sequence[Triplet], effort: str, seed: int, first: int = 0
 ) -> Iterator[list[Outcome]]:
-    """Each triplet from ``first`` on localized from its first touch, its first two and all three: from the readings, and from
-    ideal contacts.
+    """Each triplet from ``first`` on localized from its first touch, its first two and all three: from the tactile
+    images, and from ideal contacts.
 
     Before them stands the outcome of chance: the uniform distribution on the poses that touch the first sensor.
     """
@@ -131,7 +131,7 @@ def judge(
 
 def touching(localizer: Localizer, T_world_sensor: Array, T_world_object: Array) -> NDArray[np.bool_]:
     """Which of the sensors (n, 4, 4) the object touches at a pose (4, 4): its deepest point in the window lies between the
-    membrane and the gel's depth, give or take ``TOLERANCE``."""
+    membrane and the gel's depth, within ``TOLERANCE``."""
     depth = localizer.space.caster.penetration(localizer.sensor, inverse(T_world_sensor) @ T_world_object)
     return (depth >= -TOLERANCE) & (depth <= localizer.sensor.max_penetration + TOLERANCE)
 
