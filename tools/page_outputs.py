@@ -23,7 +23,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "docs" / "quickstart.md", ROOT / "docs" / "gallery.md"]
 CONSOLE = re.compile(r"(?<=^```console\n)((?:(?!```).*\n)*)", re.MULTILINE)
-SCRIPT = re.compile(r"(^```python\n((?:(?!```).*\n)*)```\n\n```\n)((?:(?!```).*\n)*)", re.MULTILINE)
+SCRIPT = re.compile(r"(^```python\n((?:(?!```).*\n)*)```\n\n?```\n)((?:(?!```).*\n)*)", re.MULTILINE)
 # Processors with bfloat16 and without differ by 0.003 nats, 0.3 % of the poses and 0.01 % of probability on the sample.
 ABSOLUTE, RELATIVE = 0.15, 0.02
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?!\w)")
