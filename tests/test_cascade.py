@@ -8,9 +8,9 @@ from geomtact.geometry.rotations import Directions
 from geomtact.inference.distribution import cell_log_density
 from geomtact.inference.posterior import Posterior
 from geomtact.scoring import fitted
-from geomtact.scoring.calibration import posterior_log_prob
 from geomtact.scoring.cascade import CoarseScorer, heaviest
 from geomtact.scoring.encoder import EncoderScorer
+from geomtact.scoring.probability import posterior_log_prob
 from geomtact.se3 import transform
 
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.special import softmax
 
 from geomtact.scoring import fitted
-from geomtact.scoring.calibration import Calibration, posterior_log_prob
 from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
+from geomtact.scoring.probability import Calibration, posterior_log_prob
 from geomtact.sensing.patches import patches
 
 MM = 1e-3

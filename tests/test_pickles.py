@@ -13,7 +13,7 @@ from speed import slow_but
 from geomtact import GaussianPrior
 from geomtact.contact_space import store
 from geomtact.errors import CacheError, InputError
-from geomtact.scoring.calibration import Calibration
+from geomtact.scoring.probability import Calibration
 from geomtact.se3 import transform
 
 WAYS = {"pickled": lambda each: pickle.loads(pickle.dumps(each)), "copied": copy.deepcopy}

@@ -16,17 +16,11 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.log_mass import normalised
 from geomtact.scoring import calibration
-from geomtact.scoring.calibration import (
-    FLOORS,
-    Calibration,
-    CalibrationTouches,
-    fit_calibration,
-    posterior_log_prob,
-    simulate_touches,
-)
+from geomtact.scoring.calibration import FLOORS, CalibrationTouches, fit_calibration, simulate_touches
 from geomtact.scoring.fitted import fitted_scorer
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.overlap import OVERLAPS, overlaps, to_grid
+from geomtact.scoring.probability import Calibration, posterior_log_prob
 from geomtact.sensing.moments import moments, without_specks
 from geomtact.sensing.sensor import Sensor
 

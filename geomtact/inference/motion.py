@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from geomtact.geometry.mesh import Mesh
 from geomtact.se3 import Array
+
+
+@runtime_checkable
+class Motion(Protocol):
+    """How an object may move from one frame to the next: a frozen dataclass of lengths [m] and angles [rad] of 0 or more."""
+
+    def twists(self, mesh: Mesh, n: int, rng: np.random.Generator) -> Array:
+        """Draw ``n`` motions xi (n, 6) about the object's centre, rotation first [rad, m]."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -50,6 +60,3 @@ class GaussianTwist:
     def twists(self, mesh: Mesh, n: int, rng: np.random.Generator) -> Array:
         """Motions xi (n, 6) about the object's centre [rad, m]."""
         return rng.normal(size=(n, 6)) * np.repeat([self.rotation, self.translation], 3)
-
-
-Motion = UniformBall | GaussianTwist

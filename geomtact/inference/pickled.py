@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import CacheError
-from geomtact.scoring.calibration import Calibration
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
+from geomtact.scoring.probability import Calibration
 
 _Kind = TypeVar("_Kind")
 Fit = tuple[Calibration, Calibration | None, bool]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sized
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -111,7 +111,7 @@ def _tracked(
     skip: bool,
 ) -> Iterator[Posterior]:
     motion, made_from, expected = state.motion_kernel.motion, None, None
-    record = TrackRecord({"kind": type(motion).__name__, **asdict(motion)}, state.counts, state.fresh, state.most)
+    record = TrackRecord({"kind": type(motion).__name__, **vars(motion)}, state.counts, state.fresh, state.most)
     for n, image, T in pairs:
         frame, at = ("sensor", np.eye(4)) if T is None else ("world", T)
         try:
@@ -162,11 +162,11 @@ def _check(
         raise UsageError(f"frames: expected several images, got one of shape {frames.shape}; give it in a list")
     if isinstance(frames, Sized) and len(frames) == 0:
         raise InputError(_NO_FRAMES)
-    if not isinstance(motion, Motion):
+    if isinstance(motion, type) or not isinstance(motion, Motion):
         raise UsageError(
-            f"motion: expected a UniformBall or a GaussianTwist, got {motion!r}; UniformBall(0.008) is 8 mm a frame"
+            f"motion: expected a Motion, such as UniformBall or GaussianTwist, got {motion!r}; UniformBall(0.008) is 8 mm a frame"
         )
-    if not all(0 <= each < np.inf for each in asdict(motion).values()):
+    if not all(0 <= each < np.inf for each in vars(motion).values()):
         raise UsageError(f"motion: expected finite lengths [m] and angles [rad], not below 0, got {motion}")
     if len(counts) != 2 or not 0 < counts[0] <= 1 or not (counts[1] is None or 0 <= counts[1] <= 1):
         raise UsageError(f"counts: expected two powers, above 0 to 1 and 0 to 1 or None, got {counts}")

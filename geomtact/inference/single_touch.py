@@ -22,8 +22,8 @@ from geomtact.inference.prior import lost_contact, prior_log_density, prior_log_
 from geomtact.inference.repeated_images import digest
 from geomtact.inference.search import SensorView
 from geomtact.inference.views import Placed
-from geomtact.scoring.calibration import posterior_log_prob
 from geomtact.scoring.fitted import FittedScorer
+from geomtact.scoring.probability import posterior_log_prob
 from geomtact.sensing.contact import Contact, SoftMask
 
 LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's

@@ -1,4 +1,4 @@
-"""From scores to probabilities: the temperature and the uniform mixture weight of a score, fitted on simulated touches.
+"""How a score becomes a likelihood: the temperature and the uniform mixture weight of a score, fitted on simulated touches.
 
 (A sensor's colours are calibrated elsewhere: ``sensing/calibrate.py``.)
 
@@ -11,7 +11,6 @@ its maximum is calibrated (Gneiting and Raftery 2007).
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,14 +21,13 @@ from geomtact.contact_space.draw import draw_within
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touch import CALIBRATION_NOISE, LEAST_CONTACT, draw_noise, simulate_mask, spoilt
 from geomtact.progress import Progress
+from geomtact.scoring.probability import TINY, Calibration
 from geomtact.scoring.protocol import Scorer
 from geomtact.se3 import Array
 from geomtact.sensing.noise import Noise
 
 TEMPERATURES = np.geomspace(0.01, 30.0, 240)  # searched, in units of the spread of the scores; hand-set range
 _BINS = 1 << 12  # of the histogram of scores, for speed
-_CHUNK = 1 << 18  # rows worked on at a time
-_TINY = 1e-30  # probability below which sums are made of logarithms: single precision ends near 1e-38
 _SPREAD_TOUCHES = 10  # touches that give the spread of the scores; hand-set
 FLOORS = np.geomspace(1e-3, 0.5, 16)  # searched uniform mixture weights; hand-set range
 _SHAPE = (72, 96)  # pixels of the simulated touches
@@ -54,18 +52,6 @@ class CalibrationTouches:
             shape = tuple(data["shape"])
             masks = np.unpackbits(data["masks"], count=int(np.prod(shape))).astype(bool)
             return cls(list(masks.reshape(shape)), data["ids"])
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """``log likelihood = score / temperature``; ``floor`` is the uniform mixture weight of the posterior.
-
-    ``gain`` is the mean information gained by the touches it was fitted on [nats].
-    """
-
-    temperature: float
-    floor: float
-    gain: float
 
 
 def simulate_touches(
@@ -155,7 +141,7 @@ def fit_to_scores(
         below, mass = _histogram(top - score, weight)
         # the likelihood at the true pose over its mean, for all temperatures from one pass over the scores
         terms = np.exp(below * np.float32(-1) / temperatures[:, None].astype(np.float32))
-        evidence = np.log(np.maximum((terms @ mass).astype(float), _TINY))
+        evidence = np.log(np.maximum((terms @ mass).astype(float), TINY))
         ratio[:, i] = (score[true] - top) / temperatures - evidence
     found = [best_floor(each) for each in ratio]
     best = int(np.argmax([gain for _, gain in found]))
@@ -181,54 +167,3 @@ def _histogram(
     held = np.flatnonzero(mass)
     middle = np.bincount(bin_of, weight * below, minlength=_BINS)[held] / mass[held]
     return middle.astype(np.float32), mass[held].astype(np.float32)
-
-
-def posterior_log_prob(
-    score: NDArray[np.float32], log_prior: NDArray[np.floating], calibration: Calibration
-) -> NDArray[np.float32]:
-    """Log probability (N,) of every row; ``log_prior`` (N,) is the log mass of every row, normalised."""
-    score, prior, floor = score.ravel(), log_prior.astype(np.float32, copy=False), calibration.floor
-    out, mass = np.empty(len(score), np.float32), np.empty(len(score), np.float32)
-    inverse = np.float32(1 / calibration.temperature)
-
-    # in single precision and in chunks: a million rows are many megabytes a pass
-    def weigh(part: slice) -> tuple[float, float]:
-        joint, likely = out[part], mass[part]
-        np.multiply(score[part], inverse, out=joint)
-        joint += prior[part]
-        top = joint.max(initial=-np.inf)
-        if top == -np.inf:
-            likely.fill(0)
-            return -np.inf, -np.inf
-        np.subtract(joint, top, out=likely)
-        np.exp(likely, out=likely)
-        return float(top), float(top) + float(np.log(likely.sum()))  # numpy adds up in pairs: exact enough
-
-    def mix(part: slice, top: float) -> None:
-        joint, likely, mine = out[part], mass[part], prior[part]
-        joint -= np.float32(total)
-        if floor == 0:
-            return
-        likely *= np.float32((1 - floor) * np.exp(top - total))
-        likely += np.exp(mine) * np.float32(floor)
-        if likely.min(initial=1) > _TINY:
-            np.log(likely, out=joint)
-            return
-        # a probability too small for single precision is added up as logarithms
-        tiny = np.flatnonzero((likely < _TINY) & (mine > -np.inf))
-        kept = np.logaddexp(joint[tiny] + np.log1p(-floor), mine[tiny] + np.log(floor), dtype=float)
-        with np.errstate(divide="ignore"):
-            np.log(likely, out=joint)
-        joint[tiny] = kept
-
-    parts = chunks(len(out))
-    with ThreadPoolExecutor(2) as pool:
-        tops, sums = zip(*pool.map(weigh, parts), strict=True)
-        total = float(np.logaddexp.reduce(sums))
-        list(pool.map(mix, parts, tops))
-    return out
-
-
-def chunks(n: int) -> list[slice]:
-    """``n`` rows in slices large enough for a thread."""
-    return [slice(start, start + _CHUNK) for start in range(0, n, _CHUNK)]

@@ -19,15 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index, expand_runs
-from geomtact.scoring.calibration import (
-    Calibration,
-    CalibrationTouches,
-    best_floor,
-    fit_calibration,
-    posterior_log_prob,
-)
+from geomtact.scoring.calibration import CalibrationTouches, best_floor, fit_calibration
 from geomtact.scoring.encoder import EncoderScorer
 from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
+from geomtact.scoring.probability import Calibration, posterior_log_prob
 from geomtact.sensing.contact import SoftMask
 
 SHARE = 0.98  # share of the mass that is scored cell by cell; hand-set

@@ -17,7 +17,7 @@ from geomtact.contact_space.store import lock_of
 from geomtact.errors import MeshError
 from geomtact.files import write_text, write_whole
 from geomtact.progress import Progress
-from geomtact.scoring.calibration import Calibration, CalibrationTouches, fit_calibration, simulate_touches
+from geomtact.scoring.calibration import CalibrationTouches, fit_calibration, simulate_touches
 from geomtact.scoring.cascade import Cascade, Rows
 from geomtact.scoring.catalogue import (
     DEFAULT_SCORER,
@@ -33,6 +33,7 @@ from geomtact.scoring.encoder import EncoderScorer
 from geomtact.scoring.evidence_model import EvidenceModel
 from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
 from geomtact.scoring.moments import Moments
+from geomtact.scoring.probability import Calibration
 from geomtact.scoring.product import Comparison, Product, choose
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import describe_index

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.scoring.calibration import chunks
+from geomtact.scoring.probability import chunks
 from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.patches import patches
 from geomtact.sensing.sensor import Sensor

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
-from geomtact.scoring.calibration import Calibration, CalibrationTouches, fit_to_scores
+from geomtact.scoring.calibration import CalibrationTouches, fit_to_scores
+from geomtact.scoring.probability import Calibration
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import VectorScorer
 from geomtact.sensing.contact import SoftMask
