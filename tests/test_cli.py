@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from geomtact import load_mesh, se3
 from geomtact.cli import app, main, project
 from geomtact.cli.options import approach_from
+from geomtact.cli.shell import one_line_errors, one_line_usage_errors
 from geomtact.errors import CacheError, InputError, UsageError
 from geomtact.sensing import reading
 from tools.studies.__main__ import COMMANDS
@@ -465,3 +466,35 @@ def test_each_image_may_have_its_own_background(tmp_path, monkeypatch, rng):
     assert refused.exit_code == 2 and "expected one, or one for each of 2 images, got 3" in " ".join(
         refused.output.split()
     )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("prepare", "ball", "--max-poses", "5"), "expected at least 1000"),
+        (("prepare", "ball", "--max-poses", "x"), "expected a whole number"),
+        (("localize", "--efort", "fast"), "no such option: --efort; did you mean '--effort'?"),
+    ],
+)
+def test_usage_errors_are_in_plain_words(words, message, capsys):
+    with pytest.raises(SystemExit), one_line_usage_errors():
+        app(list(words), standalone_mode=False)
+    told = capsys.readouterr().err
+    assert message in told and "Input should" not in told and "ossible options" not in told
+
+
+def test_a_folder_of_sensor_poses_and_a_truncated_file_are_named_as_such(geomtact, touched, tmp_path):
+    image = touched / "ball_1.png"
+    assert "is a folder; give a JSON file" in geomtact("localize", image, "--sensor-poses", tmp_path, status=3).stderr
+    (tmp_path / "cut.json").write_text('{"T_world')
+    told = geomtact("localize", image, "--sensor-poses", tmp_path / "cut.json", status=3).stderr
+    assert "cannot be read as JSON" in told and "UTF-8" not in told
+
+
+def test_an_interrupted_command_says_so(capsys):
+    def stopped():
+        raise KeyboardInterrupt
+
+    with pytest.raises(typer.Exit) as left:
+        one_line_errors(stopped)()
+    assert left.value.exit_code == 130 and capsys.readouterr().err == "interrupted\n"

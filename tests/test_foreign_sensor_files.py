@@ -117,15 +117,18 @@ def test_other_json_is_no_sensor(tmp_path, text):
 
 @pytest.mark.parametrize(
     ("size", "kept"),
-    [((640, 480), "68:412, 91:549"), ((3280, 2464), "352:2112, 468:2812"), ((1640, 1232), "176:1056, 234:1406")],
+    [
+        ((640, 480), "rows 68 to 411 and columns 91 to 548"),
+        ((3280, 2464), "rows 352 to 2111 and columns 468 to 2811"),
+        ((1640, 1232), "rows 176 to 1055 and columns 234 to 1405"),
+    ],
 )
 def test_a_whole_frame_of_the_mini_is_refused_with_its_valid_crop(size, kept):
     """gs_sdk cuts off a seventh of 640 x 480 and of 3280 x 2464 px, in whole pixels, as here."""
     frame = np.random.default_rng(0).integers(0, 255, (*size[::-1], 3), np.uint8)
     message = (
-        f"image: expected 320 x 240 px for sensor gelsight-mini (width x height), got {size[0]} x {size[1]} px; of the camera's "
-        f"whole frame give image[{kept}] scaled to 320 x 240 px, for the sensor's images are without 14 % of it at each side; "
-        "if it is cut already, scale it to 320 x 240 px"
+        f"image: expected 320 x 240 px for sensor gelsight-mini (width x height), got {size[0]} x {size[1]} px; cut the camera's "
+        f"whole frame to {kept}, counted from 0, and scale it to 320 x 240 px; if it is cut already, only scale it"
     )
     with pytest.raises(ImageError) as error:
         read_observation(frame, "gelsight-mini")

@@ -231,7 +231,10 @@ def test_no_contact_is_a_result_and_all_contact_a_warning():
 
 
 def test_a_background_for_a_mask_is_a_warning(background):
-    assert "the background is not used" in read_observation(MASK, MINI, background=background).warnings[0]
+    assert (
+        "image: the background is not used: a mask needs none"
+        in read_observation(MASK, MINI, background=background).warnings[0]
+    )
 
 
 # ---------------------------------------------------------------- bad input

@@ -406,7 +406,7 @@ def test_a_mode_that_holds_little_is_not_believed(touch, tmp_path):
     assert [percent(p) for p in (0.62, 0.0012, 0.0004, 0.0)] == ["62.0 %", "0.1 %", "< 0.1 %", "< 0.1 %"]
     assert caution(summaries_of(posterior, modes)) == caution([]) == []
     weak = [FakeMode(modes[0].T, 0.0003)]
-    warned = ["The object is probably not at mode 1, which holds < 0.1 %."]
+    warned = ["The object is probably not at mode 1, which holds < 0.1 %; touch again, or give a prior."]
     assert caution(summaries_of(posterior, weak)) == warned
     write_all(tmp_path, posterior, weak, alone(posterior, simulate), timing_ms={"prepare": 1.23456})
     html = (tmp_path / "report.html").read_text("utf-8")

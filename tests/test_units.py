@@ -57,7 +57,7 @@ def test_a_unit_in_the_file_is_used_and_never_overruled(tmp_path, suffix, unit):
 def test_a_comment_of_another_form_states_nothing(tmp_path, suffix, comment):
     path = commented(tmp_path / f"a.{suffix}", comment)
     assert stated_unit(path) is None
-    with pytest.raises(MeshError, match="does not state its unit; give unit= .--unit. one of mm, cm, m, inch"):
+    with pytest.raises(MeshError, match="does not state its unit; give --unit .unit=. mm, cm, m or inch"):
         load_mesh(path)
     assert load_mesh(path, "cm").unit == "cm"
 

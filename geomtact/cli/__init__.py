@@ -45,6 +45,15 @@ the object. The world is any frame that the sensors share.
 If the sensors differ, add "sensor": ["gelslim", "digit"]. If the matrices are uncertain, add "std_mm": 0.5, "std_deg": 0.2.
 """
 
+RESULTS = """
+[bold]Results[/bold]
+
+"centre" is the object's centre, not the origin of its mesh. "±" is the standard deviation in the least certain direction. \
+Observable directions are the motions that the contact constrains; "unknown" means that registration did not find the mode.
+
+The poses as 4x4 matrices are in result.json, which --out writes and --json prints.
+"""
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
@@ -54,7 +63,7 @@ app = typer.Typer(
     epilog=EXAMPLES
     + "\n\n'geomtact localize --help' shows the form of poses.json. 'geomtact sensors' lists the sensors.",
 )
-app.command(epilog=EXAMPLES + SENSOR_POSES)(one_line_errors(localize))
+app.command(epilog=EXAMPLES + SENSOR_POSES + RESULTS)(one_line_errors(localize))
 for command in (track, view, prepare, evaluate, train, simulate, calibrate, sensors, objects, cache):
     app.command()(one_line_errors(command))
 app.command("next-touch")(one_line_errors(next_touch))

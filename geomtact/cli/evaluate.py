@@ -244,9 +244,17 @@ def _print(content: Mapping[str, Any]) -> None:
     n, radius = figures[0].n, content["mode_radius_mm"]
     typer.echo(f"{content['object']['name']} on {content['sensor']}: {n} simulated touches by each number of sensors")
     typer.echo(f"{finding(figures)}.")
-    headings = ["sensors", "information gain [nats]", "error [mm]: median", "90 %", "best of 5"]
+    headings = ["sensors", "information gain [nats]", "MSSD [mm]: median", "90 %", "best of 5"]
     headings += [f"within {radius:.1f} mm", "time [ms]"]
     print_table(headings, rows, headings)
+    for line in (
+        "MSSD: largest error of a surface point at the most probable mode, modulo symmetry.",
+        f"best of 5: median of the least MSSD of the five most probable modes. within {radius:.1f} mm: share of true poses "
+        "within the first mode.",
+        "nats: log density at the true pose relative to the uniform distribution over all touching poses.",
+        "HPD: the most probable poses that together hold the stated probability.",
+    ):
+        typer.echo(line)
     typer.echo("Empirical coverage of HPD credible levels, with 95 % intervals; and true poses without probability")
     headings = ["sensors", *(f"{100 * level:.0f} %" for level in LEVELS), "excluded"]
     print_table(headings, regions, headings)

@@ -38,7 +38,8 @@ MaxPoses = Annotated[
     typer.Option(
         "--max-poses",
         min=1000,
-        help="Number of poses in the contact index, 1.2 million by default. Objects with plane faces get up to 75 % more.",
+        help="Number of poses in the contact index, 1.2 million by default. Fewer is faster but coarser. "
+        "Flat faces raise the count by up to 75 %.",
         show_default=False,
     ),
 ]

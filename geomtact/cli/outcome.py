@@ -62,7 +62,8 @@ def give(
         return
     if candidates:
         _print_candidates(found)
-    _print(posterior, modes, out, reports)
+    if posterior.contact or out is not None:
+        _print(posterior, modes, out, reports)
 
 
 def without_contact(request: Request, images: int, kind: str) -> str:
@@ -73,7 +74,10 @@ def without_contact(request: Request, images: int, kind: str) -> str:
     if kind == "mask":
         advice = "contact is where a mask is not 0; check the file, or touch more firmly"
     elif request.values["background"] is not None:
-        advice = "it equals the --background; check that this shows the untouched sensor, or touch more firmly"
+        advice = (
+            "nothing stands out enough from the --background; check that it shows the untouched sensor, touch more firmly, "
+            "or give a contact mask"
+        )
     return f"no contact found in {where}; {advice}"
 
 

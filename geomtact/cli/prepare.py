@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -53,6 +54,8 @@ def prepare(
         for warning in localizer.mesh.warnings:
             tell(f"warning: {warning}")
         typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
+        grid = localizer.index.resolution
+        typer.echo(f"grid: {math.degrees(grid.turn_step):.1f} degrees, {1e3 * grid.step:.2f} mm apart")
 
 
 def _prepare_all(objects: list[str] | None, request: Request, jobs: int | None, ray: str | None) -> None:

@@ -47,8 +47,10 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
         raise InputError(
             f'--sensor-poses {path}: no such file; write {{"T_world_sensor": [4x4 for each image]}}'
         ) from None
+    except IsADirectoryError:
+        raise InputError(f"--sensor-poses {path}: is a folder; give a JSON file") from None
     except (OSError, ValueError) as error:
-        raise InputError(f"--sensor-poses {path}: cannot be read as JSON ({error}); expected UTF-8 text") from None
+        raise InputError(f"--sensor-poses {path}: cannot be read as JSON ({error}); correct the file") from None
     if not isinstance(content, dict) or "T_world_sensor" not in content:
         got = f"the keys {', '.join(content) or 'none'}" if isinstance(content, dict) else f"a {type(content).__name__}"
         raise InputError(f'--sensor-poses {path}: expected {{"T_world_sensor": [4x4 for each image]}}, got {got}')

@@ -7,17 +7,26 @@ import functools
 import io
 import logging
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import typer
 
-from geomtact.errors import GeomtactError, InputError, UsageError
+from geomtact.errors import GeomtactError, InputError, UsageError, did_you_mean
 
-USAGE_ERROR, BAD_INPUT, NO_CONTACT = 2, 3, 4
+USAGE_ERROR, BAD_INPUT, NO_CONTACT, INTERRUPTED = 2, 3, 4, 130
+# of the library that parses the command line, as patterns, and what is said instead
+_PLAIN_WORDS = {
+    "Input should be greater than or equal to": "expected at least",
+    "Input should be less than or equal to": "expected at most",
+    "Input should be a valid integer.*": "expected a whole number",
+    "Input should be a valid number.*": "expected a number",
+}
 
 
 def claim_output() -> None:
@@ -57,6 +66,10 @@ def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
         except GeomtactError as error:
             _tell_error(str(error))
             raise typer.Exit(USAGE_ERROR if isinstance(error, UsageError) else BAD_INPUT) from None
+        except KeyboardInterrupt:
+            continues = command.__name__ == "evaluate" and kwargs.get("out") is not None
+            tell("interrupted" + "; the same command continues" * continues)
+            raise typer.Exit(INTERRUPTED) from None
         except BrokenPipeError:
             # whoever read the output has gone; Python would complain once more when it flushes at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -84,12 +97,24 @@ def one_line_usage_errors() -> Iterator[None]:
         # typer's own errors, whose classes differ from version to version
         if not hasattr(error, "format_message"):
             raise
-        message = error.format_message().rstrip(".")
+        message = _plain(error, error.format_message().rstrip("."))
         if message:  # it is empty where the help was printed
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "geomtact"
             _tell_error(f"{message[0].lower()}{message[1:]}; run '{command} --help'")
         sys.exit(USAGE_ERROR)
+
+
+def _plain(error: Any, message: str) -> str:
+    """The ``message`` of an ``error`` of typer's, with near names only and in plain words."""
+    option = getattr(error, "option_name", None)
+    if option is not None and "such option" in message.lower():
+        known = [each.lstrip("-") for each in getattr(error, "possibilities", None) or ()]
+        near = did_you_mean(option.lstrip("-"), known).replace("'", "'--", 1)
+        return f"no such option: {option}{near}"
+    for words, plain in _PLAIN_WORDS.items():
+        message = re.sub(words, plain, message)
+    return message
 
 
 def check_words(words: Sequence[str]) -> None:

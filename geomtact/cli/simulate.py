@@ -62,6 +62,7 @@ def simulate(
     """Simulate touches at known poses: write OBJECT_1.png (contact mask or tactile image), OBJECT_1.json (true pose), ...
 
     The images carry object and sensor in their metadata, so 'geomtact localize OBJECT_1.png' needs no options.
+    Files of these names are overwritten.
     """
     from geomtact.cli.project import required, resolve
     from geomtact.contact_space.space import ContactSpace
@@ -121,7 +122,18 @@ def simulate(
         if not 0 < touch.penetration <= pressed.max_penetration:
             what = "is too deep" if touch.penetration > 0 else "does not touch"
             tell(
-                f"warning: the object {what} at this pose; check that T_sensor_object is in metres, the membrane at z = 0"
+                f"warning: the object {what} at this pose, so no localization can return it; check that T_sensor_object is in "
+                "metres, the membrane at z = 0"
+            )
+        elif not space.admits(touch.T_sensor_object)[0]:
+            tell(
+                "warning: the object enters the sensor's housing outside the window at this pose, deeper than its "
+                f"housing_depth of {1e3 * (pressed.housing_depth or 0):g} mm, so no localization can return it; give another pose"
+            )
+        if tactile_image and touch.mask.all():
+            tell(
+                "warning: the contact fills the window, so the image shows no change from its background; touch an edge, or "
+                "leave --tactile-image out"
             )
     if tactile_image:
         typer.echo(f"{out / 'background.png'}: the untouched sensor, for --background")

@@ -98,7 +98,7 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
     if unit is not None:
         given, unit = unit, str(unit).lower()
         if unit not in UNITS:
-            raise MeshError(f"{text}: unknown unit {given!r}; give unit= (--unit) one of {', '.join(UNITS)}")
+            raise MeshError(f"{text}: unknown unit {given!r}; give --unit (unit=) mm, cm, m or inch")
     if name is not None:
         entry = objects[name]
         if unit is not None and unit != entry.unit:
@@ -134,7 +134,7 @@ def _resolve(source: str | Path, unit: str | None) -> tuple[str, Path, str, Symm
         )
     unit = unit or stated
     if unit is None:
-        raise MeshError(f"{text}: the file does not state its unit; give unit= (--unit) one of {', '.join(UNITS)}")
+        raise MeshError(f"{text}: the file does not state its unit; give --unit (unit=) mm, cm, m or inch")
     return printable(path.stem), path, unit, None
 
 

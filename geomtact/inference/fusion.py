@@ -208,9 +208,10 @@ def poor_agreement(unexplained_nats: float | None, with_prior: bool = False) -> 
     if not np.isfinite(unexplained_nats):
         left = "does not suit all of them"
     return [
-        f"the sensors agree badly: the likeliest pose {left}, rarely more than {_UNEXPLAINED_NATS} where the sensor poses "
-        f"are right; check {'the prior, ' * with_prior}T_world_sensor, or whether one of them touches something else, or "
-        "give the uncertainty of the sensor poses (std_mm, std_deg)"
+        f"the sensors agree badly: the likeliest pose {left}, rarely more than {_UNEXPLAINED_NATS} nats where the sensor "
+        f"poses are right; check {'the prior, ' * with_prior}T_world_sensor, whether one of them touches something else, or "
+        "whether the object reaches deeper than the sensor's housing_depth outside its window; or give the uncertainty of "
+        "the sensor poses (std_mm, std_deg)"
     ]
 
 
@@ -320,7 +321,8 @@ def _excluded(name: str, order: Sequence[int], rest: Sequence[float]) -> str:
             f"T_world_sensor: no pose of {name} agrees with sensor {possible[0] + 1} and with all others, which agree with "
             "each other; check that sensor's pose (metres) and image"
         )
+    which = "both" if len(order) == 2 else f"all {len(order)}"
     return (
-        f"T_world_sensor: no pose of {name} agrees with all {len(order)} sensors; check their poses (metres, sensor to world) "
-        "and that they touch the same object"
+        f"T_world_sensor: no pose of {name} agrees with {which} sensors; check their poses (metres, sensor to world; "
+        "perhaps the matrices are inverted) and that they touch the same object"
     )

@@ -165,7 +165,9 @@ def caution(modes: Sequence[ModeSummary]) -> list[str]:
     """A caution about the first mode; nothing if it holds half of the probability."""
     if not modes or modes[0].probability >= 0.5:
         return []
-    return [f"The object is probably not at mode 1, which holds {percent(modes[0].probability)}."]
+    return [
+        f"The object is probably not at mode 1, which holds {percent(modes[0].probability)}; touch again, or give a prior."
+    ]
 
 
 def percent(share: float) -> str:

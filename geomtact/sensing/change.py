@@ -158,17 +158,13 @@ def check_size(array: NDArray[Any], sensor: Sensor, name: str, do: str | None = 
     ):
         rows, columns = sensor.cut(array.shape)
         hint = (
-            f"of the camera's whole frame give image[{rows.start}:{rows.stop}, {columns.start}:{columns.stop}] scaled to "
-            f"{expected}, for the sensor's images are without {100 * sensor.border_fraction:.0f} % of it at each side; if it "
-            f"is cut already, scale it to {expected}"
+            f"cut the camera's whole frame to rows {rows.start} to {rows.stop - 1} and columns {columns.start} to "
+            f"{columns.stop - 1}, counted from 0, and scale it to {expected}; if it is cut already, only scale it"
         )
     elif width * sensor.image_size_px[1] == height * sensor.image_size_px[0]:
         hint = "the shape agrees: scale a mask to that, or describe this resolution in a sensor file of its own"
     else:
-        hint = (
-            "name the sensor that took it; crop or scale nothing: give the image as the camera made it, "
-            "or a sensor file of its resolution"
-        )
+        hint = "name the sensor that took it, or give a sensor file of the image's resolution"
     raise ImageError(f"{name}: expected {expected} for sensor {sensor.name} (width x height), got {given}; {hint}")
 
 

@@ -90,7 +90,7 @@ def read_observation(
     if kind != "reading":
         array = _grey(array)
     if background is not None and kind != "reading":
-        warnings.append(f"the background is not used: a {kind} needs none")
+        warnings.append(f"{name}: the background is not used: a {'depth map' if kind == 'height' else kind} needs none")
     if kind == "mask":
         contact = Contact(_mask(array, name, warnings))
     elif kind == "height":
