@@ -413,10 +413,10 @@ def test_the_file_holds_the_promised_arrays_and_no_pickles(plug, posteriors, tmp
         ("T_frame_sensor", lambda T: 2 * T, "no rotation"),
         ("T_frame_sensor", lambda T: T * np.nan, "finite"),
         ("row_log_prob", lambda p: p + 5, "probabilities that add up to 148"),
-        ("row_log_prob", lambda p: p[:-1], "rows of unlike length"),
+        ("row_log_prob", lambda p: p[:-1], "rows of different length"),
         ("row_cell", lambda cells: cells + 10**9, "cells that are not of its grid"),
         ("row_cell", lambda cells: cells[::-1], "cells that are not of its grid"),
-        ("vertices", lambda vertices: 1.5 * vertices, "not the one that it says it is of"),
+        ("vertices", lambda vertices: 1.5 * vertices, "not the one that its checksum names"),
         ("frame", lambda frame: np.array("camera"), "frame 'camera'"),
     ],
 )
