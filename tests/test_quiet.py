@@ -19,7 +19,7 @@ from geomtact.sensing.image_file import read_image, read_metadata, write_image
 ROOT = Path(__file__).resolve().parents[1]
 STRANGE = os.fsdecode(b"p\xfcr")  # Latin-1, which is no UTF-8
 BOX = trimesh.creation.box((10.0, 8.0, 6.0))
-CLAIMED = "from geomtact.cli.shell import claim_output, tell; claim_output()\n"
+CLAIMED = "from geomtact.cli.shell import claim_output, to_stderr; claim_output()\n"
 
 
 def python(code, *options, **variables):
@@ -51,7 +51,7 @@ logging.error("as well")
 warnings.warn("and this")
 os.write(2, b"corrupt data\\n")
 os.system("echo a child of it >&2")
-tell("a line of geomtact")
+to_stderr("a line of geomtact")
 """
     assert python(CLAIMED + code) == ("", "a line of geomtact\n", 0)
 
@@ -68,7 +68,7 @@ def test_errors_and_crashes_still_show():
 
 
 def test_a_closed_standard_error_is_no_error():
-    code = CLAIMED + "tell('lost'); print('done')"
+    code = CLAIMED + "to_stderr('lost'); print('done')"
     done = subprocess.run(["sh", "-c", '"$0" -c "$1" 2>&-', sys.executable, code], capture_output=True, cwd=ROOT)
     assert (done.stdout, done.returncode) == (b"done\n", 0)
 

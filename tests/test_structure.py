@@ -156,7 +156,7 @@ def test_files_are_written_whole_or_not_at_all():
 
 
 def test_committed_results_are_of_studies_as_they_are_now():
-    """By their schema: what is written today would be resumed, and its fields are those that the pages tell of."""
+    """By their schema: what is written today would be resumed, and its fields are those that the pages describe."""
     sources = [*MODULES, *(ROOT / "tools").rglob("*.py")]
     known = {name for path in sources for name in re.findall(r'"(geomtact/[a-z-]+/\d+)"', path.read_text("utf-8"))}
     files = sorted((ROOT / "docs" / "results").glob("*.json"))

@@ -1,4 +1,4 @@
-"""The thesis's pencil (figures 16 and 17): grasped by its middle it may lie either way round; where would one touch tell?
+"""The thesis's pencil (figures 16 and 17): grasped by its middle it may lie either way round; which touch decides?
 
 A parallel jaw with a sensor in each finger holds a pencil on two of its flats. Both contacts are featureless, so the pose stays
 unknown along the pencil, and the pencil may be turned round. The planner is asked to choose between touches along the pencil and

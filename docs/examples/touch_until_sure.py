@@ -1,4 +1,4 @@
-"""Touch until sure: localize, ask for the touch that would tell most, make it, and so on, until one mode holds 90 %.
+"""Touch until sure: localize, ask for the touch with the largest expected gain, make it, and so on, until one mode holds 90 %.
 
 A plug lies on a table; where, and how it is turned, is unknown. A sensor comes down on it. The robot is simulated: `make`
 is what it feels, and nothing else looks at the truth. About half a minute on two cores, most of it to simulate the grid.

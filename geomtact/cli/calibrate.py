@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from geomtact.cli.options import Mirror, Mounting, Rotate, SensorName
-from geomtact.cli.shell import tell
+from geomtact.cli.shell import to_stderr
 from geomtact.errors import UsageError
 from geomtact.files import write_bytes, write_text
 
@@ -96,10 +96,10 @@ def calibrate(
     found = calibrate_sensor(presses, 1e-3 * ball_mm, background, pitch, mounted, name or out.stem)
     for why in dict.fromkeys(found.left_out.values()):
         names = [name for name, reason in found.left_out.items() if reason == why]
-        tell(f"warning: left out ({why}): {', '.join(names)}")
+        to_stderr(f"warning: left out ({why}): {', '.join(names)}")
     _print(found, ball_mm)
     for warning in found.warnings:
-        tell(f"warning: {warning}")
+        to_stderr(f"warning: {warning}")
     if other_presses is not None and other_ball_mm is not None:
         _print_membrane(found, ball_mm, other_presses, other_ball_mm, background)
     _write(found.sensor, sensor, out)

@@ -13,7 +13,7 @@ from geomtact.cli.options import CacheDir, Effort, EffortName, MaxPoses, Seed, S
 from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
 from geomtact.cli.project import required, resolve
 from geomtact.cli.request import Request
-from geomtact.cli.shell import check_folder, print_table, progress_bar, tell
+from geomtact.cli.shell import check_folder, print_table, progress_bar, to_stderr
 from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -73,8 +73,7 @@ def evaluate(
         "cache_dir": (cache_dir or default_cache_dir()).absolute(),
         "out": out and out.absolute(),
     }
-    for key, source in sources.items():
-        tell(f"{key}: {values[key]} (from {source})")
+    Request(values, sources).announce()
     named: list[dict[str, Any]] = [{"name": name, "unit": own} for name, own in parts_of_tasks(objects, values["unit"])]
     if len(named) == 1 and jobs is None and ray is None:
         contents = [evaluate_object(**named[0], **options)]
@@ -149,7 +148,7 @@ def evaluate_object(
     localizer = Request(values, {}, max_poses=max_poses, cache_dir=cache_dir).open()
     mesh = localizer.mesh
     for warning in mesh.warnings:
-        tell(f"warning: {warning}")
+        to_stderr(f"warning: {warning}")
     settings = evaluation.describe(localizer) | {
         "touches": touches,
         "sensors": sensors,

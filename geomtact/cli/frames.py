@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from geomtact.cli.frame_order import doubt, in_order
-from geomtact.cli.shell import tell
+from geomtact.cli.shell import to_stderr
 from geomtact.errors import InputError, UsageError
 from geomtact.files import printable
 
@@ -76,7 +76,7 @@ def all_frames(
         if not images and not follow:
             raise InputError(f"{path}: no image in this folder; expected {', '.join(_IMAGES)}")
         if (open_question := doubt(images)) is not None:
-            tell(f"warning: {path}: {open_question}")
+            to_stderr(f"warning: {path}: {open_question}")
         frames = _followed(path) if follow else (Frame(str(image)) for image in images)
         if not images:
             return frames
@@ -167,7 +167,7 @@ def _check_camera(image: Pixels, sensor: Sensor, source: str) -> None:
 
     check_size(sensor.upright(sensor.driven(image)), sensor, f"camera {source}")
     if sensor.straight_from_camera(image):
-        tell(
+        to_stderr(
             f"camera {source}: turning {image.shape[1]} x {image.shape[0]} px by {sensor.driver_rotation_deg} degrees "
             f"counter-clockwise, as the driver of {sensor.name} does"
         )

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from geomtact.cli.options import CacheDir
-from geomtact.cli.shell import print_table, tell
+from geomtact.cli.shell import print_table, to_stderr
 from geomtact.errors import UsageError
 
 
@@ -75,7 +75,7 @@ def cache(
     elif remove:
         removed = store.remove_from_cache(remove, folder)
     if removed is not None:
-        tell(f"removed {_count(len(removed))}, {sum(e.size_bytes for e in removed) / 1e6:.0f} MB")
+        to_stderr(f"removed {_count(len(removed))}, {sum(e.size_bytes for e in removed) / 1e6:.0f} MB")
     entries = store.cache_entries(folder)
     rows = []
     for e in entries:

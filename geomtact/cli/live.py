@@ -11,7 +11,7 @@ import typer
 
 from geomtact.cli.frames import Frame, camera_frames, newest_in
 from geomtact.cli.request import Request
-from geomtact.cli.shell import tell
+from geomtact.cli.shell import to_stderr
 from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def localize_live(
             except InputError as error:
                 if n == 1:
                     raise
-                tell(f"warning: image {n} skipped: {error}")
+                to_stderr(f"warning: image {n} skipped: {error}")
                 continue
             touched |= posterior.contact
             if background is None and not posterior.contact and posterior.provenance.views[0].kind == "reading":
@@ -77,7 +77,7 @@ def localize_live(
             }
             typer.echo(to_line(line | own | {"ms": 1e3 * (time.perf_counter() - began)}))
     except KeyboardInterrupt:
-        tell("stopped")
+        to_stderr("stopped")
     finally:
         frames.close()
     return touched

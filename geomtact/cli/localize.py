@@ -13,7 +13,7 @@ import typer
 
 from geomtact.cli import options
 from geomtact.cli.request import Request
-from geomtact.cli.shell import NO_CONTACT, check_folder, tell
+from geomtact.cli.shell import NO_CONTACT, check_folder, to_stderr
 from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -147,12 +147,12 @@ def localize(
     for image, made, used in zip(images, metadata, sensors, strict=True):
         _warn_of_metadata(image, made, objects[0] if len(objects) == 1 else None, used)
     if len(objects) > 1 and found.is_unknown:
-        tell("warning: the contact is out-of-distribution for every candidate: it may be of another object")
+        to_stderr("warning: the contact is out-of-distribution for every candidate: it may be of another object")
     for warning in found.posterior.warnings:
-        tell(f"warning: {warning}")
+        to_stderr(f"warning: {warning}")
     give(request, images, found, timing_ms, out, reports, as_json)
     if not found.posterior.contact:
-        tell(without_contact(request, len(images), found.posterior.provenance.views[0].kind))
+        to_stderr(without_contact(request, len(images), found.posterior.provenance.views[0].kind))
         raise typer.Exit(NO_CONTACT)
 
 
@@ -223,7 +223,7 @@ def _warn_of_metadata(image: Path, metadata: Mapping[str, Any], name: str | None
     for word, key, used in (("of", "object", name), ("with", "sensor", sensor)):
         made = metadata.get(f"geomtact:{key}")
         if made and used and Path(made).stem != printable(Path(used).stem):
-            tell(f"warning: {image} was made {word} {made} by its metadata, but is localized with {used}")
+            to_stderr(f"warning: {image} was made {word} {made} by its metadata, but is localized with {used}")
 
 
 def _check_images(images: list[Path], sensor_poses: Path | None) -> None:

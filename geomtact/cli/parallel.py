@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli.parts import units_of
-from geomtact.cli.shell import tell
+from geomtact.cli.shell import to_stderr
 
 Jobs = Annotated[
     int | None,
@@ -46,7 +46,7 @@ def do_all(
     together = run_all(work, tasks, min(jobs or os.cpu_count() or 1, len(tasks)), ray)
     for count, (number, error) in enumerate(together, 1):
         outcome = done if error is None else f"not {done}: {' '.join(str(error).split())}"
-        tell(f"[{count} of {len(tasks)}] {names[number]}: {outcome}")
+        to_stderr(f"[{count} of {len(tasks)}] {names[number]}: {outcome}")
         if error is not None:
             wrong.append(names[number])
     if wrong:

@@ -12,7 +12,7 @@ from geomtact.cli import options
 from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks
 from geomtact.cli.project import required, resolve
 from geomtact.cli.request import Request, warn_of_size
-from geomtact.cli.shell import tell
+from geomtact.cli.shell import to_stderr
 from geomtact.errors import UsageError
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def prepare(
     else:
         localizer = request.open(argument="OBJECT")
         for warning in localizer.mesh.warnings:
-            tell(f"warning: {warning}")
+            to_stderr(f"warning: {warning}")
         typer.echo(f"{localizer.mesh.name} on {localizer.sensor.name}: ready after {time.perf_counter() - began:.1f} s")
         grid = localizer.index.resolution
         typer.echo(f"grid: {math.degrees(grid.turn_step):.1f} degrees, {1e3 * grid.step:.2f} mm apart")
@@ -87,7 +87,7 @@ def _prepare_all(objects: list[str] | None, request: Request, jobs: int | None, 
     finally:
         size = sum(entry.size_bytes for entry in cache_entries(folder))
         if request.cache_dir is None and size > DEFAULT_LIMIT:
-            tell(
+            to_stderr(
                 f"warning: the cache holds {size / 1e9:.0f} GB; the next single object prepared reduces it to "
                 f"{DEFAULT_LIMIT / 1e9:.0f} GB. To keep all, give a folder by --cache-dir"
             )

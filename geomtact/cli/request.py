@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from geomtact.cli.options import Effort, Kind, Mounting, check_name
 from geomtact.cli.project import required, resolve
-from geomtact.cli.shell import posterior_file, progress_bar, tell
+from geomtact.cli.shell import posterior_file, progress_bar, to_stderr
 
 if TYPE_CHECKING:
     from geomtact.geometry.approach import Approach
@@ -76,7 +76,7 @@ class Request:
     def announce(self) -> None:
         """Print where values come from that the command line did not give."""
         for key, source in self.sources.items():
-            tell(f"{key}: {self.values[key]} (from {source})")
+            to_stderr(f"{key}: {self.values[key]} (from {source})")
 
     def mounted(self, sensor: str | None = None) -> Sensor | None:
         """``sensor``, else the one asked for, mounted as the command line says; None where none is given."""
@@ -136,7 +136,7 @@ def warn_of_size(mesh: Mesh, sensor: Sensor) -> None:
     """Warn of an object so large that its unit may be wrong."""
     windows = mesh.diameter / (2 * sensor.half_window.max())
     if windows > _MANY_WINDOWS:
-        tell(
+        to_stderr(
             f"warning: read in {mesh.unit}, {mesh.name} is {1e3 * mesh.diameter:.0f} mm across, {windows:.0f} windows of "
             f"sensor {sensor.name!r}; if its size is another, give its --unit; so large an object takes long to prepare"
         )

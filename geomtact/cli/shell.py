@@ -64,11 +64,11 @@ def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
         try:
             command(*args, **kwargs)
         except GeomtactError as error:
-            _tell_error(str(error))
+            _report_error(str(error))
             raise typer.Exit(USAGE_ERROR if isinstance(error, UsageError) else BAD_INPUT) from None
         except KeyboardInterrupt:
             continues = command.__name__ == "evaluate" and kwargs.get("out") is not None
-            tell("interrupted" + "; the same command continues" * continues)
+            to_stderr("interrupted" + "; the same command continues" * continues)
             raise typer.Exit(INTERRUPTED) from None
         except BrokenPipeError:
             # whoever read the output has gone; Python would complain once more when it flushes at exit
@@ -76,7 +76,7 @@ def one_line_errors(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(1) from None
         except OSError as error:
             where = f"{error.filename}: " if error.filename else ""
-            _tell_error(f"{where}{error.strerror or error}; check the path, its permissions and the free space")
+            _report_error(f"{where}{error.strerror or error}; check the path, its permissions and the free space")
             raise typer.Exit(BAD_INPUT) from None
 
     return run
@@ -88,10 +88,10 @@ def one_line_usage_errors() -> Iterator[None]:
     try:
         yield
     except UsageError as error:
-        _tell_error(str(error))
+        _report_error(str(error))
         sys.exit(USAGE_ERROR)
     except (typer.Abort, EOFError):
-        _tell_error("stopped before the end; nothing more is written")
+        _report_error("stopped before the end; nothing more is written")
         sys.exit(1)
     except Exception as error:
         # typer's own errors, whose classes differ from version to version
@@ -101,7 +101,7 @@ def one_line_usage_errors() -> Iterator[None]:
         if message:  # it is empty where the help was printed
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "geomtact"
-            _tell_error(f"{message[0].lower()}{message[1:]}; run '{command} --help'")
+            _report_error(f"{message[0].lower()}{message[1:]}; run '{command} --help'")
         sys.exit(USAGE_ERROR)
 
 
@@ -166,13 +166,13 @@ def posterior_file(path: Path, option: str = "") -> Path:
         raise InputError(f"{option} {error}".strip()) from None
 
 
-def tell(text: str) -> None:
+def to_stderr(text: str) -> None:
     """One line to standard error."""
     typer.echo(text, err=True)
 
 
-def _tell_error(text: str) -> None:
-    tell("error: " + " ".join(text.split()))
+def _report_error(text: str) -> None:
+    to_stderr("error: " + " ".join(text.split()))
 
 
 @contextmanager
@@ -201,7 +201,7 @@ def progress_bar(title: str) -> Iterator[Callable[[float, str], None]]:
         reached = step, int(10 * done + 1e-9)
         if not console.is_terminal and reached != printed:
             printed = reached
-            tell(f"{description}, {10 * reached[1]} %")
+            to_stderr(f"{description}, {10 * reached[1]} %")
 
     try:
         yield report

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from geomtact.cli.options import Seed, SensorName, Unit
-from geomtact.cli.shell import check_folder, tell
+from geomtact.cli.shell import check_folder, to_stderr
 from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def simulate(
     pressed = Sensor.load(sensor_named)
     mesh = load_mesh(named, values["unit"], sensor=pressed)
     for warning in mesh.warnings:
-        tell(f"warning: {warning}")
+        to_stderr(f"warning: {warning}")
     space = ContactSpace(mesh, pressed)
     elastic = elastic or tactile_image
     strength = {NoiseName.none: noises.CLEAN, NoiseName.moderate: noises.MODERATE, NoiseName.heavy: noises.HEAVY}[noise]
@@ -121,17 +121,17 @@ def simulate(
         typer.echo(f"{out / stem}.png: {100 * touch.mask.mean():.1f} % of the window in contact")
         if not 0 < touch.penetration <= pressed.max_penetration:
             what = "is too deep" if touch.penetration > 0 else "does not touch"
-            tell(
+            to_stderr(
                 f"warning: the object {what} at this pose, so no localization can return it; check that T_sensor_object is in "
                 "metres, the membrane at z = 0"
             )
         elif not space.admits(touch.T_sensor_object)[0]:
-            tell(
+            to_stderr(
                 "warning: the object enters the sensor's housing outside the window at this pose, deeper than its "
                 f"housing_depth of {1e3 * (pressed.housing_depth or 0):g} mm, so no localization can return it; give another pose"
             )
         if tactile_image and touch.mask.all():
-            tell(
+            to_stderr(
                 "warning: the contact fills the window, so the image shows no change from its background; touch an edge, or "
                 "leave --tactile-image out"
             )

@@ -12,7 +12,7 @@ import typer
 from geomtact.cli import options
 from geomtact.cli.frames import Frame, all_frames, listed
 from geomtact.cli.request import Request
-from geomtact.cli.shell import NO_CONTACT, check_file, tell
+from geomtact.cli.shell import NO_CONTACT, check_file, to_stderr
 from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text
 
@@ -95,7 +95,7 @@ def track(
                 shown.append(sequence_frame(posterior, line, localizer.simulate))
         whole = True
     except KeyboardInterrupt:
-        tell("stopped")
+        to_stderr("stopped")
     finally:  # the results before a frame that cannot be read are kept
         if tum is not None and (lines or whole):
             write_text(tum, "".join(lines))
@@ -109,7 +109,7 @@ def track(
 def exit_untouched(touched: bool) -> None:
     """Exit with the status of no contact, unless any image was ``touched``."""
     if not touched:
-        tell("no contact found in any image; give --background, or the kind of the images by --kind")
+        to_stderr("no contact found in any image; give --background, or the kind of the images by --kind")
         raise typer.Exit(NO_CONTACT)
 
 

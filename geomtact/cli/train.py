@@ -11,7 +11,7 @@ import typer
 from geomtact.cli.options import Seed, Unit
 from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
 from geomtact.cli.parts import parts_of
-from geomtact.cli.shell import progress_bar, tell
+from geomtact.cli.shell import progress_bar, to_stderr
 from geomtact.errors import UsageError
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def _fine_tune(
         made = object_scenes(work / "scenes", mesh, sensor, MAX_POSES, n, seed, progress)
         network, curve = run(made, settings, work, progress, start=weights)
     write_encoder(out, network, curve, settings, made, whose(mesh, sensor) | {"start": start.name})
-    tell(f"{curve.validation[-1]:.2f} nats on scenes that it never saw")
+    to_stderr(f"{curve.validation[-1]:.2f} nats on scenes that it never saw")
 
 
 def _train_thesis(

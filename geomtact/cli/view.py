@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from geomtact.cli import options
-from geomtact.cli.shell import tell
+from geomtact.cli.shell import to_stderr
 from geomtact.cli.track import exit_untouched, open_track
 
 
@@ -62,11 +62,11 @@ def view(
             viewer.show(n, posterior)
             touched |= posterior.contact
         if stay:
-            tell("all images shown; press Ctrl-C to stop serving the page")
+            to_stderr("all images shown; press Ctrl-C to stop serving the page")
         while stay:
             time.sleep(1)
     except KeyboardInterrupt:
-        tell("stopped")
+        to_stderr("stopped")
     finally:
         viewer.stop()
     exit_untouched(touched)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from geomtact.cli.shell import progress_bar, tell
+from geomtact.cli.shell import progress_bar, to_stderr
 
 Start = Annotated[Path | None, typer.Option(help="Weights to start from, instead of random ones.")]
 Rate = Annotated[float | None, typer.Option(min=1e-9, help="Learning rate, where the usual one diverges.")]
@@ -35,7 +35,7 @@ def encoder(
     settings = with_rate(Settings(steps=steps, width=width, dimension=dimension, seed=seed), rate)
     with progress_bar("training") as progress:
         gain = train_encoder(out, folder_of(work, out), scenes, settings, start, progress)
-    tell(f"{gain:.2f} nats on scenes that it never saw")
+    to_stderr(f"{gain:.2f} nats on scenes that it never saw")
 
 
 @app.command()
@@ -54,7 +54,7 @@ def contact(
     settings = with_rate(Settings(steps=steps, seed=seed), rate)
     with progress_bar("training") as progress:
         overlap = train_contact_network(out, folder_of(work, out), scenes, settings, start, progress)
-    tell(f"overlaps the contact by {overlap:.2f} on objects that it never saw")
+    to_stderr(f"overlaps the contact by {overlap:.2f} on objects that it never saw")
 
 
 def with_rate(settings: Any, rate: float | None) -> Any:

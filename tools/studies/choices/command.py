@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.options import Seed, Unit
-from geomtact.cli.shell import print_table, progress_bar, tell
+from geomtact.cli.shell import print_table, progress_bar, to_stderr
 from tools.studies.common import study_file, study_options
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def judge_choices(
         _summarise(part)
         _keep(out, content, part)
         _print(mesh.name, part)
-        tell(f"{mesh.name}: done")
+        to_stderr(f"{mesh.name}: done")
     study_file.plot(content, plot)
     study_file.plot(content, plot_modelled, "modelled")
 

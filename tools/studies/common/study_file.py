@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from geomtact.cli.shell import progress_bar, tell
+from geomtact.cli.shell import progress_bar, to_stderr
 
 _SAVE_EVERY = 10  # touches
 _LOGS = ("gain", "gains", "log_probability")  # fields of outcomes that are logs of probabilities
@@ -121,7 +121,7 @@ def judged(
     if len(done) < total:
         collect(done, map(_flat, more(len(done))), total, f"{doing} {name}", put)
     put(done)
-    tell(f"{name}: done")
+    to_stderr(f"{name}: done")
 
 
 def _flat(outcome: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from geomtact.cli.options import CacheDir, Effort, MaxPoses, Seed, Unit
-from geomtact.cli.shell import print_table, tell
+from geomtact.cli.shell import print_table, to_stderr
 from geomtact.cli.simulate import NoiseName
 from tools.studies.common import study_file, study_options
 
@@ -88,7 +88,7 @@ def judge(
         figures = proper.summarise(outcomes, random_mm)
         keep(outcomes, random_add_mm=random_mm, figures=figures)
         all_figures |= {(name, group): values for group, values in figures.items()}
-        tell(f"{name}: done")
+        to_stderr(f"{name}: done")
     _print(all_figures)
     return content
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli.options import CacheDir
-from geomtact.cli.shell import print_table, progress_bar, tell
+from geomtact.cli.shell import print_table, progress_bar, to_stderr
 from tools.studies.common import study_file, study_options
 
 SCHEMA = "geomtact/readings/1"
@@ -159,7 +159,7 @@ def _draw(path: Path, sets: Any, method: Any, figures: dict[str, dict[str, Any]]
     picture = draw_sheet(shown, factor)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, picture)
-    tell(f"sheet: {path}")
+    to_stderr(f"sheet: {path}")
 
 
 def _mode(m: Any) -> list[str]:

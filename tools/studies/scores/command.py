@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.options import CacheDir, Effort, MaxPoses, Seed, Unit
-from geomtact.cli.shell import print_table, progress_bar, tell
+from geomtact.cli.shell import print_table, progress_bar, to_stderr
 from geomtact.cli.simulate import NoiseName
 from tools.studies.common import study_file, study_options
 
@@ -208,7 +208,7 @@ def _judge(
         )
     todo = scores.judged(localizer, touches[len(outcomes) :], effort, options.seed)
     keep(study_file.collect(outcomes, todo, options.touches, f"judging {mesh.name}, {name}", keep))
-    tell(f"{mesh.name}, {name}: done")
+    to_stderr(f"{mesh.name}, {name}: done")
 
 
 def _compare(part: dict[str, Any], n: int) -> None:

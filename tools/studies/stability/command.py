@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli.options import CacheDir, Effort, MaxPoses, Seed, Unit
-from geomtact.cli.shell import print_table, tell
+from geomtact.cli.shell import print_table, to_stderr
 from tools.studies.common import study_file, study_options
 
 SCHEMA = "geomtact/stability/2"
@@ -136,4 +136,4 @@ def _print(part: str, sweeps: Mapping[str, Any]) -> None:
         "wrong, holding half or more, without a warning; * no longer promised to hold"
     )
     print_table(["condition", *numbers, *shares], rows, [*numbers, *shares])
-    tell(f"{part}: done")
+    to_stderr(f"{part}: done")

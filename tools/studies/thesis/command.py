@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.options import CacheDir, Effort, Seed, Unit
-from geomtact.cli.shell import print_table, progress_bar, tell
+from geomtact.cli.shell import print_table, progress_bar, to_stderr
 from geomtact.cli.simulate import NoiseName
 from tools.studies.common import study_file, study_options
 
@@ -65,7 +65,7 @@ def judge_thesis_table(
             "seed": seed,
         }
         _judge_part(mesh, gel, strength, settings, ambiguity, content, out, cache_dir)
-        tell(f"{mesh.name}: done")
+        to_stderr(f"{mesh.name}: done")
     _print(content["parts"])
     study_file.plot(content, plot)
 

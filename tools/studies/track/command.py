@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli.options import CacheDir, Effort, Seed, Unit
-from geomtact.cli.shell import print_table, tell
+from geomtact.cli.shell import print_table, to_stderr
 from geomtact.cli.simulate import NoiseName
 from tools.studies.common import study_file, study_options
 
@@ -59,7 +59,7 @@ def judge_track(
             more = track_study.follow(localizer, trajectories, seed, track_study.FRAMES, strength, effort, len(done))
             study_file.collect(done, more, trajectories, f"following {name}", keep)
         keep(done, timing=timing or track_study.time_steps(localizer, seed, track_study.FRAMES, strength, effort))
-        tell(f"{name}: done")
+        to_stderr(f"{name}: done")
     everything = [o for part in content["parts"].values() for o in study_file.outcomes(part, track_study.Followed)]
     content["figures"] = plain(track_study.summarise(everything))
     study_file.save(out, content)

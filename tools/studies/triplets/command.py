@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from geomtact.cli.options import CacheDir, Effort, MaxPoses, Seed
-from geomtact.cli.shell import print_table, progress_bar, tell
+from geomtact.cli.shell import print_table, progress_bar, to_stderr
 from tools.studies.common import study_file, study_options
 
 SCHEMA = "geomtact/triplets/1"
@@ -44,7 +44,7 @@ def judge_triplets(
                 done += more
                 progress(len(done) / (each * len(some)), "")
                 study_file.keep(out, content, mesh.stem, settings=settings, outcomes=[asdict(o) for o in done])
-        tell(f"{mesh.stem}: done")
+        to_stderr(f"{mesh.stem}: done")
     judged = [o for part in content["parts"].values() for o in study_file.outcomes(part, triplets.Outcome)]
     content["figures"] = plain(triplets.summarise(judged))
     study_file.save(out, content)
