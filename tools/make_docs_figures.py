@@ -2,9 +2,8 @@
 
     python tools/make_docs_figures.py [NAME ...]
 
-Without names all are drawn into docs/images: frames, approach, one_map, first_result, augmentations. ``first_result``
-localizes the bundled sample touch of the pin, so it shows what ``sh tools/quickstart.sh`` finds; ``augmentations`` needs the
-extra ``train``.
+Without names all are drawn into docs/images: frames, approach, one_map, augmentations. ``augmentations`` needs the extra
+``train``.
 """
 
 from __future__ import annotations
@@ -19,20 +18,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, Polygon, Rectangle
 
-from geomtact import Localizer, Sensor, load_mesh
+from geomtact import Sensor, load_mesh
 from geomtact.contact_space.heightmap import NOTHING, HeightMap, Window
 from geomtact.contact_space.index import unpack
-from geomtact.report.marginals import marginals
-from geomtact.report.view import Painter
-from geomtact.se3 import Array, inverse
 from geomtact.sensing.cast import Caster
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
-SAMPLE = ROOT / "meshes" / "samples" / "pin_1.png"
 
 # Okabe and Ito's colours, as in the report.
-ORANGE, SKY, BLUE, GREEN, GREY, INK = "#D55E00", "#56B4E9", "#0072B2", "#009E73", "#8A8F98", "#1B1F24"
+ORANGE, BLUE, GREEN, GREY, INK = "#D55E00", "#0072B2", "#009E73", "#8A8F98", "#1B1F24"
 STYLE = {"font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
@@ -182,53 +177,6 @@ def one_map() -> Figure:
     return figure
 
 
-def first_result() -> Figure:
-    """What the quick start finds: the touch, three of the modes, and how broad the posterior is."""
-    localizer = Localizer.prepare("pin", sensor="gelslim")
-    posterior = localizer.localize(str(SAMPLE))
-    modes = posterior.modes(5)
-    chosen = [0, 2, 4]
-    figure = Figure(figsize=(11, 5.4), layout="constrained")
-    grid = figure.subplots(2, 4, height_ratios=[1, 1.1])
-    sensor, painter = posterior.sensor, Painter(posterior.mesh, posterior.sensor)
-    mask = posterior.observation.contact.mask
-    _in_window(grid[0, 0], sensor, np.repeat(mask[..., None], 3, 2).astype(float), "The touch: a contact mask")
-    grid[0, 0].set_ylabel("y [mm], downwards")
-    for column, k in enumerate(chosen, 1):
-        T = inverse(posterior.T_frame_sensor) @ modes[k].T
-        contact = localizer.simulate(T)
-        picture = np.where(contact.mask[..., None], mpl.colors.to_rgb(SKY), 1.0)
-        axes = grid[0, column]
-        _in_window(axes, sensor, picture, f"mode {k + 1}: {100 * modes[k].probability:.1f} %")
-        x, y = (1e3 * c for c in sensor.pixel_centres())
-        axes.contour(x, y, mask.astype(float), [0.5], colors=ORANGE, linewidths=1.3)
-        view = painter.paint(T)
-        below = grid[1, column]
-        below.imshow(view.image, extent=view.extent)
-        seen = np.argwhere((view.image < 0.995).any(-1))
-        left, right, bottom, top = view.extent
-        rows = np.array([seen[:, 0].min() - 8, seen[:, 0].max() + 8]) / len(view.image)
-        below.set_ylim(top + (bottom - top) * rows[1], top + (bottom - top) * rows[0])
-        below.axis("off")
-    figure.legend(
-        handles=[
-            mpl.lines.Line2D([], [], color=ORANGE, label="outline of the touch"),
-            mpl.patches.Patch(color=SKY, label="contact simulated at the mode"),
-        ],
-        loc="outside lower right",
-        ncols=2,
-        frameon=False,
-    )
-    samples = marginals(posterior, modes[0].T)[1]
-    mass, edges = samples.histogram()
-    axes = grid[1, 0]
-    axes.stairs(100 * mass, edges, fill=True, color=BLUE)
-    axes.axvline(samples.mark, color=INK, lw=1.2, ls="--", label="mode 1")
-    axes.set(title="All poses together: broad", xlabel=samples.label, ylabel="probability [%]")
-    axes.legend(frameon=False, fontsize=8)
-    return figure
-
-
 def augmentations() -> Figure:
     """Five touches of a procedural part: stored, rigid, elastic, and each noise that training adds to them."""
     import torch
@@ -264,14 +212,6 @@ def augmentations() -> Figure:
     return figure
 
 
-def _in_window(axes: Axes, sensor: Sensor, picture: Array, title: str) -> None:
-    x, y = 1e3 * sensor.half_window
-    axes.imshow(picture, extent=(-x, x, y, -y), vmin=0, vmax=1, interpolation="nearest")
-    axes.set(title=title, xlabel="x [mm]")
-    for spine in axes.spines.values():
-        spine.set_visible(True)
-
-
 def _arrow(axes: Axes, start: tuple, end: tuple, colour: str, text: str, at: tuple, align: str) -> None:
     axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.4}, zorder=5)
     axes.text(*at, text, color=colour, ha=align, va="center", fontsize=8)
@@ -286,7 +226,6 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "frames": frames,
     "approach": approach,
     "one_map": one_map,
-    "first_result": first_result,
     "augmentations": augmentations,
 }
 

@@ -30,15 +30,20 @@ class Caster:
     vertices : (V, 3) object frame [m]
     faces : (F, 3) indices into vertices
     threads : how many batches of poses are cast at once (the GIL is released)
+
+    Attributes
+    ----------
+    centre : (3,) of the object's bounding box, object frame [m]: the origin of what is in ``scene``
+    scene : the object's triangles
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, threads: int = 2):
         self.vertices, self.faces = np.asarray(vertices, float), np.asarray(faces)
         self.threads = threads
         # Embree works in float32: rays start near the object's centre to keep 1e-8 m
-        self._centre = 0.5 * (self.vertices.min(0) + self.vertices.max(0))
-        self._radius = float(np.linalg.norm(self.vertices - self._centre, axis=1).max())
-        self._scene = scene_of((self.vertices - self._centre).astype(np.float32)[self.faces])
+        self.centre = 0.5 * (self.vertices.min(0) + self.vertices.max(0))
+        self._radius = float(np.linalg.norm(self.vertices - self.centre, axis=1).max())
+        self.scene = scene_of((self.vertices - self.centre).astype(np.float32)[self.faces])
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Caster, (self.vertices, self.faces, self.threads)  # no scene can be pickled: it is made again
@@ -84,8 +89,8 @@ class Caster:
         """Which face the camera ray through each pixel (h, w) meets first at pose ``T`` (4, 4); -1 for none."""
         x, y = sensor.pixel_centres(shape)
         rays = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-        origin, direction, _ = self._rays(sensor, np.asarray(T, float)[None], rays)
-        return self._scene.faces(origin, direction).reshape(len(y), len(x))
+        origin, direction, _ = self.rays(sensor, np.asarray(T, float)[None], rays)
+        return self.scene.faces(origin, direction).reshape(len(y), len(x))
 
     def penetration(self, sensor: Sensor, T: ArrayLike) -> Array:
         """Depth of the object's deepest point inside the window (n,) [m]: > 0 below the membrane.
@@ -111,8 +116,8 @@ class Caster:
     def gaps(self, points: Array, directions: Array) -> Array:
         """How far (n,) [m] it is from ``points`` (n, 3) of the surface along unit ``directions`` (n, 3) to the surface again;
         +inf where it is not met."""
-        rows = (points - self._centre + _OFF * directions, directions)
-        far = self._scene.distances(*(np.ascontiguousarray(each, np.float32) for each in rows))
+        rows = (points - self.centre + _OFF * directions, directions)
+        far = self.scene.distances(*(np.ascontiguousarray(each, np.float32) for each in rows))
         return np.where(far > MISSED, np.inf, far.astype(float))
 
     def lowest_outside(self, sensor: Sensor, T: ArrayLike) -> Array:
@@ -134,8 +139,8 @@ class Caster:
         return pose, np.column_stack([xy, heights[pose, vertex]])
 
     def _cast(self, sensor: Sensor, T: Array, rays: Array) -> NDArray[np.float32]:
-        origin, direction, below = self._rays(sensor, T, rays)
-        t = self._scene.distances(origin, direction).reshape(len(T), len(rays))
+        origin, direction, below = self.rays(sensor, T, rays)
+        t = self.scene.distances(origin, direction).reshape(len(T), len(rays))
         depth = t.astype(float)
         depth *= -(sensor.camera_distance or 1.0)
         depth += below[:, None]
@@ -147,7 +152,7 @@ class Caster:
         depth[t > MISSED] = -np.inf
         return depth.astype(np.float32)
 
-    def _rays(self, sensor: Sensor, T: Array, rays: Array) -> tuple[NDArray[np.float32], NDArray[np.float32], Array]:
+    def rays(self, sensor: Sensor, T: Array, rays: Array) -> tuple[NDArray[np.float32], NDArray[np.float32], Array]:
         """Origins and directions (n m, 3) of rays in Embree's frame, and how far below the membrane's plane they start (n,) [m].
 
         A direction is so long that it nears that plane by the camera's distance, or by 1 m where there is no camera.
@@ -159,19 +164,19 @@ class Caster:
             direction = _combined(R, rays, sensor.camera_distance)
         else:
             # far enough below for every pose that reaches the membrane at all
-            below = np.linalg.norm(apply(T, self._centre[None])[:, 0], axis=-1) + 2 * self._radius
+            below = np.linalg.norm(apply(T, self.centre[None])[:, 0], axis=-1) + 2 * self._radius
             direction = R[:, 2, None]
-        middle = np.einsum("ni,nij->nj", below[:, None] * [0.0, 0.0, -1.0] - T[:, :3, 3], R) - self._centre
+        middle = np.einsum("ni,nij->nj", below[:, None] * [0.0, 0.0, -1.0] - T[:, :3, 3], R) - self.centre
         origin = middle[:, None] if sensor.camera_distance else middle[:, None] + _combined(R, rays, 0.0)
         return _of_every_ray(origin, len(rays)), _of_every_ray(direction, len(rays)), below
 
     def _camera_inside(self, sensor: Sensor, T: Array) -> NDArray[np.bool_]:
         if not sensor.camera_distance:
             return np.zeros(len(T), bool)
-        camera = apply(inverse(T), np.array([[0.0, 0.0, -sensor.camera_distance]]))[:, 0] - self._centre
+        camera = apply(inverse(T), np.array([[0.0, 0.0, -sensor.camera_distance]]))[:, 0] - self.centre
         # an odd direction, so that no ray runs along a face of a machined object
         direction = np.broadcast_to(np.array([0.41, 0.33, 0.85], np.float32), camera.shape)
-        hit = self._scene.hits(camera.astype(np.float32), np.ascontiguousarray(direction))
+        hit = self.scene.hits(camera.astype(np.float32), np.ascontiguousarray(direction))
         return np.asarray(((hit.normal * direction).sum(1) > 0) & (hit.face >= 0))
 
 

@@ -39,7 +39,7 @@ def simulation(given: argparse.Namespace) -> list[dict[str, Any]]:
         rays = np.stack(np.meshgrid(*sensor.pixel_centres(shape)), -1).reshape(-1, 2)
         blocks = [T[i : i + BLOCK] for i in range(0, len(T), BLOCK)]
         ways = depth_ways(mesh, sensor, shape, caster, draw)
-        take_turns(ways, ((block, *ready(*caster._rays(sensor, block, rays)[:2])) for block in blocks), compare)
+        take_turns(ways, ((block, *ready(*caster.rays(sensor, block, rays)[:2])) for block in blocks), compare)
         for way in ways:
             ms = spread([ms / BLOCK for ms in way.ms])
             row = {"threads": given.threads, "pixels": list(shape[::-1]), "faces": len(mesh.faces)}
@@ -73,7 +73,7 @@ def depth_ways(mesh: Any, sensor: Any, shape: tuple[int, int], caster: Any, draw
     """Variants from poses (n, 4, 4) to depths (n, h, w) [m], and the casts alone of rays that are there."""
     import open3d as o3d
 
-    pool, distance, middle = ThreadPoolExecutor(caster.threads), sensor.camera_distance, caster._centre
+    pool, distance, middle = ThreadPoolExecutor(caster.threads), sensor.camera_distance, caster.centre
     scene = o3d.t.geometry.RaycastingScene(nthreads=caster.threads)
     scene.add_triangles((mesh.vertices - middle).astype(np.float32), mesh.faces.astype(np.uint32))
     focal = distance * np.array(shape[::-1]) / (2 * sensor.half_window)
@@ -98,7 +98,7 @@ def depth_ways(mesh: Any, sensor: Any, shape: tuple[int, int], caster: Any, draw
     def embree(item: Any) -> None:
         origin, direction = (np.array_split(each, caster.threads) for each in item[1])
         each = map if caster.threads == 1 else pool.map
-        list(each(lambda o, d: caster._scene.distances(o, d), origin, direction))
+        list(each(lambda o, d: caster.scene.distances(o, d), origin, direction))
 
     def open3d(item: Any) -> None:
         scene.cast_rays(item[2], nthreads=caster.threads)
