@@ -23,9 +23,8 @@ from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.distribution import cell_log_density
 from geomtact.inference.motion import GaussianTwist, UniformBall
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
-from geomtact.sensing import reading
+from geomtact.sensing.image_file import ImageFile, write_image
 from geomtact.sensing.noise import MODERATE
-from geomtact.sensing.reading import write_image
 from tools.studies.track import study as track_study
 from tools.studies.track.trajectories import random_trajectory
 
@@ -429,9 +428,8 @@ def test_track_prints_a_line_a_frame(command, folder, flat_nut, creeping):
 
 def test_track_reads_each_image_once(command, folder, monkeypatch):
     """The first one too, which is checked before the index is prepared."""
-    opened = []
-    read_image = reading.read_image
-    monkeypatch.setattr(reading, "read_image", lambda path: opened.append(Path(path).stem) or read_image(path))
+    opened, read = [], ImageFile.read
+    monkeypatch.setattr(ImageFile, "read", lambda path: opened.append(Path(path).stem) or read(path))
     for options in ((), ("--sensor", "gelsight-mini"), ("--sensor", "gelsight-mini", "--skip-broken")):
         opened.clear()
         command(folder, *options)

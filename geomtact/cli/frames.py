@@ -21,11 +21,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from geomtact.sensing.image_file import ImageFile
     from geomtact.sensing.reading import Observation
     from geomtact.sensing.sensor import Sensor
 
     Pixels = NDArray[np.generic]  # (H, W, 3) RGB, or a mask (H, W)
-    Unread = str | Pixels  # a path, or pixels
+    Unread = str | ImageFile | Pixels
     Image = Unread | Observation
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy")

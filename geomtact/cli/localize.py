@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from geomtact.cli.sensor_poses import SensorPoses
     from geomtact.identification import Identification
     from geomtact.localizer import Localizer
+    from geomtact.sensing.image_file import ImageFile
 
 
 class Report(StrEnum):
@@ -99,7 +100,7 @@ def localize(
     from geomtact.cli.outcome import give, without_contact
     from geomtact.cli.parts import parts_of
     from geomtact.cli.sensor_poses import read_sensor_poses
-    from geomtact.sensing.reading import read_metadata
+    from geomtact.sensing.image_file import ImageFile
 
     check_folder(out)
     reports = _reports(report, out)
@@ -111,7 +112,8 @@ def localize(
     else:
         _check_images(images, sensor_poses)
     placed = read_sensor_poses(sensor_poses, len(images)) if sensor_poses is not None else None
-    metadata = [] if live else [read_metadata(image) for image in images]
+    files = [] if live else [ImageFile.read(image) for image in images]
+    metadata = [file.metadata for file in files]
     if background and len(background) not in (1, len(images)):
         raise UsageError(f"--background: expected one, or one for each of {len(images)} images, got {len(background)}")
     first = background[0] if background else None
@@ -143,7 +145,7 @@ def localize(
     sensors = placed.sensor if placed is not None and placed.sensor else [request.values["sensor"]] * len(images)
     several = background if background and len(background) > 1 else None
     backgrounds = [str(each) for each in several] if several else request.values["background"]
-    found, timing_ms = _identified(request, images, sensors, backgrounds, objects, placed)
+    found, timing_ms = _identified(request, files, sensors, backgrounds, objects, placed)
     for image, made, used in zip(images, metadata, sensors, strict=True):
         _warn_of_metadata(image, made, objects[0] if len(objects) == 1 else None, used)
     if len(objects) > 1 and found.is_unknown:
@@ -170,7 +172,7 @@ def _reports(report: str | None, out: Path | None) -> list[str]:
 
 def _identified(
     request: Request,
-    images: Sequence[Path],
+    images: Sequence[ImageFile],
     sensors: Sequence[str | None],
     backgrounds: list[str] | str | None,
     objects: Sequence[str | None],
@@ -178,7 +180,7 @@ def _identified(
 ) -> tuple[Identification, dict[str, float]]:
     """The object, of ``objects``, and its posterior; and the time to read the images and to prepare the indexes [ms].
 
-    ``sensors`` has one for each image; ``backgrounds`` too, or one for all. Each image is read once.
+    ``sensors`` has one for each image; ``backgrounds`` too, or one for all.
     """
     from geomtact.cli.parts import units_of
     from geomtact.identification import identify

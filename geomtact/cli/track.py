@@ -12,7 +12,7 @@ import typer
 from geomtact.cli import options
 from geomtact.cli.frames import Frame, all_frames, listed
 from geomtact.cli.request import Request
-from geomtact.cli.shell import NO_CONTACT, check_file, to_stderr
+from geomtact.cli.shell import NO_CONTACT, check_file, note_overwritten, to_stderr
 from geomtact.errors import InputError, UsageError
 from geomtact.files import write_text
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from geomtact.cli.frames import Image, Unread
     from geomtact.inference.posterior import Posterior
     from geomtact.localizer import Localizer
+    from geomtact.sensing.image_file import ImageFile
 
 
 def track(
@@ -79,6 +80,7 @@ def track(
     from geomtact.report.exchange import tum_line
     from geomtact.report.result import frame_line, to_line
 
+    note_overwritten([tum, report])
     lines: list[str] = []
     shown: list[dict[str, Any]] = []
     touched = whole = False
@@ -130,10 +132,13 @@ def open_track(
 
     if follow and not Path(source).is_dir():
         raise UsageError(f"--follow: expected a folder to watch, got {source}")
-    request = Request.of(given, _metadata(source), **asked)
+    first, metadata = _first_image(source)
+    request = Request.of(given, metadata, **asked)
     sensor, background = request.mounted(), request.values["background"]
 
     def read(image: Unread) -> Image:
+        if first is not None and not follow:  # an image that is still being written is read in its turn
+            image = first
         if sensor is None or skip_broken:
             return image  # opening the index reports a missing sensor; broken images are skipped in their turn
         return read_observation(image, sensor, request.kind, background)
@@ -158,15 +163,18 @@ def open_track(
     return localizer, ((times.popleft(), posterior) for posterior in posteriors)
 
 
-def _metadata(source: str) -> dict[str, Any]:
-    """The metadata of the first image of a folder."""
-    from geomtact.sensing.reading import read_metadata
+def _first_image(source: str) -> tuple[ImageFile | None, dict[str, Any]]:
+    """The first image of a folder, if it can be read, and its metadata."""
+    from geomtact.sensing.image_file import ImageFile
 
     images = listed(Path(source)) if Path(source).is_dir() else []
+    if not images:
+        return None, {}
     try:
-        return read_metadata(images[0]) if images else {}
+        first = ImageFile.read(images[0])
+        return first, first.metadata
     except InputError:
-        return {}  # reported with its number when its turn comes
+        return None, {}  # reported with its number when its turn comes
 
 
 def _images(frames: Iterator[Frame], times: deque[float | None]) -> Iterator[Image]:

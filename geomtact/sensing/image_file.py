@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,56 @@ MAX_BYTES = 256 * 2**20
 _PREFIX = "geomtact:"
 
 
+@dataclass(frozen=True, eq=False)
+class ImageFile:
+    """The bytes of an image file, read once: its pixels, and what geomtact wrote beside them."""
+
+    path: Path
+    data: bytes
+
+    @classmethod
+    def read(cls, path: str | Path) -> ImageFile:
+        """The file ``path``.
+
+        Raises
+        ------
+        ImageError
+            No such file, empty or too large.
+        """
+        return cls(Path(path), _read_bytes(Path(path)))
+
+    @cached_property
+    def pixels(self) -> NDArray[Any]:
+        """As :func:`read_image`."""
+        return decoded(self.data, self.path)
+
+    @cached_property
+    def metadata(self) -> dict[str, Any]:
+        """As :func:`read_metadata`."""
+        from PIL import Image, UnidentifiedImageError
+
+        if self.data[:8] != b"\x89PNG\r\n\x1a\n":
+            return {}
+        try:
+            with Image.open(io.BytesIO(self.data)) as image:
+                image.load()
+                text = dict(getattr(image, "text", {}))
+        except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+            raise ImageError(
+                f"{self.path}: the image is truncated or damaged ({error}); save or copy it again"
+            ) from None
+        found: dict[str, Any] = {key: value for key, value in text.items() if key.startswith(_PREFIX)}
+        pose = f"{_PREFIX}T_sensor_object"
+        if pose in found:
+            try:
+                found[pose] = check_transforms(json.loads(found[pose]), pose)
+            except (ValueError, TypeError, PoseError) as error:
+                raise ImageError(
+                    f"{self.path}: its entry {pose} is no rigid transform ({error}); write it again"
+                ) from None
+        return found
+
+
 def read_image(path: str | Path) -> NDArray[Any]:
     """The pixels of an image file: (H, W) or (H, W, C), colours in the order R, G, B(, A).
 
@@ -30,9 +82,7 @@ def read_image(path: str | Path) -> NDArray[Any]:
     ImageError
         No such file, empty, too large, no image, or damaged.
     """
-    path = Path(path)
-    data = _read_bytes(path)
-    return decoded(data, path)
+    return ImageFile.read(path).pixels
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
@@ -40,25 +90,7 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
 
     ``geomtact:object``, ``geomtact:unit`` and ``geomtact:sensor`` are strings, ``geomtact:T_sensor_object`` an array (4, 4) [m].
     """
-    from PIL import Image, UnidentifiedImageError
-
-    data = _read_bytes(Path(path))
-    if data[:8] != b"\x89PNG\r\n\x1a\n":
-        return {}
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            image.load()
-            text = dict(getattr(image, "text", {}))
-    except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise ImageError(f"{path}: the image is truncated or damaged ({error}); save or copy it again") from None
-    found: dict[str, Any] = {key: value for key, value in text.items() if key.startswith(_PREFIX)}
-    pose = f"{_PREFIX}T_sensor_object"
-    if pose in found:
-        try:
-            found[pose] = check_transforms(json.loads(found[pose]), pose)
-        except (ValueError, TypeError, PoseError) as error:
-            raise ImageError(f"{path}: its entry {pose} is no rigid transform ({error}); write it again") from None
-    return found
+    return ImageFile.read(path).metadata
 
 
 def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] | None = None) -> None:

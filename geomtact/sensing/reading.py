@@ -18,7 +18,7 @@ from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
 from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.height import height_of
 from geomtact.sensing.image_faults import calibration_mismatches, faults
-from geomtact.sensing.image_file import read_image, read_metadata, write_image
+from geomtact.sensing.image_file import ImageFile, read_metadata, write_image
 from geomtact.sensing.local_shape import contact_mask, find_contact, on_grid
 from geomtact.sensing.sensor import Sensor
 
@@ -53,7 +53,7 @@ class Observation:
 
 
 def read_observation(
-    image: str | Path | ArrayLike,
+    image: str | Path | ImageFile | ArrayLike,
     sensor: Sensor | str | Path,
     kind: str = "auto",
     background: str | Path | ArrayLike | None = None,
@@ -62,7 +62,7 @@ def read_observation(
 
     Parameters
     ----------
-    image : path or array. ``auto`` takes bool or two-valued as a mask; float (H, W) as a height [m]; 16-bit grey as a
+    image : path, file or array. ``auto`` takes bool or two-valued as a mask; float (H, W) as a height [m]; 16-bit grey as a
         height in micrometres; three channels, RGB, uint8 or float 0..1, as a tactile image; other grey as a tactile image
     sensor : whose image it is; another size is an error
     kind : "auto", "mask", "height" or "reading"
@@ -80,6 +80,7 @@ def read_observation(
         raise UsageError(f"unknown kind {kind!r}{nearest_name(str(kind), KINDS)}")
     warnings: list[str] = []
     method = None
+    image = _opened(image)
     name, array = _load(image, "image", warnings)
     if kind in ("auto", "mask"):
         array = without_two_colours(array, name)
@@ -118,10 +119,15 @@ def read_observation(
     return Observation(contact, kind, warnings, array, method)
 
 
+def _opened(source: Any) -> Any:
+    """An array or an image file, of a path, too, whose file is read here and nowhere else."""
+    return ImageFile.read(source) if isinstance(source, str | Path) else source
+
+
 def _load(source: Any, role: str, warnings: list[str]) -> tuple[str, NDArray[Any]]:
-    """The name and the array (H, W) or (H, W, 3) behind a path or an array; opaque alpha is dropped."""
-    if isinstance(source, str | Path):
-        name, array = f"{role} {source}" if role == "background" else str(source), read_image(source)
+    """The name and the array (H, W) or (H, W, 3) of an image file or an array; opaque alpha is dropped."""
+    if isinstance(source, ImageFile):
+        name, array = f"{role} {source.path}" if role == "background" else str(source.path), source.pixels
     else:
         name, array = role, np.asarray(source)
     if array.dtype.kind not in "buif":
@@ -157,8 +163,8 @@ def _in_sensor_frame(
     straight = sensor.straight_from_camera(array)
     if not (sensor.turned or straight):
         return array
-    from_file = isinstance(source, str | Path)
-    if from_file and "geomtact:sensor" in read_metadata(source):
+    from_file = isinstance(source, ImageFile)
+    if from_file and "geomtact:sensor" in source.metadata:
         if sensor.turned:
             warnings.append(
                 f"{name}: is not turned or mirrored as the camera is mounted, for its metadata say that geomtact made it in the "
@@ -264,6 +270,7 @@ def _reading(
         no_depths = "" if sensor.colour is None else ", and there is no depth map without one"
         warnings.append(f"{name}: no background was given; a smooth one was estimated from the image itself{no_depths}")
     else:
+        background = _opened(background)
         label, reference = _load(background, "background", warnings)
         reference = _in_sensor_frame(reference, background, label, "reading", sensor, warnings)
         check_size(reference, sensor, label, "take it with the camera settings of the image")
