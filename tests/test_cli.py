@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+import trimesh
 import typer
 from PIL import Image
 from typer.testing import CliRunner
@@ -18,6 +19,7 @@ from geomtact.cli.options import approach_from
 from geomtact.cli.shell import one_line_errors, one_line_usage_errors
 from geomtact.errors import CacheError, InputError, UsageError
 from geomtact.sensing import reading
+from geomtact.sensing.image_file import ImageFile
 from tools.studies.__main__ import COMMANDS
 from tools.studies.__main__ import app as studies
 from tools.studies.__main__ import main as run_study
@@ -248,6 +250,29 @@ def test_simulate_is_repeatable_and_replays_a_pose(geomtact, touched, tmp_path):
     geomtact("simulate", "ball", "--sensor", "gelslim", "--pose", tmp_path / "pose.json", status=3)
 
 
+@pytest.mark.parametrize(
+    ("size_mm", "share", "why"),
+    [
+        (40, "100.0 %", "the contact fills the window, so no slope changes the colours; touch an edge"),
+        (11, "41.3 %", "the gel sinks in nearly all of the window, so colours do not show which side is pressed in"),
+        (5, "8.4 %", None),
+    ],
+)
+def test_a_tactile_image_that_does_not_show_its_contact_brings_a_warning(geomtact, tmp_path, size_mm, share, why):
+    """A flat face moves the gel around it alone; localize reads such an image inverted, or as empty."""
+    trimesh.creation.box((size_mm, size_mm, 10)).export(tmp_path / "block.stl")
+    (tmp_path / "pose.json").write_text(json.dumps(se3.transform(np.eye(3), [1e-3, 0, 4.5e-3]).tolist()))
+    block = ("block.stl", "--unit", "mm", "--sensor", "gelsight-mini", "--pose", "pose.json", "--out", "out")
+    done = geomtact("simulate", *block, "--tactile-image")
+    assert f"block_1.png: {share} of the window in contact" in done.stdout
+    if why is None:
+        assert done.stderr == ""
+    else:
+        (warning,) = done.stderr.splitlines()
+        assert warning.startswith(f"warning: out/block_1.png: localize would not find this contact: {why}")
+    assert geomtact("simulate", *block).stderr == "overwritten: out/block_1.png, out/block_1.json\n"
+
+
 def test_the_contact_face_may_be_given(geomtact, flat_nut, a_touch, tmp_path):
     Image.fromarray(255 * a_touch(flat_nut)[1].astype(np.uint8)).save(tmp_path / "nut.png")
     own = ("--cache-dir", tmp_path / "own")  # others count what the shared one holds
@@ -304,8 +329,8 @@ def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touch
 
 def test_localize_reads_each_image_once(geomtact, touched, tmp_path, monkeypatch):
     """For one sensor and for two, though a bad image is reported before an index is prepared."""
-    opened, read_image = [], reading.read_image
-    monkeypatch.setattr(reading, "read_image", lambda path: opened.append(path.name) or read_image(path))
+    opened, read = [], ImageFile.read
+    monkeypatch.setattr(ImageFile, "read", lambda path: opened.append(path.name) or read(path))
     geomtact("localize", touched / "ball_1.png", "--effort", "fast")
     assert opened == ["ball_1.png"]
     opened.clear()
@@ -443,7 +468,7 @@ def test_each_image_may_have_its_own_background(tmp_path, monkeypatch, rng):
     read_observation, given = reading.read_observation, []
 
     def noted(image, sensor, kind, background):
-        given.append((image.name, background))
+        given.append((image.path.name, background))
         return read_observation(image, sensor, kind, background)
 
     def refused(*_, **__):

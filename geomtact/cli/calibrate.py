@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from geomtact.cli.options import Mirror, Mounting, Rotate, SensorName
-from geomtact.cli.shell import to_stderr
+from geomtact.cli.shell import note_overwritten, to_stderr
 from geomtact.errors import UsageError
 from geomtact.files import write_bytes, write_text
 
@@ -104,12 +104,14 @@ def calibrate(
         _print_membrane(found, ball_mm, other_presses, other_ball_mm, background)
     _write(found.sensor, sensor, out)
     if plot is not None:
+        note_overwritten([plot])
         write_bytes(plot, draw_calibration(found, 1e-3 * ball_mm))
         typer.echo(f"wrote {plot}")
 
 
 def _write(calibrated: Sensor, geometry: str | None, out: Path) -> None:
     """Write a sensor's file; ``geometry`` is whose it has."""
+    note_overwritten([out])
     write_text(out, calibrated.to_toml())
     typer.echo(f"wrote {out}; geomtact.contact_height(image, background, {str(out)!r}) returns depth maps")
     if geometry is None:

@@ -75,8 +75,8 @@ def without_contact(request: Request, images: int, kind: str) -> str:
         advice = "contact is where a mask is not 0; check the file, or touch more firmly"
     elif request.values["background"] is not None:
         advice = (
-            "nothing stands out enough from the --background; check that it shows the untouched sensor, touch more firmly, "
-            "or give a contact mask"
+            "nothing stands out enough from the --background; check that it shows the untouched sensor, and touch more firmly; "
+            "if the contact fills the window, touch an edge instead, since a flat face changes no colours inside its rim"
         )
     return f"no contact found in {where}; {advice}"
 

@@ -20,6 +20,7 @@ import typer
 from geomtact.errors import GeomtactError, InputError, UsageError, did_you_mean
 
 USAGE_ERROR, BAD_INPUT, NO_CONTACT, INTERRUPTED = 2, 3, 4, 130
+_NAMED = 4  # files that a note names
 # of the library that parses the command line, as patterns, and what is said instead
 _PLAIN_WORDS = {
     "Input should be greater than or equal to": "expected at least",
@@ -149,6 +150,14 @@ def check_file(path: Path | None, option: str) -> None:
     """
     if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
         raise UsageError(f"{option} {path}: expected a file in an existing folder; create the folder, or give another")
+
+
+def note_overwritten(paths: Iterable[Path | None]) -> None:
+    """Name the files among ``paths`` that are there, because they are about to be overwritten."""
+    there = [str(path) for path in paths if path is not None and path.exists()]
+    if there:
+        more = f" and {len(there) - _NAMED} more" if len(there) > _NAMED else ""
+        to_stderr(f"overwritten: {', '.join(there[:_NAMED])}{more}")
 
 
 def posterior_file(path: Path, option: str = "") -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from geomtact.cli.options import Seed, SensorName, Unit
-from geomtact.cli.shell import check_folder, to_stderr
+from geomtact.cli.shell import check_folder, note_overwritten, to_stderr
 from geomtact.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from geomtact.contact_space.touches import Touch
     from geomtact.se3 import Array
     from geomtact.sensing.noise import Noise
+
+
+_FOUND = 0.25  # share of a contact that is found in its tactile image, below which the image shows something else
+_LARGE = 0.1  # share of the window in contact, from which on the gel sinks in nearly all of it
 
 
 class NoiseName(StrEnum):
@@ -62,12 +66,14 @@ def simulate(
     """Simulate touches at known poses: write OBJECT_1.png (contact mask or tactile image), OBJECT_1.json (true pose), ...
 
     The images carry object and sensor in their metadata, so 'geomtact localize OBJECT_1.png' needs no options.
-    Files of these names are overwritten.
+    Files of these names are overwritten, with a note.
     """
     from geomtact.cli.project import required, resolve
     from geomtact.contact_space.space import ContactSpace
+    from geomtact.contact_space.touches import random_touches
     from geomtact.geometry.mesh_file import load_mesh
     from geomtact.sensing import noise as noises
+    from geomtact.sensing.image_file import write_image
     from geomtact.sensing.sensor import Sensor
 
     check_folder(out)
@@ -82,32 +88,23 @@ def simulate(
     space = ContactSpace(mesh, pressed)
     elastic = elastic or tactile_image
     strength = {NoiseName.none: noises.CLEAN, NoiseName.moderate: noises.MODERATE, NoiseName.heavy: noises.HEAVY}[noise]
-
     if pose is not None:
         touches = [_touch_at(space, read_pose(pose), seed, elastic, strength)]
     else:
-        from geomtact.contact_space.touches import random_touches
-
         touches = random_touches(space, n or 1, seed, elastic=elastic, noise=strength)
+
+    stems = [out / f"{mesh.name}_{k}" for k in range(1, len(touches) + 1)]
+    background = out / "background.png" if tactile_image else None
+    files = [Path(f"{stem}{suffix}") for stem in stems for suffix in (".png", ".json")]
+    note_overwritten([*files, background])
+    out.mkdir(parents=True, exist_ok=True)
     # files are named in full, so that the image is understood from any folder
     metadata = {key: str(Path(v).resolve()) if Path(v).is_file() else v for key, v in values.items() if v is not None}
-    out.mkdir(parents=True, exist_ok=True)
-    if tactile_image:
-        import numpy as np
-
-        from geomtact.contact_space.touch import simulate_depth_map
-        from geomtact.sensing.image_file import write_image
-        from geomtact.sensing.render import SPOILT, example_reading
-
-        heights = [
-            np.zeros(pressed.image_size_px[::-1]),
-            *(simulate_depth_map(space, t.T_sensor_object) for t in touches),
-        ]
-        rng = np.random.default_rng([seed, 2])
-        background, *shown = (example_reading(h, pressed.pixel_pitch, SPOILT[noise.value], rng) for h in heights)
-        write_image(out / "background.png", background, metadata)
-    for k, touch in enumerate(touches, 1):
-        stem = f"{mesh.name}_{k}"
+    images: list[NDArray[np.generic]] = [touch.mask for touch in touches]
+    if background is not None:
+        untouched, *images = _tactile_images(space, touches, noise, seed)
+        write_image(background, untouched, metadata)
+    for stem, touch, image in zip(stems, touches, images, strict=True):
         truth = {
             "object": mesh.name,
             "sensor": pressed.name,
@@ -117,26 +114,59 @@ def simulate(
             "noise": noise.value,
             "seed": seed,
         }
-        _write(out / stem, shown[k - 1] if tactile_image else touch.mask, truth, metadata)
-        typer.echo(f"{out / stem}.png: {100 * touch.mask.mean():.1f} % of the window in contact")
-        if not 0 < touch.penetration <= pressed.max_penetration:
-            what = "is too deep" if touch.penetration > 0 else "does not touch"
-            to_stderr(
-                f"warning: the object {what} at this pose, so no localization can return it; check that T_sensor_object is in "
-                "metres, the membrane at z = 0"
-            )
-        elif not space.admits(touch.T_sensor_object)[0]:
-            to_stderr(
-                "warning: the object enters the sensor's housing outside the window at this pose, deeper than its "
-                f"housing_depth of {1e3 * (pressed.housing_depth or 0):g} mm, so no localization can return it; give another pose"
-            )
-        if tactile_image and touch.mask.all():
-            to_stderr(
-                "warning: the contact fills the window, so the image shows no change from its background; touch an edge, or "
-                "leave --tactile-image out"
-            )
-    if tactile_image:
-        typer.echo(f"{out / 'background.png'}: the untouched sensor, for --background")
+        _write(stem, image, truth, metadata)
+        typer.echo(f"{stem}.png: {100 * touch.mask.mean():.1f} % of the window in contact")
+        _warn(space, touch, Path(f"{stem}.png"), background)
+    if background is not None:
+        typer.echo(f"{background}: the untouched sensor, for --background")
+
+
+def _tactile_images(
+    space: ContactSpace, touches: Sequence[Touch], noise: NoiseName, seed: int
+) -> list[NDArray[np.generic]]:
+    """The tactile image (H, W, 3) of the untouched sensor, then one of each touch."""
+    import numpy as np
+
+    from geomtact.contact_space.touch import simulate_depth_map
+    from geomtact.sensing.render import SPOILT, example_reading
+
+    rng, sensor = np.random.default_rng([seed, 2]), space.sensor
+    heights = [np.zeros(sensor.image_size_px[::-1]), *(simulate_depth_map(space, t.T_sensor_object) for t in touches)]
+    return [example_reading(height, sensor.pixel_pitch, SPOILT[noise.value], rng) for height in heights]
+
+
+def _warn(space: ContactSpace, touch: Touch, image: Path, background: Path | None) -> None:
+    """Warn of a touch that no localization can return, or of a tactile image in which its contact is not found."""
+    from geomtact.sensing.reading import read_observation
+
+    sensor = space.sensor
+    if not 0 < touch.penetration <= sensor.max_penetration:
+        what = "is too deep" if touch.penetration > 0 else "does not touch"
+        to_stderr(
+            f"warning: the object {what} at this pose, so no localization can return it; check that T_sensor_object is in "
+            "metres, the membrane at z = 0"
+        )
+    elif not space.admits(touch.T_sensor_object)[0]:
+        to_stderr(
+            "warning: the object enters the sensor's housing outside the window at this pose, deeper than its "
+            f"housing_depth of {1e3 * (sensor.housing_depth or 0):g} mm, so no localization can return it; give another pose"
+        )
+    if background is None or not touch.mask.any():
+        return
+    found = read_observation(image, sensor, "reading", background).contact.mask
+    share = float((found & touch.mask).sum() / touch.mask.sum())
+    if touch.mask.all():
+        why = "the contact fills the window, so no slope changes the colours; touch an edge"
+    elif found.all() or (share < _FOUND and touch.mask.mean() > _LARGE):
+        why = (
+            "the gel sinks in nearly all of the window, so colours do not show which side is pressed in; touch an edge or "
+            "press less deep"
+        )
+    elif share < _FOUND:
+        why = "the contact is small or shallow; press deeper"
+    else:
+        return
+    to_stderr(f"warning: {image}: localize would not find this contact: {why}, or leave --tactile-image out")
 
 
 def read_pose(path: Path) -> Array:
@@ -177,5 +207,5 @@ def _write(stem: Path, image: NDArray[np.generic], truth: Mapping[str, object], 
     from geomtact.sensing.image_file import write_image
 
     pose = {"T_sensor_object": truth["T_sensor_object"]}
-    write_image(stem.with_name(f"{stem.name}.png"), image, {**metadata, **pose})
-    write_text(stem.with_name(f"{stem.name}.json"), to_text(plain(truth)))
+    write_image(f"{stem}.png", image, {**metadata, **pose})
+    write_text(Path(f"{stem}.json"), to_text(plain(truth)))
