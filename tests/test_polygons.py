@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geomtact.errors import MeshError
-from geomtact.geometry.folds import folded_faces
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.geometry.obj_file import read_obj
 from geomtact.geometry.off_file import read_off
 from geomtact.geometry.ply_file import read_ply
 from geomtact.geometry.polygon_file import READERS, read_triangles
 from geomtact.geometry.polygons import Polygons
+from geomtact.geometry.solid import folded_faces
 from geomtact.geometry.stl_file import read_stl
 from geomtact.se3 import random_rotations
 

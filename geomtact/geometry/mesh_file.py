@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from geomtact.errors import MeshError, did_you_mean, nearest_name
 from geomtact.files import printable
 from geomtact.geometry.catalogue import catalogue
-from geomtact.geometry.folds import folded_faces
 from geomtact.geometry.gltf_file import read_gltf
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.polygon_file import read_triangles
-from geomtact.geometry.solid import check_solid, place_mm
+from geomtact.geometry.solid import check_solid, folded_faces, place_mm
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.geometry.units import METRE_FORMATS, UNITS, stated_unit, unit_comment
 from geomtact.se3 import Array

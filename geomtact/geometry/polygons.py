@@ -149,6 +149,26 @@ def edges_of(faces: NDArray[np.integer]) -> NDArray[np.integer]:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
+def edge_table(
+    faces: NDArray[np.integer],
+) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.intp], NDArray[np.intp]]:
+    """The edges of triangles (F, 3), gathered by the two corners that they join.
+
+    Returns
+    -------
+    face : (3 F,) that has the edge
+    way : (3 F,) 1 where it goes from the lower to the higher corner, else -1
+    start : (E,) where each group of edges of the same corners begins
+    uses : (E,) how many there are in each
+    """
+    edges = edges_of(faces)
+    ends = np.sort(edges, axis=1)
+    order = np.lexsort(ends.T)
+    ends, way = ends[order], np.where(edges[:, 0] < edges[:, 1], 1, -1)[order]
+    start = np.flatnonzero(np.concatenate([[True], (ends[1:] != ends[:-1]).any(1)]))
+    return order % len(faces), way, start, np.diff(np.append(start, len(ends)))
+
+
 def _fan(rings: Indices) -> Indices:
     """Triangles (m (n - 2), 3) of faces ``rings`` (m, n), all from their first corners."""
     n = rings.shape[1]

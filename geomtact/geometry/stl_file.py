@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from geomtact.errors import MeshError
-from geomtact.geometry.polygons import Polygons, edges_of
+from geomtact.geometry.polygons import Polygons, edge_table
 from geomtact.geometry.text_numbers import number, single_bytes
 from geomtact.se3 import Array
 
@@ -97,5 +97,4 @@ def _is_closed(corners: Array) -> bool:
     if not len(corners) or not np.isfinite(corners).all():
         return False
     _, vertex = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    edges = np.sort(edges_of(vertex.reshape(-1, 3)), axis=1)
-    return bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
+    return bool((edge_table(vertex.reshape(-1, 3))[3] % 2 == 0).all())
