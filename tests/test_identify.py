@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from geomtact import InputError, Localizer, Mesh, UsageError
 from geomtact.cli import app
-from geomtact.cli.parts import parts_of
+from geomtact.cli.several import objects_of
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import simultaneous_touches
 from geomtact.identification import identify
@@ -157,20 +157,20 @@ def test_weights_that_do_not_fit_are_refused(drawer, weights):
 
 
 def test_objects_are_given_by_a_folder_or_by_names(tmp_path):
-    assert parts_of(None) == [None] and parts_of("pin") == ["pin"] and parts_of("pin, head") == ["pin", "head"]
+    assert objects_of(None) == [None] and objects_of("pin") == ["pin"] and objects_of("pin, head") == ["pin", "head"]
     meshes = Path(__file__).parents[1] / "meshes"
-    assert "pin" in parts_of(str(meshes)) and len(parts_of(str(meshes))) == 10
+    assert "pin" in objects_of(str(meshes)) and len(objects_of(str(meshes))) == 10
     with pytest.raises(InputError, match="no mesh in this folder"):
-        parts_of(str(tmp_path))
+        objects_of(str(tmp_path))
     with pytest.raises(InputError, match="each object once"):
-        parts_of("pin,pin")
+        objects_of("pin,pin")
     for name in ("b.stl", "a.ply", "note.txt"):
         (tmp_path / name).touch()
     (tmp_path / "._a.ply").write_bytes(b"\0\5\x16\7")  # beside each file on disks that macOS writes to
-    assert parts_of(str(tmp_path)) == [str(tmp_path / "a.ply"), str(tmp_path / "b.stl")]
+    assert objects_of(str(tmp_path)) == [str(tmp_path / "a.ply"), str(tmp_path / "b.stl")]
     odd = tmp_path / "a,b.stl"
     odd.touch()
-    assert parts_of(str(odd)) == [str(odd)], "a file's name may hold a comma"
+    assert objects_of(str(odd)) == [str(odd)], "a file's name may hold a comma"
 
 
 @pytest.mark.slow

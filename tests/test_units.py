@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from geomtact.cli.parts import units_of
+from geomtact.cli.several import units_of
 from geomtact.errors import MeshError
 from geomtact.geometry.catalogue import catalogue
 from geomtact.geometry.mesh_file import load_mesh

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.options import CacheDir, Effort, EffortName, MaxPoses, Seed, SensorName, Unit, check_name
-from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
 from geomtact.cli.project import required, resolve
 from geomtact.cli.request import Request
+from geomtact.cli.several import Jobs, Ray, do_all, everywhere, objects_with_units, quietly
 from geomtact.cli.shell import check_folder, print_table, progress_bar, to_stderr
 from geomtact.errors import InputError, UsageError
 
@@ -74,7 +74,9 @@ def evaluate(
         "out": out and out.absolute(),
     }
     Request(values, sources).announce()
-    named: list[dict[str, Any]] = [{"name": name, "unit": own} for name, own in parts_of_tasks(objects, values["unit"])]
+    named: list[dict[str, Any]] = [
+        {"name": name, "unit": own} for name, own in objects_with_units(objects, values["unit"])
+    ]
     if len(named) == 1 and jobs is None and ray is None:
         contents = [evaluate_object(**named[0], **options)]
     else:

@@ -98,8 +98,8 @@ def localize(
     """
     from geomtact.cli.live import check_live, follow
     from geomtact.cli.outcome import give, without_contact
-    from geomtact.cli.parts import parts_of
     from geomtact.cli.sensor_poses import read_sensor_poses
+    from geomtact.cli.several import objects_of
     from geomtact.sensing.image_file import ImageFile
 
     check_folder(out)
@@ -129,7 +129,7 @@ def localize(
         cache_dir=cache_dir,
         mounting=options.Mounting(rotate, mirror),
     )
-    objects = parts_of(request.values["object"])
+    objects = objects_of(request.values["object"])
     if len(objects) > 1 and (live or prior is not None):
         raise UsageError(
             "--object: several objects exclude --camera, --watch and --prior; give one object, or leave these out"
@@ -182,7 +182,7 @@ def _identified(
 
     ``sensors`` has one for each image; ``backgrounds`` too, or one for all.
     """
-    from geomtact.cli.parts import units_of
+    from geomtact.cli.several import units_of
     from geomtact.identification import identify
     from geomtact.sensing.reading import read_observation
 

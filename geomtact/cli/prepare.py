@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from geomtact.cli import options
-from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks
 from geomtact.cli.project import required, resolve
 from geomtact.cli.request import Request, warn_of_size
+from geomtact.cli.several import Jobs, Ray, do_all, everywhere, objects_with_units
 from geomtact.cli.shell import to_stderr
 from geomtact.errors import UsageError
 
@@ -81,7 +81,7 @@ def _prepare_all(objects: list[str] | None, request: Request, jobs: int | None, 
     # named, so that what is prepared first is not removed to make room for the last
     folder = (request.cache_dir or default_cache_dir()).absolute()
     how = (gel, everywhere(scorer), request.max_poses or MAX_POSES, folder)
-    tasks = [(*part, *how) for part in parts_of_tasks(objects, unit)]
+    tasks = [(*part, *how) for part in objects_with_units(objects, unit)]
     try:
         do_all(prepare_part, tasks, [f"{part} on {gel.name}" for part in objects], "prepared", jobs, ray)
     finally:

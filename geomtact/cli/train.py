@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from geomtact.cli.options import Seed, Unit
-from geomtact.cli.parallel import Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
-from geomtact.cli.parts import parts_of
+from geomtact.cli.several import Jobs, Ray, do_all, everywhere, objects_of, objects_with_units, quietly
 from geomtact.cli.shell import progress_bar, to_stderr
 from geomtact.errors import UsageError
 
@@ -69,7 +68,7 @@ def train(
     FILE.safetensors, or in Python by Localizer.prepare(..., scorer="FILE.safetensors").
     """
     options = dict(locals())
-    parts = parts_of(object_name)
+    parts = objects_of(object_name)
     if len(parts) > 1:
         _train_each([str(part) for part in parts], options)
         return
@@ -158,7 +157,7 @@ def _train_each(parts: list[str], options: dict[str, Any]) -> None:
     start = options["start"] and options["start"].absolute()
     same = options | {"sensor": everywhere(options["sensor"]), "start": start}
     tasks = []
-    for name, unit in parts_of_tasks(parts, options["unit"]):
+    for name, unit in objects_with_units(parts, options["unit"]):
         own = {"object_name": name, "unit": unit, "out": folder / f"{Path(name).stem}.safetensors"}
         tasks.append((train, same | own))
     do_all(quietly, tasks, parts, "trained", jobs, ray)

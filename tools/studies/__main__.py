@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from geomtact.cli.parallel import Command
+from geomtact.cli.several import Command
 from geomtact.cli.shell import check_words, claim_output, one_line_errors, one_line_usage_errors
 from tools.studies.choices import command as choices
 from tools.studies.common.by_part import by_part

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from geomtact.cli.parallel import Command, Jobs, Ray, do_all, everywhere, parts_of_tasks, quietly
+from geomtact.cli.several import Command, Jobs, Ray, do_all, everywhere, objects_with_units, quietly
 from tools.studies.common import study_file
 
 
@@ -78,7 +78,7 @@ def _judge_apart(judge: Command, schema: str, options: Mapping[str, Any], jobs: 
     if "cache_dir" in options:  # a study of what preparing costs has none
         same["cache_dir"] = (options["cache_dir"] or default_cache_dir()).absolute()
     tasks = []
-    for (name, unit), file in zip(parts_of_tasks(parts, options["unit"]), files, strict=True):
+    for (name, unit), file in zip(objects_with_units(parts, options["unit"]), files, strict=True):
         tasks.append((judge, same | {"parts": [name], "unit": unit, "out": file}))
     try:
         do_all(quietly, tasks, parts, "judged", jobs, ray)

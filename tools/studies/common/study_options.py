@@ -63,7 +63,7 @@ def noise_named(name: str) -> Noise:
 
 def meshes(parts: Sequence[str | Path] | None, unit: str | None, sensor: Sensor) -> list[Mesh]:
     """The meshes of the parts, the thesis's four by default: a wrong name is told before any work is done."""
-    from geomtact.cli.parts import units_of
+    from geomtact.cli.several import units_of
     from geomtact.geometry.mesh_file import load_mesh
     from tools.studies.common.study import THESIS_PARTS
 

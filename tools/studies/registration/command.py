@@ -44,7 +44,7 @@ def judge_registration(
 
     Prints success, errors and times of each method, and writes them and every trial to --out.
     """
-    from geomtact.cli.parts import units_of
+    from geomtact.cli.several import units_of
     from geomtact.contact_space.build import choose_resolution
     from geomtact.contact_space.resolution import MAX_POSES
     from geomtact.contact_space.space import ContactSpace
