@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from geomtact import Localizer, Mesh, Posterior, Sensor
 from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.report.result import write_all
 from geomtact.report.sensor_image import sensor_images
-from geomtact.report.write import write_all
 from geomtact.se3 import inverse, random_rotations, transform
 
 pytestmark = pytest.mark.slow  # prepares 300,000 poses of two balls

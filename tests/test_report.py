@@ -24,7 +24,7 @@ from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.facts import Diagnostics, Provenance, ViewRecord
 from geomtact.json_values import plain, to_text
 from geomtact.report.marginals import Samples, marginals, turn_and_tilt
-from geomtact.report.result import result
+from geomtact.report.result import result, write_all
 from geomtact.report.sensor_image import SensorImage, sensor_images
 from geomtact.report.summary import (
     MOTIONS,
@@ -36,7 +36,6 @@ from geomtact.report.summary import (
     summaries_of,
     summarise,
 )
-from geomtact.report.write import write_all
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
 from tools.studies.__main__ import app as studies

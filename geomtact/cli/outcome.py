@@ -32,7 +32,7 @@ def give(
 ) -> None:
     """Print what was found, after stages that took ``timing_ms``, and write it into ``out``."""
     from geomtact.json_values import to_text
-    from geomtact.report.result import result
+    from geomtact.report.result import result, write_all
 
     posterior = found.posterior
     began = time.perf_counter()
@@ -51,7 +51,6 @@ def give(
     candidates = [asdict(candidate) for candidate in found.candidates] if len(found.candidates) > 1 else None
     if out is not None:
         from geomtact.report.sensor_image import sensor_images
-        from geomtact.report.write import write_all
 
         shown = sensor_images(posterior, found.localizer)
         content = write_all(out, posterior, modes, shown, settings, timing, candidates, reports)
