@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touches import Touch, each_touch
 from geomtact.errors import NoPoseAgreesError
-from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.geometry.distance import PoseDistance, mode_radius, mssd
 from geomtact.geometry.mesh import Mesh
-from geomtact.geometry.pose_error import mssd
 from geomtact.inference.posterior import Posterior
 from geomtact.localizer import Localizer
 from geomtact.se3 import Array, inverse, random_rotations, transform

@@ -12,14 +12,14 @@ from typer.testing import CliRunner
 from geomtact import Localizer, Mesh, load_mesh
 from geomtact.errors import InputError
 from geomtact.evaluation import LEVELS, coverage
-from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.geometry.pose_error import add, add_s, mssd
+from geomtact.geometry.distance import PoseDistance, mode_radius, mssd
 from geomtact.inference.effort import EFFORTS
 from geomtact.se3 import exp, log, random_rotations, transform
 from geomtact.sensing.noise import CLEAN, MODERATE
 from tools.studies.__main__ import app as studies
 from tools.studies.common import study, study_file
 from tools.studies.common.pictures import draw
+from tools.studies.common.pose_error import add, add_s
 from tools.studies.common.study import random_add
 from tools.studies.localize import study as proper
 from tools.studies.thesis import known_approach

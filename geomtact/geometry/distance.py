@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geomtact.geometry.mesh import Mesh
+from geomtact.geometry.mesh import Mesh, outermost
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array, apply, hat, transform
 
@@ -141,6 +141,22 @@ def _about_axis(symmetry: Symmetry) -> tuple[Array, Array, Array]:
     assert symmetry.axis is not None
     along = np.outer(symmetry.axis, symmetry.axis)
     return along, np.eye(3) - along, hat(symmetry.axis)
+
+
+def mssd(T_true: ArrayLike, T: ArrayLike, mesh: Mesh) -> Array:
+    """MSSD (m,) [m]: largest distance of corresponding surface points of ``mesh`` at ``T_true`` (4, 4) and ``T`` (m, 4, 4).
+
+    Over a finite symmetry group it is the least over the group; over a continuous one it is taken at the image that is
+    nearest in mean square. A point's distance is convex in the point, so the hull's vertices hold the largest.
+    """
+    T, symmetry = np.asarray(T, float).reshape(-1, 4, 4), mesh.symmetry
+    if symmetry is not None and symmetry.kind == "discrete":
+        images = T[:, None] @ symmetry.elements
+    else:
+        images = PoseDistance(mesh).aligned(T_true, T)[:, None]
+    corners = outermost(mesh.vertices)
+    here = apply(T_true, corners)
+    return np.array([np.linalg.norm(apply(some, corners) - here, axis=-1).max(-1).min() for some in images])
 
 
 def mode_radius(mesh: Mesh) -> float:

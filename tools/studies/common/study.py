@@ -114,7 +114,7 @@ def judged(
 
 
 def summarise(outcomes: Sequence[Outcome], random_add_mm: float) -> dict[str, dict[str, Any]]:
-    """Figures over all touches, the geometric and the elastic ones; ``random_add_mm`` as of ``pose_error.random_add``."""
+    """Figures over all touches, the geometric and the elastic ones; ``random_add_mm`` as of :func:`random_add`."""
     return {name: _figures(some, random_add_mm) for name, some in groups(outcomes).items()}
 
 

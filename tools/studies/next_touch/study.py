@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.contact_space.touches import Touch, penetrations, random_touches
 from geomtact.errors import NoPoseAgreesError
-from geomtact.geometry.pose_error import mssd
+from geomtact.geometry.distance import mssd
 from geomtact.inference.posterior import Posterior
 from geomtact.localizer import Localizer
 from geomtact.planning.actions import Touch as Planned

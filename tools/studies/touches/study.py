@@ -11,9 +11,9 @@ import numpy as np
 
 from geomtact.evaluation import SimultaneousTouches, assess, localized
 from geomtact.geometry.distance import PoseDistance
-from geomtact.geometry.pose_error import add_s
 from geomtact.localizer import Localizer
 from geomtact.se3 import Array
+from tools.studies.common.pose_error import add_s
 from tools.studies.common.study import MODES, coverage_figures, mean_with_interval
 
 SENSORS = 5

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from geomtact.errors import InputError, NoPoseAgreesError
-from geomtact.geometry.pose_error import add_s
 from geomtact.localizer import Localizer
 from geomtact.se3 import Array, apply, inverse, random_rotations, transform
 from geomtact.sensing.sensor import Sensor
+from tools.studies.common.pose_error import add_s
 from tools.studies.common.study import coverage_figures
 
 SENSOR = "digit-hsp"
