@@ -99,7 +99,6 @@ def localize(
     from geomtact.cli.live import check_live, follow
     from geomtact.cli.outcome import give, without_contact
     from geomtact.cli.sensor_poses import read_sensor_poses
-    from geomtact.cli.several import objects_of
     from geomtact.sensing.image_file import ImageFile
 
     check_folder(out)
@@ -129,22 +128,15 @@ def localize(
         cache_dir=cache_dir,
         mounting=options.Mounting(rotate, mirror),
     )
-    objects = objects_of(request.values["object"])
-    if len(objects) > 1 and (live or prior is not None):
-        raise UsageError(
-            "--object: several objects exclude --camera, --watch and --prior; give one object, or leave these out"
-        )
-    if len(objects) > 1 and request.approach:
-        raise UsageError("--approach needs exactly one object; give one by --object")
-    if len(objects) == 1:
-        request.values["object"] = objects[0]
+    objects = _objects(request, live)
     if live:
         if not follow(request, images, camera):
             raise typer.Exit(NO_CONTACT)
         return
     sensors = placed.sensor if placed is not None and placed.sensor else [request.values["sensor"]] * len(images)
-    several = background if background and len(background) > 1 else None
-    backgrounds = [str(each) for each in several] if several else request.values["background"]
+    backgrounds = [request.values["background"]] * len(images)
+    if background and len(background) > 1:
+        backgrounds = [str(each) for each in background]
     found, timing_ms = _identified(request, files, sensors, backgrounds, objects, placed)
     for image, made, used in zip(images, metadata, sensors, strict=True):
         _warn_of_metadata(image, made, objects[0] if len(objects) == 1 else None, used)
@@ -156,6 +148,22 @@ def localize(
     if not found.posterior.contact:
         to_stderr(without_contact(request, len(images), found.posterior.provenance.views[0].kind))
         raise typer.Exit(NO_CONTACT)
+
+
+def _objects(request: Request, live: bool) -> list[str | None]:
+    """The objects to tell apart; a single one is put into the request."""
+    from geomtact.cli.several import objects_of
+
+    objects = objects_of(request.values["object"])
+    if len(objects) == 1:
+        request.values["object"] = objects[0]
+    elif live or request.prior is not None:
+        raise UsageError(
+            "--object: several objects exclude --camera, --watch and --prior; give one object, or leave these out"
+        )
+    elif request.approach:
+        raise UsageError("--approach needs exactly one object; give one by --object")
+    return objects
 
 
 def _reports(report: str | None, out: Path | None) -> list[str]:
@@ -174,24 +182,23 @@ def _identified(
     request: Request,
     images: Sequence[ImageFile],
     sensors: Sequence[str | None],
-    backgrounds: list[str] | str | None,
+    backgrounds: Sequence[str | None],
     objects: Sequence[str | None],
     placed: SensorPoses | None,
 ) -> tuple[Identification, dict[str, float]]:
     """The object, of ``objects``, and its posterior; and the time to read the images and to prepare the indexes [ms].
 
-    ``sensors`` has one for each image; ``backgrounds`` too, or one for all.
+    ``sensors`` and ``backgrounds`` have one for each image.
     """
     from geomtact.cli.several import units_of
     from geomtact.identification import identify
     from geomtact.sensing.reading import read_observation
 
-    each = backgrounds if isinstance(backgrounds, list) else [backgrounds] * len(images)
     began = time.perf_counter()
     # a bad image is reported before minutes go into an index, and a missing sensor by opening the index
     observations = [
         read_observation(image, gel, request.kind, background)
-        for image, sensor, background in zip(images, sensors, each, strict=True)
+        for image, sensor, background in zip(images, sensors, backgrounds, strict=True)
         if (gel := request.mounted(sensor)) is not None
     ]
     timing_ms = {"read": 1e3 * (time.perf_counter() - began), "prepare": 0.0}
