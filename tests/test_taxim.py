@@ -75,7 +75,7 @@ def test_the_command_makes_a_sensor_of_a_table(table, tmp_path):
     assert sensor.image_size_px == SHAPE[::-1] and sensor.colour is not None
     assert "has no pitch" in run().output
     assert "needs no presses" in run("--ball-mm", 6).output
-    assert "a background of 240 x 320 px, got 80 x 60" in run("--sensor", "digit").output
+    assert "expected 240 x 320 px for sensor digit (width x height), got 80 x 60 px" in run("--sensor", "digit").output
     (tmp_path / "polycalib.npz").write_bytes(b"no table")
     assert run("--pitch-mm", 0.1, 0.1).exit_code == 3
     np.savez(table, bins=3, grad_r=np.zeros((2, 3, 6)), grad_g=np.zeros((2, 3, 6)), grad_b=np.zeros((2, 3, 6)))

@@ -154,26 +154,22 @@ def _of_taxim(
     """The sensor with the colour calibration of a table of Taxim."""
     from dataclasses import replace
 
-    from geomtact.sensing.change import as_unit_rgb
+    from geomtact.sensing.change import as_unit_rgb, check_size
     from geomtact.sensing.colour import kept
-    from geomtact.sensing.image_file import read_image
     from geomtact.sensing.sensor import Sensor
     from geomtact.sensing.taxim import colours_of_taxim
 
-    height, width = read_image(background).shape[:2]
+    rest = as_unit_rgb(background, "background")
+    height, width = rest.shape[:2]
     if sensor is None and pitch is None:
         raise UsageError(f"{table}: a table of Taxim has no pitch; give --pitch-mm, --pins or --sensor")
     base = Sensor.load(sensor) if sensor is not None else Sensor(name, (width, height), pitch or (0.0, 0.0), 0.0, 2e-3)
-    if base.image_size_px != (width, height):
-        raise UsageError(
-            f"--sensor {sensor}: expected a background of {base.image_size_px[0]} x {base.image_size_px[1]} px, got "
-            f"{width} x {height}; name the sensor that took it"
-        )
+    check_size(rest, base, str(background))
     if base.turned:
         raise UsageError(
             f"--sensor {sensor}: its camera is turned, but a table of Taxim fits unturned images; name another sensor"
         )
-    colour = replace(colours_of_taxim(table, (height, width)), background=kept(as_unit_rgb(background, "background")))
+    colour = replace(colours_of_taxim(table, (height, width)), background=kept(rest))
     typer.echo(
         f"error of slopes up to 30 degrees in the table: {colour.slope_rms:.3f} rms (a slope of 1 is 45 degrees)"
     )
