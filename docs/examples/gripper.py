@@ -67,4 +67,4 @@ else:
     where = np.round(1e3 * (T_base_gripper @ touch.T_world_sensor)[:3, 3], 1)
     print(f"not sure: touch from {where} mm next, expected gain {touch.expected_nats:.1f} nats")
 print(json.dumps(to_ros(first, "gripper"))[:120], "...")
-print(f"(the truth: {posterior.log_density(truth):.1f} nats are known of it)")
+print(f"(information gain at the true pose: {posterior.log_density(truth):.1f} nats)")
