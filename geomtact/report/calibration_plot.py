@@ -24,14 +24,12 @@ def draw_calibration(found: SensorCalibration, ball_diameter: float) -> bytes:
     ----------
     ball_diameter : metres
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     colour, pitch = found.sensor.colour, found.sensor.pixel_pitch
     assert colour is not None
     some = found.presses[:: max(1, len(found.presses) // _SHOWN)][:_SHOWN]
     figure = Figure(figsize=(12, 8.2), dpi=100, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     bands: Any = figure.subfigures(2, 1, height_ratios=[2, 1])
     grid, last = bands[0].subplots(2, _SHOWN), bands[1].subplots(1, 3)
     for axes in grid[:, len(some) :].flat:
@@ -74,4 +72,4 @@ def draw_calibration(found: SensorCalibration, ball_diameter: float) -> bytes:
     last[2].axvline(1e3 * ball_diameter, color=COLOURS[1], ls="--", label="given")
     last[2].set(xlabel="ball's diameter by each press [mm]", ylabel="presses")
     last[2].legend(fontsize=8)
-    return png(canvas)
+    return png(figure)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geomtact.se3 import Array
 
 if TYPE_CHECKING:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
 _T = TypeVar("_T")
 
@@ -27,10 +27,12 @@ def coloured(what: Iterable[_T]) -> Iterator[tuple[_T, str]]:
     return zip(what, cycle(COLOURS), strict=False)
 
 
-def png(canvas: FigureCanvasAgg) -> bytes:
-    """What a matplotlib ``canvas`` shows."""
+def png(figure: Figure) -> bytes:
+    """What a matplotlib ``figure`` shows."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     out = io.BytesIO()
-    canvas.print_png(out, metadata={"Software": None})
+    FigureCanvasAgg(figure).print_png(out, metadata={"Software": None})
     return out.getvalue()
 
 

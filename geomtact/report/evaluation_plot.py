@@ -19,11 +19,9 @@ def finding(figures: Sequence[Accuracy]) -> str:
 
 def draw_evaluation(figures: Sequence[Accuracy], title: str, mode_radius_mm: float) -> bytes:
     """A PNG: information gain, pose error, coverage and time, each by number of sensors."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 8), dpi=110, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     figure.suptitle(f"{title}\n{finding(figures)}", fontsize=11)
     (gain, error), (inside, time) = figure.subplots(2, 2)
     sensors = [f.sensors for f in figures]
@@ -70,7 +68,7 @@ def draw_evaluation(figures: Sequence[Accuracy], title: str, mode_radius_mm: flo
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3)
         axes.legend(frameon=False, fontsize=9, loc="lower left" if axes is error else "best")
-    return png(canvas)
+    return png(figure)
 
 
 def _count(sensors: int) -> str:

@@ -42,14 +42,12 @@ def draw_next_touch(posterior: Posterior, ranked: Sequence[Action], seed: int = 
     seed : of the poses that are shown
     """
     import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     poses = draw_cells(posterior, _POSES, np.random.default_rng(seed))[0]
     best = ranked[: len(_COLOURS)]
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
         figure = Figure(figsize=(14, 8.6), dpi=100, layout="constrained", facecolor="white")
-        canvas = FigureCanvasAgg(figure)
         upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[5.6, 3.0])[:, 0]
         above, front, bars = upper.subplots(1, 3)
         for axes, view in zip((above, front), _VIEWS, strict=True):
@@ -67,7 +65,7 @@ def draw_next_touch(posterior: Posterior, ranked: Sequence[Action], seed: int = 
         title = f"{posterior.mesh.name} on {posterior.sensor.name}, {posterior.frame} frame: where to touch next"
         title += " (dark: the object is probably there)"
         figure.suptitle(title if note is None else f"{title}\n{note}", fontsize=11)
-        return png(canvas)
+        return png(figure)
 
 
 def _region(

@@ -62,12 +62,11 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
     figure.set_layout_engine("none")  # names are placed between the points as these now lie
     for axes, points_here in named:
         write_names(axes, points_here, 6.5)
-    return png(canvas)
+    return png(figure)
 
 
 def draw_modelled(content: Mapping[str, Any]) -> bytes:
     """A PNG: the ablations [nats] for each object and kind of scene, with paired 95 % intervals."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     parts = content["parts"]
@@ -78,7 +77,6 @@ def draw_modelled(content: Mapping[str, Any]) -> bytes:
     figure = Figure(
         figsize=(6.2 * len(scenes) + 1, 0.42 * len(names) + 1.4), dpi=100, layout="constrained", facecolor="white"
     )
-    canvas = FigureCanvasAgg(figure)
     grid = figure.subplots(1, len(scenes), squeeze=False, sharey=True)[0]
     for axes, scene in zip(grid, scenes, strict=True):
         for k, ((part, of), colour) in enumerate(coloured(modelled.items())):
@@ -102,7 +100,7 @@ def draw_modelled(content: Mapping[str, Any]) -> bytes:
     grid[0].set_yticks(range(len(names)), names)
     grid[0].invert_yaxis()
     grid[0].legend(frameon=False, fontsize=8)
-    return png(canvas)
+    return png(figure)
 
 
 def _points(part: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float | None]]]:

@@ -18,11 +18,9 @@ _LINES = {
 
 def draw_identification(content: Mapping[str, Any]) -> bytes:
     """A PNG: shares of scenes against the number of touches, and the confusion of objects after the last."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4.6), dpi=110, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     figures = content["figures"]
     touches = [f["touches"] for f in figures]
@@ -49,4 +47,4 @@ def draw_identification(content: Mapping[str, Any]) -> bytes:
     right.set_xticks(range(len(names)), names, rotation=35, ha="right")
     right.set_yticks(range(len(names)), names)
     right.set(xlabel="identified as", ylabel="touched", title=f"After {touches[-1]} touches [% of scenes]")
-    return png(canvas)
+    return png(figure)

@@ -21,7 +21,6 @@ def draw_kitting(content: Mapping[str, Any]) -> bytes:
     content : of the JSON that ``python -m tools.studies kitting --out`` writes
     """
     import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     parts = content["parts"]
@@ -29,7 +28,6 @@ def draw_kitting(content: Mapping[str, Any]) -> bytes:
     most, goal = settings["touches"], settings["goal_mm"]
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
         figure = Figure(figsize=(11, 4.2), dpi=110, layout="constrained", facecolor="white")
-        canvas = FigureCanvasAgg(figure)
         left, right = figure.subplots(1, 2)
         ticks: list[tuple[float, str]] = []
         for k, ((name, part), colour) in enumerate(coloured(parts.items())):
@@ -59,7 +57,7 @@ def draw_kitting(content: Mapping[str, Any]) -> bytes:
     right.legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
-    return png(canvas)
+    return png(figure)
 
 
 def _bars(axes: Axes, start: float, figures: list[Mapping[str, Any]]) -> None:

@@ -15,11 +15,9 @@ _BAND = 1.63  # of a Kolmogorov band that holds 99 % of curves, in 1 / sqrt(n)
 def draw_answers(content: Mapping[str, Any]) -> bytes:
     """A PNG: how many truths lie in the region of each mass, and in what is nearer to a pose drawn at random; and how often a
     right mode is among the first ones; a line for each object."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4.2), dpi=110, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     regions, nearer, found = figure.subplots(1, 3)
     for (name, part), colour in coloured(content["parts"].items()):
         for axes, field in ((regions, "level"), (nearer, "tarp")):
@@ -48,4 +46,4 @@ def draw_answers(content: Mapping[str, Any]) -> bytes:
     for axes in (regions, nearer, found):
         axes.spines[["top", "right"]].set_visible(False)
     regions.legend(frameon=False, fontsize=8, loc="lower right")
-    return png(canvas)
+    return png(figure)

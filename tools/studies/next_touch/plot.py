@@ -15,12 +15,10 @@ _STYLES = {
 
 def draw_touches_until_sure(content: Mapping[str, Any]) -> bytes:
     """A PNG: for each object, the share of runs that are sure after each number of touches."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     parts = content["parts"]
     figure = Figure(figsize=(3.1 * len(parts), 3.6), dpi=110, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     for axes, (name, part) in zip(
         figure.subplots(1, len(parts), squeeze=False, sharey=True)[0], parts.items(), strict=True
     ):
@@ -34,4 +32,4 @@ def draw_touches_until_sure(content: Mapping[str, Any]) -> bytes:
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("runs in which one mode holds 95 % [%]")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
-    return png(canvas)
+    return png(figure)

@@ -19,14 +19,12 @@ def draw_sheet(
 ) -> bytes:
     """A PNG of all tactile images by set, each (image (H, W, 3), contact (H, W), circle (column, row, radius) [px]);
     the circle is divided by the set's ``factor``."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     rows = {name: -(-len(some) // _COLUMNS) for name, some in sets.items()}
     tall = {name: some[0][0].shape[0] / some[0][0].shape[1] for name, some in sets.items()}
     height = sum(rows[name] * tall[name] for name in sets)
     figure = Figure((13, 13 * height / _COLUMNS + 0.5 * len(sets)), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
     bands = np.ravel(
         figure.subfigures(len(sets), 1, squeeze=False, height_ratios=[rows[n] * tall[n] + 0.35 for n in sets])
     )
@@ -47,4 +45,4 @@ def draw_sheet(
             for contour in contours:
                 axes.plot(*np.vstack([contour[:, 0], contour[:1, 0]]).T, color=COLOURS[1], linewidth=1.0)
             axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
-    return png(canvas)
+    return png(figure)

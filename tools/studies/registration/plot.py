@@ -21,7 +21,6 @@ def draw_registration(content: Mapping[str, Any]) -> bytes:
     content : of the JSON that ``python -m tools.studies registration --out`` writes
     """
     import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     kinds = {kind: cells for kind, cells in content["figures"]["success"].items() if cells}
@@ -30,7 +29,6 @@ def draw_registration(content: Mapping[str, Any]) -> bytes:
     with mpl.rc_context({"font.size": 8}):
         size = (_PANEL[0] * len(names) + 1.2, _PANEL[1] * len(kinds) + 0.9)
         figure = Figure(figsize=size, dpi=120, layout="constrained", facecolor="white")
-        canvas = FigureCanvasAgg(figure)
         grid = figure.subplots(len(kinds), len(names), squeeze=False)  # a hundred axes that share take minutes
         for i, (kind, cells) in enumerate(kinds.items()):
             turns, shifts = (sorted({cell[key] for cell in cells}) for key in ("turn_deg", "shift_mm"))
@@ -58,4 +56,4 @@ def draw_registration(content: Mapping[str, Any]) -> bytes:
             f"{settings['noise']['name']} noise",
             fontsize=9,
         )
-        return png(canvas)
+        return png(figure)

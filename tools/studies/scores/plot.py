@@ -51,7 +51,7 @@ def draw_scores(content: Mapping[str, Any]) -> bytes:
         figure.set_layout_engine("none")  # labels are placed between the points as these now lie
         for (axes, _), here in zip(shown, points, strict=True):
             write_names(axes, here)
-        return png(canvas)
+        return png(figure)
 
 
 def _points(axes: Axes, title: str, entries: Mapping[str, Any], names: Sequence[str]) -> list[Named]:

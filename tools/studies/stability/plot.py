@@ -22,7 +22,6 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
 
     What is promised lies on a light ground. Objects differ by colour; all together are black.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     sweeps = {part: told["sweeps"] for part, told in content["parts"].items()}
@@ -33,7 +32,6 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
     across = min(_ACROSS, max(1, len(names)))
     down = -(-len(names) // across)
     figure = Figure(figsize=(4.2 * across, 4.4 * down + 0.4), dpi=100, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     grid = figure.subplots(2 * down, across, squeeze=False, height_ratios=[3, 2] * down)
     for axes in grid.ravel():
         axes.set_visible(False)
@@ -50,7 +48,7 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
     handles += [figure.axes[0].plot([], [], style, color="0.4", label=label)[0] for style, label in styles]
     handles.append(figure.axes[0].fill_between([], [], color="0.94", label="promised to hold"))
     figure.legend(handles=handles, loc="outside upper center", ncols=_IN_A_ROW, frameon=False)
-    return png(canvas)
+    return png(figure)
 
 
 def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -> None:

@@ -23,12 +23,10 @@ _BIN, _MOST = 0.05, 1.6  # normalised error
 
 def draw_thesis(content: Mapping[str, Any]) -> bytes:
     """A PNG: for each object, and before and after refinement, how many touches have which normalised error."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     parts = content["parts"]
     figure = Figure(figsize=(4.2 * len(parts) + 0.4, 4.6), dpi=110, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     edges = np.arange(0, _MOST + _BIN, _BIN)
     for axes, (name, part) in zip(
         figure.subplots(1, len(parts), sharey=True, squeeze=False)[0], parts.items(), strict=True
@@ -54,4 +52,4 @@ def draw_thesis(content: Mapping[str, Any]) -> bytes:
     lines = {"median": ("k", (0, (2, 1))), "a random guess": ("k", "-"), "the grid's neighbours": ("#CC0000", "-")}
     handles = [first.plot([], [], color=colour, ls=style, label=label)[0] for label, (colour, style) in lines.items()]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
-    return png(canvas)
+    return png(figure)

@@ -10,11 +10,9 @@ from geomtact.report.canvas import coloured, png
 
 def draw_touches(content: Mapping[str, Any]) -> bytes:
     """A PNG: information and error against the number of sensors, a line for each part."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 4), dpi=110, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     for (name, part), colour in coloured(content["parts"].items()):
         figures = part["figures"]
@@ -39,4 +37,4 @@ def draw_touches(content: Mapping[str, Any]) -> bytes:
     right.set_title("How far off the first mode and the best of ten are")
     left.legend(frameon=False)
     right.legend(frameon=False, fontsize=8)
-    return png(canvas)
+    return png(figure)

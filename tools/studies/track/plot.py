@@ -14,11 +14,9 @@ LABELS = {"filter": "the filter", "frames": "independent frames", "thesis": "the
 
 def draw_track(content: Mapping[str, Any]) -> bytes:
     """A PNG: information frame by frame in the mean, and what the filter adds on each trajectory."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 4), dpi=110, layout="constrained", facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     least = content["figures"]["least_gain"]
     outcomes = [(name, o) for name, part in content["parts"].items() for o in part["outcomes"]]
@@ -45,7 +43,7 @@ def draw_track(content: Mapping[str, Any]) -> bytes:
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3, axis="y")
-    return png(canvas)
+    return png(figure)
 
 
 def _gain(outcome: Mapping[str, Any], method: str, least: float) -> np.ndarray:
