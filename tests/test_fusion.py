@@ -18,7 +18,7 @@ from geomtact.evaluation import simultaneous_touches
 from geomtact.inference.distribution import cell_densities, cell_log_density
 from geomtact.inference.extrinsics import extrinsics_covariance
 from geomtact.inference.fusion import _shares, disagreement, fuse, poor_agreement
-from geomtact.sensing.reading import write_image
+from geomtact.sensing.image_file import write_image
 
 
 def world(touches, rng):

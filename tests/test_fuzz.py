@@ -19,7 +19,7 @@ from geomtact.cli.sensor_poses import read_sensor_poses
 from geomtact.inference import files
 from geomtact.report.exchange import from_bop, from_tum
 from geomtact.scoring.encoder import load_weights
-from geomtact.sensing.image_file import read_image, read_metadata
+from geomtact.sensing.image_file import ImageFile, read_image
 
 TIMES = int(os.environ.get("GEOMTACT_FUZZ", "1"))
 
@@ -65,7 +65,7 @@ KINDS = {
     "bmp": (lambda: picture("BMP"), read_image, 500),
     "tiff": (lambda: picture("TIFF"), read_image, 800),
     "npy": (array, read_image, 800),
-    "meta.png": (lambda: picture("PNG"), read_metadata, 300),
+    "meta.png": (lambda: picture("PNG"), lambda path: ImageFile.read(path).metadata, 300),
     "stl": (lambda: mesh("stl"), lambda path: load_mesh(path, "m"), 1000),
     "ascii.stl": (lambda: mesh("stl_ascii"), lambda path: load_mesh(path, "m"), 500),
     "obj": (lambda: mesh("obj"), lambda path: load_mesh(path, "m"), 700),

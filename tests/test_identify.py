@@ -17,8 +17,8 @@ from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import simultaneous_touches
 from geomtact.identification import identify
 from geomtact.inference.facts import Diagnostics
+from geomtact.sensing.image_file import write_image
 from geomtact.sensing.noise import MODERATE
-from geomtact.sensing.reading import write_image
 from tools.studies.common.pictures import draw
 from tools.studies.identify.study import Told, identify_scenes, summarise
 

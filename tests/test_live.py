@@ -17,7 +17,7 @@ from geomtact import InputError, Localizer, Mesh, Sensor
 from geomtact.cli.frames import Frame, all_frames, camera_frames, newest, newest_in
 from geomtact.cli.live import localize_live
 from geomtact.cli.shell import one_line_errors
-from geomtact.sensing.reading import write_image
+from geomtact.sensing.image_file import write_image
 from geomtact.sensing.render import example_reading
 
 MINI = Sensor.load("gelsight-mini")

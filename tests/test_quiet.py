@@ -14,7 +14,7 @@ from PIL import Image
 
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.json_values import plain, to_text
-from geomtact.sensing.image_file import read_image, read_metadata, write_image
+from geomtact.sensing.image_file import ImageFile, read_image, write_image
 
 ROOT = Path(__file__).resolve().parents[1]
 STRANGE = os.fsdecode(b"p\xfcr")  # Latin-1, which is no UTF-8
@@ -110,7 +110,7 @@ def test_unusual_names_are_printable_in_output_files(tmp_path):
     text = to_text(plain({STRANGE: [Path(STRANGE), STRANGE]}))
     assert json.dumps(json.loads(text), ensure_ascii=False).encode() == rb'{"p\\udcfcr": ["p\\udcfcr", "p\\udcfcr"]}'
     write_image(tmp_path / f"{STRANGE}.png", np.eye(4, dtype=bool), {"object": STRANGE})
-    assert read_metadata(tmp_path / f"{STRANGE}.png")["geomtact:object"] == r"p\udcfcr"
+    assert ImageFile.read(tmp_path / f"{STRANGE}.png").metadata["geomtact:object"] == r"p\udcfcr"
 
 
 def test_a_command_is_quiet_about_missing_pictures_and_takes_any_name(tmp_path):

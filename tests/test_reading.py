@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from geomtact.errors import ImageError, UsageError
-from geomtact.sensing.image_file import read_image, read_metadata, write_image
+from geomtact.sensing.image_file import ImageFile, read_image, write_image
 from geomtact.sensing.local_shape import contact_mask
 from geomtact.sensing.pixels import median_of
 from geomtact.sensing.reading import read_observation
@@ -368,7 +368,7 @@ def test_a_written_image_is_loaded_with_its_metadata(tmp_path, array):
     contact = read_observation(path, MINI).contact
     assert np.array_equal(contact.mask, MASK)
     assert (contact.height is None) if array is MASK else np.abs(contact.height - HEIGHT).max() < 0.51e-6
-    found = read_metadata(path)
+    found = ImageFile.read(path).metadata
     assert found.keys() == {"geomtact:object", "geomtact:sensor", "geomtact:T_sensor_object"}
     assert found["geomtact:object"] == "hex-nut" and found["geomtact:sensor"] == "gelsight-mini"
     assert np.array_equal(found["geomtact:T_sensor_object"], T), "a pose survives to the last bit"
@@ -376,11 +376,11 @@ def test_a_written_image_is_loaded_with_its_metadata(tmp_path, array):
 
 
 def test_metadata_of_other_files_is_empty_and_a_broken_pose_is_named(tmp_path, background):
-    assert read_metadata(write(tmp_path / "plain.png", background)) == {}
-    assert read_metadata(write(tmp_path / "plain.jpg", background)) == {}
+    assert ImageFile.read(write(tmp_path / "plain.png", background)).metadata == {}
+    assert ImageFile.read(write(tmp_path / "plain.jpg", background)).metadata == {}
     write_image(tmp_path / "wrong.png", MASK, {"T_sensor_object": 2 * np.eye(4)})
     with pytest.raises(ImageError, match="geomtact:T_sensor_object is no rigid transform"):
-        read_metadata(tmp_path / "wrong.png")
+        ImageFile.read(tmp_path / "wrong.png").metadata  # noqa: B018
 
 
 @pytest.mark.parametrize("value", [0, 255])

@@ -15,7 +15,7 @@ from geomtact.report import viewer
 from geomtact.report.canvas import to_pixels
 from geomtact.report.viewer import Viewer
 from geomtact.se3 import transform
-from geomtact.sensing.reading import write_image
+from geomtact.sensing.image_file import write_image
 
 pytest.importorskip("viser")
 

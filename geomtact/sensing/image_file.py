@@ -47,7 +47,10 @@ class ImageFile:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """As :func:`read_metadata`."""
+        """What ``geomtact simulate`` wrote into a PNG, under the keys it has there; {} where there is nothing.
+
+        ``geomtact:object``, ``geomtact:unit`` and ``geomtact:sensor`` are strings, ``geomtact:T_sensor_object`` is (4, 4) [m].
+        """
         from PIL import Image, UnidentifiedImageError
 
         if self.data[:8] != b"\x89PNG\r\n\x1a\n":
@@ -83,14 +86,6 @@ def read_image(path: str | Path) -> NDArray[Any]:
         No such file, empty, too large, no image, or damaged.
     """
     return ImageFile.read(path).pixels
-
-
-def read_metadata(path: str | Path) -> dict[str, Any]:
-    """What ``geomtact simulate`` wrote into a PNG, under the keys it has there; {} where there is nothing.
-
-    ``geomtact:object``, ``geomtact:unit`` and ``geomtact:sensor`` are strings, ``geomtact:T_sensor_object`` an array (4, 4) [m].
-    """
-    return ImageFile.read(path).metadata
 
 
 def write_image(path: str | Path, array: ArrayLike, metadata: Mapping[str, Any] | None = None) -> None:

@@ -18,11 +18,9 @@ from geomtact.sensing.drawn import bright_half, two_valued, without_two_colours
 from geomtact.sensing.flicker import without_flicker
 from geomtact.sensing.height import height_of
 from geomtact.sensing.image_faults import calibration_mismatches, faults
-from geomtact.sensing.image_file import ImageFile, read_metadata, write_image
-from geomtact.sensing.local_shape import contact_mask, find_contact, on_grid
+from geomtact.sensing.image_file import ImageFile
+from geomtact.sensing.local_shape import find_contact, on_grid
 from geomtact.sensing.sensor import Sensor
-
-__all__ = ["KINDS", "Observation", "contact_mask", "read_metadata", "read_observation", "write_image"]
 
 KINDS = ("auto", "mask", "height", "reading")
 _DUST = 0.1e-6  # m^2 of contact, under which a touch constrains nothing (docs/stability.md)
