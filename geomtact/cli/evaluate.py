@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from geomtact.cli.options import CacheDir, Effort, EffortName, MaxPoses, Seed, SensorName, Unit, check_name
+from geomtact.cli.options import CacheDir, Effort, EffortName, MaxPoses, Objects, Seed, SensorName, Unit, check_name
 from geomtact.cli.project import required, resolve
 from geomtact.cli.request import Request
 from geomtact.cli.several import Jobs, Ray, do_all, everywhere, objects_with_units, quietly
@@ -24,10 +24,7 @@ _SAVE_EVERY = 10  # touches
 
 
 def evaluate(
-    objects: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="OBJECT...", help="Objects (see 'geomtact objects') or mesh files."),
-    ] = None,
+    objects: Objects = None,
     unit: Unit = None,
     sensor: SensorName = None,
     touches: Annotated[

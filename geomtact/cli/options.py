@@ -106,6 +106,9 @@ Source = Annotated[
         help="Folder of images, video, number of a camera, or - for paths on standard input.",
     ),
 ]
+Objects = Annotated[
+    list[str] | None, typer.Argument(metavar="OBJECT...", help="Objects (see 'geomtact objects') or mesh files.")
+]
 ObjectName = Annotated[str | None, typer.Option("--object", help="Object (see 'geomtact objects') or mesh file.")]
 MotionMm = Annotated[
     float,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 
 def prepare(
-    objects: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="OBJECT...", help="Objects (see 'geomtact objects') or mesh files."),
-    ] = None,
+    objects: options.Objects = None,
     unit: options.Unit = None,
     sensor: options.SensorName = None,
     approach: options.Approaches = None,
