@@ -16,7 +16,6 @@ _NUMBER = re.compile(
 )
 _DIGITS = 17  # that Python writes a float with at most, zeros before them aside
 _SHOWN = 3  # names of the order taken that a warning gives
-
 _SPREAD = 1.0  # s over which files are written one after the other at least, for their times to count
 _STEADY = 0.25  # of the median time between two files that lies between all, if that is less than _SPREAD
 _SECONDS = 10  # digits of the seconds since 1970
