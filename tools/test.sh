@@ -12,4 +12,6 @@ if [ "${1:-}" = --all ]; then
 fi
 # two workers, each on one core: threads of both would only wait for each other
 export OMP_NUM_THREADS=1
+# compiled modules are kept: the other worker, and processes that tests start, read what was compiled once
+unset PYTHONDONTWRITEBYTECODE
 exec .venv/bin/python -m pytest -n 2 --dist worksteal --durations=25 -m "$selected" "$@"
