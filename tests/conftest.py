@@ -46,7 +46,7 @@ def make_localizer(cache_dir):
     from geomtact import Localizer
     from geomtact.scoring import fitted
 
-    def make(mesh, sensor, approach=None, max_poses=20_000, touches=120, **options):
+    def make(mesh, sensor, approach=None, max_poses=20_000, touches=60, **options):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(fitted, "TOUCHES", touches)
             options = {"cache_dir": cache_dir, **options}
@@ -61,7 +61,7 @@ def few_touches():
     from geomtact.scoring import fitted
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitted, "TOUCHES", 120)
+        patch.setattr(fitted, "TOUCHES", 60)
         yield
 
 
@@ -75,7 +75,7 @@ def curved_sensor():
 @pytest.fixture(scope="session")
 def plug(make_localizer):
     """An object without symmetry."""
-    return make_localizer("connector_plug", "gelslim", max_poses=20_000, touches=240)
+    return make_localizer("connector_plug", "gelslim", touches=240)
 
 
 @pytest.fixture(scope="session")
@@ -92,7 +92,7 @@ def ball(make_localizer):
 @pytest.fixture(scope="session")
 def curved(make_localizer, curved_sensor):
     """A nut, which twelve rotations map onto itself, on a membrane that bulges."""
-    return make_localizer("hex_nut", curved_sensor, max_poses=30_000)
+    return make_localizer("hex_nut", curved_sensor)
 
 
 @pytest.fixture(scope="session")

@@ -36,6 +36,7 @@ def geomtact(tmp_path, monkeypatch, cache, few_touches):
     """Runs a command in an empty folder; checks the exit status."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GEOMTACT_CACHE", str(cache))
+    monkeypatch.setattr("geomtact.contact_space.resolution.MAX_POSES", 3000)
 
     def run(*args, status=0, of=app):
         result = CliRunner().invoke(of, [str(a) for a in args])
@@ -104,9 +105,9 @@ def test_a_usage_error_is_one_line(args, said, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["geomtact", *args])
     with pytest.raises(SystemExit) as stopped:
         main()
-    told = capsys.readouterr()
-    assert stopped.value.code == 2 and told.out == ""
-    assert told.err.startswith("error: ") and told.err.count("\n") == 1 and said.lower() in told.err.lower()
+    printed = capsys.readouterr()
+    assert stopped.value.code == 2 and printed.out == ""
+    assert printed.err.startswith("error: ") and printed.err.count("\n") == 1 and said.lower() in printed.err.lower()
 
 
 @pytest.mark.parametrize(
@@ -140,12 +141,12 @@ def test_the_process_exits_with_the_status_of_its_command(monkeypatch, capsys):
 
 def test_missing_options_are_named_with_their_choices(geomtact, tmp_path):
     Image.fromarray(np.zeros((240, 320), np.uint8)).save("plain.png")
-    told = geomtact("localize", "plain.png", status=2).stderr
-    assert "--object" in told
-    assert "pin" in told
-    told = geomtact("localize", "plain.png", "--object", "pin", status=2).stderr
-    assert "--sensor" in told
-    assert "gelsight-mini" in told
+    printed = geomtact("localize", "plain.png", status=2).stderr
+    assert "--object" in printed
+    assert "pin" in printed
+    printed = geomtact("localize", "plain.png", "--object", "pin", status=2).stderr
+    assert "--sensor" in printed
+    assert "gelsight-mini" in printed
 
 
 def test_bad_input_exits_3_with_one_line(geomtact, tmp_path):
@@ -182,9 +183,9 @@ def test_wrong_names_and_paths_are_errors_before_any_work(geomtact, touched, tmp
     assert "no.npz: no such file" in geomtact("localize", image, "--prior", "no.npz", status=3).stderr
     assert "no.toml: no such file" in geomtact("localize", image, "--sensor", "no.toml", status=3).stderr
     (tmp_path / "geomtact.toml").write_text('effort = "quick"')
-    told = geomtact("localize", image, status=3).stderr
-    assert "geomtact.toml: no effort named 'quick'" in told
-    assert "(known: balanced, exact, fast)" in told
+    printed = geomtact("localize", image, status=3).stderr
+    assert "geomtact.toml: no effort named 'quick'" in printed
+    assert "(known: balanced, exact, fast)" in printed
 
 
 def test_an_image_is_no_prior(tmp_path, touched):
@@ -209,8 +210,8 @@ def test_progress_without_a_terminal_is_a_line_each_tenth(capsys):
 
 def test_system_errors_are_one_line_too(geomtact, tmp_path):
     (tmp_path / "file").touch()
-    told = geomtact("simulate", "ball", "--sensor", "gelslim", "--out", tmp_path / "file" / "below", status=3).stderr
-    assert "file" in told
+    printed = geomtact("simulate", "ball", "--sensor", "gelslim", "--out", tmp_path / "file" / "below", status=3).stderr
+    assert "file" in printed
 
 
 def test_simulated_images_carry_their_object_and_sensor(touched):
@@ -276,7 +277,7 @@ def test_a_tactile_image_that_does_not_show_its_contact_brings_a_warning(geomtac
 def test_the_contact_face_may_be_given(geomtact, flat_nut, a_touch, tmp_path):
     Image.fromarray(255 * a_touch(flat_nut)[1].astype(np.uint8)).save(tmp_path / "nut.png")
     own = ("--cache-dir", tmp_path / "own")  # others count what the shared one holds
-    nut = ("nut.png", "--object", "hex_nut", "--sensor", "gelsight-mini", "--max-poses", 3000, *own)
+    nut = ("nut.png", "--object", "hex_nut", "--sensor", "gelsight-mini", "--scorer", "moments", *own)
     said = json.loads(geomtact("localize", *nut, "--approach", "0,0,1", "--json").stdout)
     assert said["settings"]["approach"] == [[[0, 0, 1], 0]]
     assert "ready" in geomtact("prepare", *nut[2:], "--approach", "-0.0,0,2").stdout
@@ -296,10 +297,10 @@ def test_the_contact_face_may_be_given(geomtact, flat_nut, a_touch, tmp_path):
 
 
 def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touched, tmp_path, cache):
-    told = geomtact("localize", touched / "ball_1.png", "--out", "out")
-    assert "object: ball (from the image's metadata)" in told.stderr
-    assert "sensor: gelsight-mini (from the image's metadata)" in told.stderr
-    assert "probability" in told.stdout
+    printed = geomtact("localize", touched / "ball_1.png", "--out", "out")
+    assert "object: ball (from the image's metadata)" in printed.stderr
+    assert "sensor: gelsight-mini (from the image's metadata)" in printed.stderr
+    assert "probability" in printed.stdout
     written = sorted(p.name for p in (tmp_path / "out").iterdir())
     assert written == ["posterior.npz", "report.html", "report.png", "result.json"]
     content = json.loads((tmp_path / "out" / "result.json").read_text())
@@ -310,13 +311,12 @@ def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touch
 
     # only JSON on standard output, and the index comes from the cache now
     again = geomtact("localize", touched / "ball_1.png", "--json", "--seed", 0, "--report", "none")
-    printed = json.loads(again.stdout)
-    assert printed["modes"] == content["modes"]
+    assert json.loads(again.stdout)["modes"] == content["modes"]
 
     for wanted, written in (("png", {"report.png"}), ("html", {"report.html"}), ("none", set())):
-        told = geomtact("localize", touched / "ball_1.png", "--out", wanted, "--report", wanted).stdout
+        printed = geomtact("localize", touched / "ball_1.png", "--out", wanted, "--report", wanted).stdout
         assert {p.name for p in (tmp_path / wanted).iterdir()} == {"posterior.npz", "result.json"} | written
-        assert all((name in told) == (name in written) for name in ("report.png", "report.html"))
+        assert all((name in printed) == (name in written) for name in ("report.png", "report.html"))
 
     shutil.copytree(cache, tmp_path / "copy")
     assert "ball" in geomtact("cache", "--cache-dir", "copy").stdout
@@ -345,21 +345,21 @@ def test_localize_reads_each_image_once(geomtact, touched, tmp_path, monkeypatch
 def test_images_and_folders_may_have_any_name(geomtact, touched, tmp_path):
     name = os.fsdecode(b"t\xfcr")
     image = shutil.copy(touched / "ball_1.png", tmp_path / f"{name}.png")
-    told = geomtact("localize", image, "--out", name, "--json")
-    assert json.loads(told.stdout)["settings"]["image"] == str(tmp_path / r"t\udcfcr.png")
-    assert (tmp_path / name / "result.json").read_text("utf-8") == told.stdout
+    printed = geomtact("localize", image, "--out", name, "--json")
+    assert json.loads(printed.stdout)["settings"]["image"] == str(tmp_path / r"t\udcfcr.png")
+    assert (tmp_path / name / "result.json").read_text("utf-8") == printed.stdout
     assert r"t\udcfcr.png" in (tmp_path / name / "report.html").read_text("utf-8")
     assert geomtact("localize", image, "--prior", name, "--json").stdout.startswith("{")
     film = shutil.copy(image, tmp_path / f"{name}.avi")
-    told = geomtact("track", film, "--object", "ball", "--sensor", "gelsight-mini", status=3).stderr
-    assert "the name of a video must be UTF-8; rename it" in told
+    printed = geomtact("track", film, "--object", "ball", "--sensor", "gelsight-mini", status=3).stderr
+    assert "the name of a video must be UTF-8; rename it" in printed
 
 
 def test_no_contact_exits_4_and_writes_its_result(geomtact, tmp_path):
     Image.fromarray(np.zeros((240, 320), np.uint8)).save("nothing.png")
     args = ["nothing.png", "--object", "ball", "--sensor", "gelsight-mini", "--kind", "mask", "--out", "out", "--json"]
-    told = geomtact("localize", *args, status=4)
-    assert json.loads(told.stdout)["contact"] is False
+    printed = geomtact("localize", *args, status=4)
+    assert json.loads(printed.stdout)["contact"] is False
     assert json.loads((tmp_path / "out" / "result.json").read_text())["modes"] == []
 
 
@@ -504,16 +504,16 @@ def test_each_image_may_have_its_own_background(tmp_path, monkeypatch, rng):
 def test_usage_errors_are_in_plain_words(words, message, capsys):
     with pytest.raises(SystemExit), one_line_usage_errors():
         app(list(words), standalone_mode=False)
-    told = capsys.readouterr().err
-    assert message in told and "Input should" not in told and "ossible options" not in told
+    printed = capsys.readouterr().err
+    assert message in printed and "Input should" not in printed and "ossible options" not in printed
 
 
 def test_a_folder_of_sensor_poses_and_a_truncated_file_are_named_as_such(geomtact, touched, tmp_path):
     image = touched / "ball_1.png"
     assert "is a folder; give a JSON file" in geomtact("localize", image, "--sensor-poses", tmp_path, status=3).stderr
     (tmp_path / "cut.json").write_text('{"T_world')
-    told = geomtact("localize", image, "--sensor-poses", tmp_path / "cut.json", status=3).stderr
-    assert "cannot be read as JSON" in told and "UTF-8" not in told
+    printed = geomtact("localize", image, "--sensor-poses", tmp_path / "cut.json", status=3).stderr
+    assert "cannot be read as JSON" in printed and "UTF-8" not in printed
 
 
 def test_an_interrupted_command_says_so(capsys):

@@ -139,7 +139,7 @@ def test_the_covariance_of_a_cell_is_that_of_draws_from_it(plug, rng):
     everywhere."""
     index = plug.index
     found = []
-    for i in rng.choice(len(index), 12, p=weights(index)):
+    for i in rng.choice(len(index), 8, p=weights(index)):
         T = index.poses([i])[0]
         C = index.cell_covariance(T)
         assert np.abs(C - C.T).max() < 1e-12 and (np.linalg.eigvalsh(C) > 0).all()

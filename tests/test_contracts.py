@@ -29,7 +29,7 @@ from geomtact.sensing.sensor import Sensor
 
 # --- scores
 
-TOUCHES = 120  # that each score is fitted on; the laws are coarse enough for it
+TOUCHES = 60  # that each score is fitted on; the laws are coarse enough for it
 POOR = ("l1", "hu", "fpfh")  # the thesis's pixel distance, and those that are blind to where a contact lies
 ONLY_BY_WEIGHTS = {"CosineScorer"}  # of a user's own trained network
 INNER = {"CoarseScorer", "Product"}  # a coarse form of the encoder's, see test_cascade; and where "best" weighs several
@@ -332,9 +332,20 @@ MOTIONS = [
     each(**{field.name: SIZES[field.name] for field in dataclasses.fields(each)})
     for each in implementations(geomtact.inference, "twists")
 ]
-KINDS = ("pin", "ball", "cone", "flat_nut")  # an axis, a sphere, cones of approach, and a face with a housing
+KINDS = {  # an axis, a sphere, cones of approach, and a face with a housing
+    "pin": ("damping_pin", "gelslim", None),
+    "ball": ("ball", "gelsight-mini", None),
+    "cone": ("bracket", "gelslim", [((0, 0, 1), 0.5), ((0, 0.3, 1), 0.5)]),
+    "flat_nut": ("hex_nut", "gelsight-mini", [((0, 0, 1), 0.0)]),
+}
 each_motion = pytest.mark.parametrize("motion", MOTIONS, ids=str)
-each_part = pytest.mark.parametrize("part", slow_but(KINDS, "ball", "flat_nut"))
+
+
+@pytest.fixture(params=slow_but(KINDS, "ball", "flat_nut"))
+def grid(request, cache_dir):
+    """A grid of few poses, which a motion fills in a moment."""
+    name, sensor, approach = KINDS[request.param]
+    return open_index(load_mesh(name), Sensor.load(sensor), approach, 6_000, cache_dir, None)
 
 
 def weights(index):
@@ -359,39 +370,33 @@ def test_a_motion_repeats_by_its_seed_and_leans_nowhere(motion):
 
 
 @each_motion
-@each_part
-def test_a_motion_keeps_the_uniform_distribution_and_all_mass(part, motion, request, rng):
-    index = request.getfixturevalue(part).index
-    spread = MotionKernel(index, motion)
-    possible = index.possible
-    after = spread(Mixture(possible, weights(index)[possible], 0.0))
-    np.testing.assert_allclose(dense(index, after), weights(index), rtol=2e-3, atol=1e-9)
+def test_a_motion_keeps_the_uniform_distribution_and_all_mass(grid, motion, rng):
+    spread = MotionKernel(grid, motion)
+    possible = grid.possible
+    after = spread(Mixture(possible, weights(grid)[possible], 0.0))
+    np.testing.assert_allclose(dense(grid, after), weights(grid), rtol=2e-3, atol=1e-9)
     assert len(np.unique(after.cells)) == len(after.cells)
     cells = np.sort(rng.choice(possible, 20, replace=False))
     after = spread(Mixture(cells, rng.dirichlet(np.ones(20)), 0.0))
     assert after.mass.sum() == pytest.approx(1, abs=1e-4)
     assert after.mass.min() >= 0
-    assert (weights(index)[after.cells] > 0).all()
+    assert (weights(grid)[after.cells] > 0).all()
 
 
 @each_motion
-@each_part
-def test_components_of_a_distribution_spread_independently(part, motion, request, rng):
+def test_components_of_a_distribution_spread_independently(grid, motion, rng):
     """However few cells hold mass: few rotations are spread by another method than all of them."""
-    index = request.getfixturevalue(part).index
-    spread, possible = MotionKernel(index, motion), index.possible
-    mass = weights(index)[possible] * rng.random(len(possible))
-    few = np.isin(index.rotation[possible % index.places], rng.choice(index.rotation, 2))
-    whole = dense(index, spread(Mixture(possible, mass, 0.0)))
-    parts = [dense(index, spread(Mixture(possible[some], mass[some], 0.0))) for some in (few, ~few)]
+    spread, possible = MotionKernel(grid, motion), grid.possible
+    mass = weights(grid)[possible] * rng.random(len(possible))
+    few = np.isin(grid.rotation[possible % grid.places], rng.choice(grid.rotation, 2))
+    whole = dense(grid, spread(Mixture(possible, mass, 0.0)))
+    parts = [dense(grid, spread(Mixture(possible[some], mass[some], 0.0))) for some in (few, ~few)]
     np.testing.assert_allclose(sum(parts), whole, rtol=1e-4, atol=1e-10)
 
 
 @each_motion
-@each_part
-def test_a_motion_of_no_size_leaves_everything_where_it_was(part, motion, request, rng):
-    index = request.getfixturevalue(part).index
+def test_a_motion_of_no_size_leaves_everything_where_it_was(grid, motion, rng):
     still = dataclasses.replace(motion, **{field.name: 1e-12 for field in dataclasses.fields(motion)})
-    cells = np.sort(rng.choice(index.possible, 20, replace=False))
+    cells = np.sort(rng.choice(grid.possible, 20, replace=False))
     before = Mixture(cells, rng.dirichlet(np.ones(20)), 0.0)
-    np.testing.assert_allclose(dense(index, MotionKernel(index, still)(before)), dense(index, before), atol=1e-5)
+    np.testing.assert_allclose(dense(grid, MotionKernel(grid, still)(before)), dense(grid, before), atol=1e-5)

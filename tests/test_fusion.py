@@ -1,5 +1,6 @@
 """Several sensors at once: products, shares of cells, sensors without contact, and sensors that disagree."""
 
+import functools
 import json
 from dataclasses import replace
 
@@ -31,15 +32,23 @@ def single(localizer, touch, T):
     return localizer.localize(touch.mask, "mask", T_world_sensor=T, effort="fast")
 
 
-def carried(localizer, rng, pairs):
-    """``n`` pairs of sensors that touch: places of poses drawn within cells of the first, and poses at the second."""
-    index, space = localizer.index, localizer.space
-    T, _ = space.sample(2 * pairs, rng)
-    for here, there in zip(T[::2], T[1::2], strict=True):
-        transfer = CellTransfer(index, index, there @ se3.inverse(here))
-        cells = rng.choice(index.possible, 400)
-        settled, ok = space.settle(*index.draw(cells, rng))
-        yield transfer, cells[ok] % index.places, transfer.T_there_here @ settled[ok]
+@pytest.fixture(scope="module")
+def carried(plug):
+    """Pairs of sensors that touch: places of poses drawn within cells of the first, and poses at the second."""
+    index, space = plug.index, plug.space
+
+    @functools.cache
+    def of(pairs):
+        found, rng = [], np.random.default_rng(0)
+        T, _ = space.sample(2 * pairs, rng)
+        for here, there in zip(T[::2], T[1::2], strict=True):
+            transfer = CellTransfer(index, index, there @ se3.inverse(here))
+            cells = rng.choice(index.possible, 400)
+            settled, ok = space.settle(*index.draw(cells, rng))
+            found.append((transfer, cells[ok] % index.places, transfer.T_there_here @ settled[ok]))
+        return found
+
+    return of
 
 
 def test_a_sensor_in_the_same_place_sees_each_place_in_itself(plug):
@@ -57,20 +66,20 @@ def test_a_sensor_in_the_same_place_sees_each_place_in_itself(plug):
 
 
 @pytest.mark.parametrize("pairs", slow_but((6, 12), 6))
-def test_shares_equal_the_frequencies_of_simulation(plug, rng, pairs):
+def test_shares_equal_the_frequencies_of_simulation(plug, carried, pairs):
     """Of poses drawn within cells, as many touch a second sensor as the cells' shares predict, within a factor of two."""
     expected, happened = [], []
-    for transfer, places, T in carried(plug, rng, pairs):
+    for transfer, places, T in carried(pairs):
         expected.append(transfer.mean(np.ones(len(plug.index)))[1][places].mean())
         happened.append(np.isfinite(plug.space.penetration(T)).mean())
     assert 0.5 < np.mean(expected) / np.mean(happened) < 2.0
 
 
 @pytest.mark.parametrize("pairs", slow_but((6, 12), 6))
-def test_sensors_without_contact_are_reached_at_the_stated_frequency(plug, rng, pairs):
+def test_sensors_without_contact_are_reached_at_the_stated_frequency(plug, carried, pairs):
     """Of poses drawn within cells, as many reach a second sensor, at any depth, as the shares predict; or more."""
     expected, happened = [], []
-    for transfer, places, T in carried(plug, rng, pairs):
+    for transfer, places, T in carried(pairs):
         expected.append(transfer.reached()[places])
         happened.append(plug.space.caster.penetration(plug.sensor, T) > 0)
     expected, happened = np.concatenate(expected), np.concatenate(happened)
@@ -128,9 +137,11 @@ def test_sensors_with_the_same_errors_count_as_one(rng):
     np.testing.assert_allclose(_shares(log_prior, 1e-3 * fields + 7, three), _shares(log_prior, 1e-3 * fields, three))
 
 
-@pytest.mark.parametrize("scenes", slow_but((3, 12), 3))
+@pytest.mark.parametrize("scenes", slow_but((2, 12), 2))
 def test_each_further_sensor_adds_information_about_the_true_pose(plug, scenes):
-    """In the mean of 12 scenes: a second sensor adds 1.1 nats with a standard error of 0.65, two more 4.4 with one of 0.9."""
+    """In the mean of 12 scenes: a second sensor adds 1.1 nats with a standard error of 0.65, two more 4.4 with one of 0.9.
+
+    Of 2 scenes the standard errors are 1.6 and 2.2: the bounds lie 0.7 and 1.1 of them below the means."""
     gains = []
     touches = random_touches(plug.space, 3 * scenes, 3)
     for i in range(scenes):
@@ -211,10 +222,10 @@ def test_sensors_out_of_reach_do_not_change_refinement(plug, order):
     masks, T = [t.mask for t in touches], [*sensors, *far]
     masks += [np.zeros_like(masks[0])] * 2
     alone = plug.localize(masks[:3], "mask", None, T[:3])
-    told = plug.localize([masks[i] for i in order], "mask", None, [T[i] for i in order])
-    assert abs(np.exp(told.log_prob) - np.exp(alone.log_prob)).sum() < 1e-3
-    assert told.entropy_nats == pytest.approx(alone.entropy_nats, abs=1e-3)
-    for one, other in zip(alone.modes(3), told.modes(3), strict=True):
+    posterior = plug.localize([masks[i] for i in order], "mask", None, [T[i] for i in order])
+    assert abs(np.exp(posterior.log_prob) - np.exp(alone.log_prob)).sum() < 1e-3
+    assert posterior.entropy_nats == pytest.approx(alone.entropy_nats, abs=1e-3)
+    for one, other in zip(alone.modes(3), posterior.modes(3), strict=True):
         np.testing.assert_allclose(one.T, other.T, atol=1e-6)
 
 
@@ -224,9 +235,9 @@ def test_a_sensor_that_faces_away_does_not_constrain_poses_behind_it(plug, rng, 
     _, sensors = world([touch], rng)
     away = sensors[0] @ se3.transform(np.eye(3), [0, 0, -apart]) @ np.diag([1.0, -1.0, -1.0, 1.0])
     empty = np.zeros_like(touch.mask)
-    told = plug.localize([touch.mask, empty], "mask", None, np.stack([sensors[0], away]), effort="fast")
+    posterior = plug.localize([touch.mask, empty], "mask", None, np.stack([sensors[0], away]), effort="fast")
     alone = single(plug, touch, sensors[0])
-    assert abs(cell_densities(told) - cell_densities(alone)).sum() < 1e-3 * cell_densities(alone).sum()
+    assert abs(cell_densities(posterior) - cell_densities(alone)).sum() < 1e-3 * cell_densities(alone).sum()
 
 
 def test_no_contact_anywhere_leaves_the_poses_that_do_not_touch(plug, rng):
@@ -303,7 +314,7 @@ def test_a_prior_counts_once(plug, rng):
 def test_the_posterior_of_one_sensor_is_a_prior_for_another(plug, rng):
     """One after the other, two sensors do not exclude the truth, and give more information than each alone."""
     gains = []
-    for seed in range(50, 58):
+    for seed in range(50, 55):
         touches = random_touches(plug.space, 2, seed)
         T, sensors = world(touches, rng)
         before, alone = (single(plug, touch, at) for touch, at in zip(touches, sensors, strict=True))
@@ -319,7 +330,8 @@ def test_an_image_that_counts_twice_is_a_warning(plug, rng):
     touches = random_touches(plug.space, 2, 12)
     _, sensors = world(touches, rng)
     images = [touch.mask for touch in touches]
-    assert not any("same" in warning for warning in plug.localize(images, "mask", None, sensors).warnings)
+    both = plug.localize(images, "mask", None, sensors, effort="fast")
+    assert not any("same" in warning for warning in both.warnings)
     again = plug.localize([images[0], images[0]], "mask", None, sensors, effort="fast")
     assert any(warning.startswith("images 1 and 2 are the same") for warning in again.warnings)
     once = plug.localize(images[0], "mask", None, sensors[0], effort="fast")
@@ -368,7 +380,7 @@ def test_bad_sensor_poses_are_refused(plug):
 
 
 @pytest.mark.parametrize(
-    ("scenes", "max_poses", "more"), [(3, 6_000, 0.0), pytest.param(8, 20_000, 0.5, marks=pytest.mark.slow)]
+    ("scenes", "max_poses", "more"), [(3, 3_000, 0.0), pytest.param(8, 20_000, 0.5, marks=pytest.mark.slow)]
 )
 def test_sensors_may_differ(make_localizer, plug, rng, scenes, max_poses, more):
     """The second sensor has another window and other optics."""
@@ -399,7 +411,8 @@ def test_the_command_takes_several_images(plug, rng, tmp_path, monkeypatch):
     # with a byte order mark, as some editors write it
     poses.write_text(json.dumps({"T_world_sensor": sensors.tolist(), "std_mm": 0.5}), "utf-8-sig")
     monkeypatch.setattr(Localizer, "prepare", classmethod(lambda cls, *args, **options: plug))
-    args = ["localize", *paths, "--object", "connector_plug", "--sensor", "gelslim"]
+    quick = ["--effort", "fast", "--report", "none"]
+    args = ["localize", *paths, "--object", "connector_plug", "--sensor", "gelslim", *quick]
     done = CliRunner().invoke(app, [*args, "--sensor-poses", str(poses), "--json", "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     assert "0.png was made of gear by its metadata, but is localized with connector_plug" in done.stderr
@@ -454,8 +467,8 @@ def test_the_pose_uncertainty_of_extrinsics_equals_their_propagated_errors(rng):
     for sensor in sensors:
         xi = se3.log(se3.inverse(T) @ sensor @ se3.exp(eta) @ se3.inverse(sensor) @ T)
         sampled.append(xi.T @ xi / len(xi))
-    told = extrinsics_covariance(T, sensors, rig)
-    whiten = np.linalg.inv(np.linalg.cholesky(told))
+    stated = extrinsics_covariance(T, sensors, rig)
+    whiten = np.linalg.inv(np.linalg.cholesky(stated))
     assert whiten @ np.mean(sampled, 0) @ whiten.T == pytest.approx(np.eye(6), abs=0.05)
 
 
@@ -466,7 +479,7 @@ def test_wrong_extrinsics_are_a_warning_and_right_ones_hardly_ever(plug):
     Were one right set of extrinsics in ten warned of, three of six would be once in 63 times.
     """
     rng = np.random.default_rng(5)
-    told, last = {"right": 0, "off": 0, "known to be": 0}, {}
+    warned, last = {"right": 0, "off": 0, "known to be": 0}, {}
     for scene in simultaneous_touches(plug.space, 6, 3, 9):
         masks = [touch.mask for touch in scene.touches]
         off = scene.T_world_sensor.copy()
@@ -482,8 +495,8 @@ def test_wrong_extrinsics_are_a_warning_and_right_ones_hardly_ever(plug):
                 posterior = last[name] = plug.localize(masks, "mask", T_world_sensor=T, extrinsics_std=rig)
             except NoPoseAgreesError:
                 continue
-            told[name] += any("agree badly" in warning for warning in posterior.warnings)
-    assert told["right"] <= 2 and told["off"] >= told["right"] + 3 and told["known to be"] == 0, told
+            warned[name] += any("agree badly" in warning for warning in posterior.warnings)
+    assert warned["right"] <= 2 and warned["off"] >= warned["right"] + 3 and warned["known to be"] == 0, warned
     exact = plug.localize(masks, "mask", T_world_sensor=off, extrinsics_std=ExtrinsicsStd())
     assert np.array_equal(exact.log_prob, last["off"].log_prob)
     # a mode is no more certain than the extrinsics

@@ -10,7 +10,7 @@ import trimesh
 from speed import slow_but
 from typer.testing import CliRunner
 
-from geomtact import InputError, Localizer, Mesh, UsageError
+from geomtact import InputError, Mesh, UsageError
 from geomtact.cli import app
 from geomtact.cli.several import objects_of
 from geomtact.errors import NoPoseAgreesError
@@ -24,17 +24,17 @@ from tools.studies.identify.study import Told, identify_scenes, summarise
 
 
 @pytest.fixture(scope="module")
-def drawer(cache_dir, few_touches):
+def drawer(make_localizer):
     """Three objects of different contacts."""
 
-    def part(name, shape):
+    def prepared(name, shape):
         mesh = Mesh(shape.vertices, shape.faces, name, "m")
-        return Localizer.prepare(mesh, sensor="gelslim", max_poses=4000, scorer="moments", cache_dir=cache_dir)
+        return make_localizer(mesh, "gelslim", max_poses=4000, touches=120, scorer="moments")
 
     return [
-        part("rod", trimesh.creation.box((60e-3, 3e-3, 3e-3))),
-        part("ball", trimesh.creation.icosphere(3, 12e-3)),
-        part("block", trimesh.creation.box((30e-3, 30e-3, 30e-3))),
+        prepared("rod", trimesh.creation.box((60e-3, 3e-3, 3e-3))),
+        prepared("ball", trimesh.creation.icosphere(3, 12e-3)),
+        prepared("block", trimesh.creation.box((30e-3, 30e-3, 30e-3))),
     ]
 
 
@@ -174,7 +174,7 @@ def test_objects_are_given_by_a_folder_or_by_names(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_line_identifies_the_object(drawer, tmp_path, monkeypatch):
+def test_the_command_line_identifies_the_object(drawer, few_touches, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "parts").mkdir()
     for localizer in drawer[:2]:
@@ -186,7 +186,7 @@ def test_the_command_line_identifies_the_object(drawer, tmp_path, monkeypatch):
     done = CliRunner().invoke(app, [*run, "--out", "out"])
     assert done.exit_code == 0, done.output
     said = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert said["object"]["name"] == "ball" and [part["name"] for part in said["candidates"]] == ["ball", "rod"]
+    assert said["object"]["name"] == "ball" and [each["name"] for each in said["candidates"]] == ["ball", "rod"]
     assert "log evidence" in done.stdout
     refused = CliRunner().invoke(app, [*run, "--prior", "out/posterior.npz"])
     assert refused.exit_code == 2 and "several objects exclude" in " ".join(refused.output.split())
@@ -194,21 +194,21 @@ def test_the_command_line_identifies_the_object(drawer, tmp_path, monkeypatch):
 
 @pytest.mark.studies
 def test_the_study_reports_the_figures_of_identify(drawer):
-    told = list(identify_scenes(drawer[1], drawer, 2, 3, MODERATE, "fast", first=1))
-    assert [[each.touches for each in some] for some in told] == [[1, 2, 3]]
-    assert all(each.scene == 1 and set(each.log_probability) == {"rod", "ball", "block"} for each in told[0])
-    last = told[0][-1].log_probability  # one touch may suit either; after three the ball is 1.9 nats ahead
+    scenes = list(identify_scenes(drawer[1], drawer, 2, 3, MODERATE, "fast", first=1))
+    assert [[each.touches for each in some] for some in scenes] == [[1, 2, 3]]
+    assert all(each.scene == 1 and set(each.log_probability) == {"rod", "ball", "block"} for each in scenes[0])
+    last = scenes[0][-1].log_probability  # one touch may suit either; after three the ball is 1.9 nats ahead
     assert last["ball"] > max(last["rod"], last["block"])
 
 
 @pytest.mark.studies
 def test_figures_of_the_study_follow_from_its_records():
-    def told(touches, a, b, unlike_a, unlike_b):
+    def record(touches, a, b, unlike_a, unlike_b):
         logs = np.array([a, b]) - np.logaddexp(a, b)
         return Told(0, touches, dict(zip("ab", logs.tolist(), strict=True)), {"a": unlike_a, "b": unlike_b})
 
-    of_a = [told(1, 0.0, -9.0, False, True), told(2, 0.0, -9.0, True, True), told(3, 0.0, 0.0, True, True)]
-    of_b = [told(1, 5.0, 0.0, False, False), told(2, 0.0, 0.1, True, False), told(3, -9.0, 0.0, True, False)]
+    of_a = [record(1, 0.0, -9.0, False, True), record(2, 0.0, -9.0, True, True), record(3, 0.0, 0.0, True, True)]
+    of_b = [record(1, 5.0, 0.0, False, False), record(2, 0.0, 0.1, True, False), record(3, -9.0, 0.0, True, False)]
     one, two, three = summarise({"a": of_a, "b": of_b})
     assert (one["right"][0], one["foreign"][0], one["alarmed"][0], one["sure_and_wrong"]) == (0.5, 0.5, 0, 0.5)
     assert (two["right"][0], two["foreign"][0], two["alarmed"][0], two["sure_and_wrong"]) == (1, 1, 0.5, 0)

@@ -13,7 +13,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from geomtact import InputError, Localizer, Mesh, Sensor
+from geomtact import InputError, Mesh, Sensor
 from geomtact.cli.frames import Frame, all_frames, camera_frames, newest, newest_in
 from geomtact.cli.live import localize_live
 from geomtact.cli.shell import one_line_errors
@@ -24,12 +24,12 @@ MINI = Sensor.load("gelsight-mini")
 
 
 @pytest.fixture(scope="module")
-def localizer(tmp_path_factory):
+def localizer(make_localizer):
     import trimesh
 
     box = trimesh.creation.box((8e-3, 6e-3, 5e-3))
     mesh = Mesh(box.vertices, box.faces, "box", "m")
-    return Localizer.prepare(mesh, sensor=MINI, max_poses=1500, scorer="iou", cache_dir=tmp_path_factory.mktemp("c"))
+    return make_localizer(mesh, MINI, max_poses=1500, scorer="iou")
 
 
 def test_the_newest_image_wins_and_skipped_ones_are_counted():

@@ -223,11 +223,11 @@ def test_the_pencil_is_constrained_at_its_ends(pencil):
 @pytest.fixture(scope="module")
 def on_a_facet(make_localizer, tmp_path_factory):
     """A pencil that is touched on one of its facets or the opposite one; and R (3, 3) that lays that facet on the sensor."""
-    part = load_mesh(pencil_file(tmp_path_factory.mktemp("pencil")), "mm")
-    facet = part.normals[np.argmax(part.areas)]
+    mesh = load_mesh(pencil_file(tmp_path_factory.mktemp("pencil")), "mm")
+    facet = mesh.normals[np.argmax(mesh.areas)]
     R = np.linalg.svd(facet[None])[2]
     R = np.stack([R[1], np.cross(-facet, R[1]), -facet])
-    return make_localizer(part, "gelslim", approach=[(facet, 0.0), (-facet, 0.0)], max_poses=10_000), R
+    return make_localizer(mesh, "gelslim", approach=[(facet, 0.0), (-facet, 0.0)], max_poses=10_000), R
 
 
 @pytest.mark.slow
@@ -304,7 +304,7 @@ def test_cells_are_drawn_by_their_probability(plug, posterior, rng):
     assert (held.reshape(5, 20) == held.reshape(5, 20)[0]).mean() > 0.9
 
 
-@pytest.mark.parametrize("n", slow_but((1500, 4000), 1500))
+@pytest.mark.parametrize("n", slow_but((600, 4000), 600))
 def test_a_refined_cell_is_drawn_as_registration_left_it(plug, a_touch, n):
     world = plug.localize(a_touch(plug)[1], T_world_sensor=T_MOVED)
     mode = next(mode for mode in world.modes() if mode.refined)
@@ -313,8 +313,9 @@ def test_a_refined_cell_is_drawn_as_registration_left_it(plug, a_touch, n):
     known = replace(world, cells=world.cells[row], log_prob=np.zeros(1), runs=None)
     T = draw_cells(known, 2, np.random.default_rng(0), n)
     white = np.linalg.solve(np.linalg.cholesky(mode.covariance), log(inverse(mode.T) @ T).reshape(-1, 6).T)
-    assert white.mean(1) == pytest.approx(np.zeros(6), abs=0.06)
-    assert np.cov(white) == pytest.approx(np.eye(6), abs=0.08)
+    error = 1 / np.sqrt(2 * n)  # of a mean; of a variance it is sqrt 2 of that
+    assert white.mean(1) == pytest.approx(np.zeros(6), abs=3.5 * error)
+    assert np.cov(white) == pytest.approx(np.eye(6), abs=3.5 * np.sqrt(2) * error)
 
 
 def test_touches_start_clear_of_the_object_and_meet_it(plug, posterior):
@@ -341,7 +342,7 @@ def test_touches_keep_to_the_approach(flat_nut, a_touch):
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "expected"),
     [
         (lambda: Touch(2 * np.eye(4)), "rotation"),
         (lambda: Touch(np.eye(3)), "T_world_sensor"),
@@ -353,8 +354,8 @@ def test_touches_keep_to_the_approach(flat_nut, a_touch):
         (lambda: Probe([0, 0, 0], [0, 0, 1], cost=np.inf), "cost"),
     ],
 )
-def test_impossible_actions_are_refused(make, told):
-    with pytest.raises(GeomtactError, match=told):
+def test_impossible_actions_are_refused(make, expected):
+    with pytest.raises(GeomtactError, match=expected):
         make()
 
 
@@ -410,8 +411,8 @@ def test_command_ranks_the_actions_of_a_file(command, saved, tmp_path):
         {"probe": {"point": [0, 0, 0.01], "direction": [0, 0, -1]}},
     ]
     file.write_text(json.dumps({"actions": actions}))
-    told = command(saved, "--actions", file, "--out", out).stdout
-    assert "nats" in told
+    printed = command(saved, "--actions", file, "--out", out).stdout
+    assert "nats" in printed
     content = json.loads((out / "next_touch.json").read_text())
     assert content["schema"] == "geomtact/next-touch/1"
     assert content["actions"][0]["number"] in (2, 3)
@@ -433,7 +434,7 @@ def test_the_command_prints_that_no_action_helps(command, saved, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [
         ("{", "JSON"),
         ("[]", "actions"),
@@ -446,13 +447,13 @@ def test_the_command_prints_that_no_action_helps(command, saved, tmp_path):
         (json.dumps({"actions": [{"T_world_sensor": np.eye(4).tolist(), "cost": "x"}]}), "numbers"),
     ],
 )
-def test_command_refuses_bad_files(command, saved, tmp_path, text, told):
+def test_command_refuses_bad_files(command, saved, tmp_path, text, expected):
     import re
 
     file = tmp_path / "actions.json"
     file.write_text(text)
     error = command(saved, "--actions", file, status=3).stderr
-    assert re.search(told, error), error
+    assert re.search(expected, error), error
     assert "actions.json" in error
 
 
@@ -492,9 +493,9 @@ def test_figures_of_runs_made_by_hand():
     assert ratio == pytest.approx(0.25) and low <= ratio <= high
 
 
-@pytest.mark.parametrize("part", ["connector_plug", "bracket"])
-def test_an_object_lies_on_its_lowest_face(part):
-    mesh = load_mesh(part)
+@pytest.mark.parametrize("name", ["connector_plug", "bracket"])
+def test_an_object_lies_on_its_lowest_face(name):
+    mesh = load_mesh(name)
     up = upwards(mesh)
     assert np.linalg.norm(up) == pytest.approx(1)
     # lying on a facet: three of its corners, at least, are down

@@ -16,6 +16,7 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.distribution import cell_log_density, middle_cells, row_log_density, row_poses
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.reweight import reweight_cells
+from geomtact.scoring.probability import posterior_log_prob
 from geomtact.se3 import exp, transform
 
 T_WORLD = exp([0.3, -1.2, 0.5, 0.4, -0.1, 0.7])
@@ -469,7 +470,9 @@ def test_a_truncated_posterior_is_refused(plug, posteriors, tmp_path):
 @pytest.fixture(scope="module")
 def exact(ball, a_touch):
     """The posterior of one touch of a ball, every cell scored, without refinement."""
-    return replace(ball.localize(a_touch(ball)[1], effort="exact"), refined={})
+    rows = ball.scorer.rows(ball.index, a_touch(ball)[1], "all")
+    log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
+    return Posterior(ball.index, rows.first, log_prob, runs=rows.runs)
 
 
 def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_touch, exact):
@@ -502,8 +505,8 @@ def test_of_mass_shared_anew_the_images_count_by_a_power_and_a_prior_in_full(exa
     log_prior = index.log_weight + nats
     known = replace(before, log_prob=before.log_prob + nats[before.cells])
     plain = cell_log_density(reweight_cells(before, cells, likelihood, image_power=0.5), cells)
-    told = cell_log_density(reweight_cells(known, cells, likelihood, image_power=0.5, log_prior=log_prior), cells)
-    shift = told - plain - nats[cells]
+    moved = cell_log_density(reweight_cells(known, cells, likelihood, image_power=0.5, log_prior=log_prior), cells)
+    shift = moved - plain - nats[cells]
     np.testing.assert_allclose(shift, shift[0], atol=1e-3)
 
 

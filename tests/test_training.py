@@ -255,9 +255,9 @@ def test_weights_for_one_object_are_refused_for_another(weights, tmp_path, ball)
 
 def test_scenes_are_made_once_and_repeat(tmp_path):
     mesh, sensor = load_mesh("hex_nut"), Sensor.load("gelsight-mini")
-    first = object_scenes(tmp_path, mesh, sensor, 20_000, 2, seed=4, processes=1)
+    first = object_scenes(tmp_path, mesh, sensor, 5_000, 2, seed=4, processes=1)
     times = {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()}
-    second = object_scenes(tmp_path, mesh, sensor, 20_000, 2, seed=4, processes=1)
+    second = object_scenes(tmp_path, mesh, sensor, 5_000, 2, seed=4, processes=1)
     assert {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()} == times and len(times) == 2
     for a, b in zip(first, second, strict=True):
         assert (a.stored == b.stored).all() and (a.true == b.true).all()
