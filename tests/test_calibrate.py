@@ -90,10 +90,10 @@ def test_slopes_are_those_of_the_ball(found):
 def test_heights_of_a_ball_it_was_not_calibrated_with(found, diameter):
     (image,), background = presses(diameter, [(90, 65)], seed=7)
     true, _ = pressed(diameter, (90, 65))
-    told = contact_height(image, background, found.sensor)
+    height = contact_height(image, background, found.sensor)
     on = np.hypot(*(np.indices(SHAPE)[::-1] - np.array([90, 65])[:, None, None])) * PITCH < 1.2 * MM
-    assert told.dtype == np.float32 and (told >= 0).all()
-    assert told[on] == pytest.approx(true[on], abs=0.08 * true.max())
+    assert height.dtype == np.float32 and (height >= 0).all()
+    assert height[on] == pytest.approx(true[on], abs=0.08 * true.max())
     assert contact_height(background, background, found.sensor).max() == 0
 
 
@@ -105,8 +105,8 @@ def test_a_bulging_membrane_takes_its_own_slope_off_the_balls():
     # treated as flat, its bulge passes for a tenth of the ball's curvature
     flat = calibrate_sensor(images, 8 * MM, background, PITCH)
     press = found.presses[0]
-    told = [measured_diameter(press, sensor) for sensor in (found.sensor, flat.sensor)]
-    assert told[0] == pytest.approx(8 * MM, rel=0.05)
+    diameters = [measured_diameter(press, sensor) for sensor in (found.sensor, flat.sensor)]
+    assert diameters[0] == pytest.approx(8 * MM, rel=0.05)
     assert np.linalg.norm(np.subtract(found.sensor.colour.weights, flat.sensor.colour.weights)) > 0.05
 
 
@@ -285,8 +285,8 @@ def test_the_command_writes_a_sensor_and_a_picture(tmp_path):
     sensor = Sensor.load(tmp_path / "mine.toml")
     assert sensor.name == "mine" and sensor.pixel_pitch == pytest.approx((PITCH, PITCH))
     assert read_image(tmp_path / "fit.png").ndim == 3
-    told = geomtact.contact_height(images[0], background, tmp_path / "mine.toml")
-    assert told.max() == pytest.approx(pressed(8 * MM, PLACES[0])[0].max(), rel=0.1)
+    height = geomtact.contact_height(images[0], background, tmp_path / "mine.toml")
+    assert height.max() == pytest.approx(pressed(8 * MM, PLACES[0])[0].max(), rel=0.1)
     options = ["--ball-mm", "8", "--background", str(tmp_path / "background.png")]
     folder = CliRunner().invoke(app, ["calibrate", str(tmp_path), *options])
     assert folder.exit_code == 2 and "expected images, got a folder; give" in folder.output
@@ -303,15 +303,15 @@ def test_the_command_writes_a_sensor_and_a_picture(tmp_path):
     assert "ends in .toml" in run("--out", tmp_path / "mine.txt").output
 
 
-@pytest.mark.parametrize(("used", "judged"), [(6.310, 9.500), (9.500, 6.310)])
+@pytest.mark.parametrize(("used", "measured"), [(6.310, 9.500), (9.500, 6.310)])
 @pytest.mark.slow
-def test_real_presses_of_one_ball_measure_the_other(data_folder, used, judged):
+def test_real_presses_of_one_ball_measure_the_other(data_folder, used, measured):
     folder = data_folder / "gelslam_gsmini_balls"
-    own, other = (sorted((folder / f"{d:.3f}mm").glob("*.png")) for d in (used, judged))
+    own, other = (sorted((folder / f"{d:.3f}mm").glob("*.png")) for d in (used, measured))
     background = folder / "background.png"
     table = calibrate_sensor(own, used * MM, background, sensor="gelsight-mini")
     assert np.median(table.diameters) == pytest.approx(used * MM, rel=0.05)
     assert len(table.presses) >= 0.8 * len(own)
-    found = calibrate_sensor(other, judged * MM, background, sensor="gelsight-mini").presses
-    told = [measured_diameter(press, table.sensor) for press in found]
-    assert np.median(told) == pytest.approx(judged * MM, rel=0.05)
+    found = calibrate_sensor(other, measured * MM, background, sensor="gelsight-mini").presses
+    diameters = [measured_diameter(press, table.sensor) for press in found]
+    assert np.median(diameters) == pytest.approx(measured * MM, rel=0.05)

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.studies
 SMALL = 4000  # poses
 
 
-def told(gains, ms, mssd=5.0):
+def answers_of(gains, ms, mssd=5.0):
     return [Timed(gain, 2.0, 0.5, mssd, 0.4, False, ms) for gain in gains]
 
 
@@ -43,10 +43,10 @@ def test_a_variant_differs_from_the_default_in_one_setting():
 
 
 ANSWERS = {
-    DEFAULT: told([2.0, 4.0, 3.0], 40.0),
-    "fast": told([1.0, 3.5, 2.0], 10.0),
-    "exact": told([2.5, 4.0, 3.1], 100.0),
-    "1 mode": told([1.9, 3.9, 2.9], 50.0),
+    DEFAULT: answers_of([2.0, 4.0, 3.0], 40.0),
+    "fast": answers_of([1.0, 3.5, 2.0], 10.0),
+    "exact": answers_of([2.5, 4.0, 3.1], 100.0),
+    "1 mode": answers_of([1.9, 3.9, 2.9], 50.0),
 }
 
 
@@ -61,21 +61,25 @@ def test_the_pareto_front_holds_the_variants_that_no_other_dominates():
 def test_only_a_faster_and_significantly_better_variant_beats_the_default():
     figures = summarise(ANSWERS)
     assert beaten_by(ANSWERS, figures) == []
-    better = {**ANSWERS, "moments": told([2.5, 4.5, 3.5], 30.0), "iou": told([9.0, 0.0, 0.5], 30.0)}
+    better = {**ANSWERS, "moments": answers_of([2.5, 4.5, 3.5], 30.0), "iou": answers_of([9.0, 0.0, 0.5], 30.0)}
     assert beaten_by(better, summarise(better)) == ["moments"]
 
 
 def test_a_variant_that_excludes_truths_or_has_another_uniform_beats_nothing():
-    bold = {**ANSWERS, "moments": told([-np.inf, 9.0, 9.0], 1.0), "within 30 degrees": told([9.0, 9.0, 9.0], 1.0)}
+    bold = {
+        **ANSWERS,
+        "moments": answers_of([-np.inf, 9.0, 9.0], 1.0),
+        "within 30 degrees": answers_of([9.0, 9.0, 9.0], 1.0),
+    }
     figures = summarise(bold)
     assert beaten_by(bold, figures) == []
     assert not {"moments", "within 30 degrees"} & set(front(figures))
     assert front(figures, "mssd_mm_median", -1) == ["within 30 degrees"]
-    assert modelled({DEFAULT: told([-np.inf], 1.0), "exact": told([1.0], 1.0)}) == {}
+    assert modelled({DEFAULT: answers_of([-np.inf], 1.0), "exact": answers_of([1.0], 1.0)}) == {}
 
 
 def test_a_truth_that_is_ruled_out_is_counted_apart():
-    f = summarise({DEFAULT: told([1.0, -np.inf, 3.0], 1.0)})[DEFAULT]
+    f = summarise({DEFAULT: answers_of([1.0, -np.inf, 3.0], 1.0)})[DEFAULT]
     assert (f["gain_mean"], f["ruled_out"]) == (2.0, pytest.approx(1 / 3))
 
 
@@ -105,14 +109,14 @@ def test_the_study_evaluates_every_variant_on_the_same_touches_and_resumes(few_w
     shown = CliRunner().invoke(studies, [*command, *pictures])
     assert shown.exit_code == 0, shown.output
     content = json.loads(out.read_text("utf-8"))
-    part = content["parts"]["hex_nut"]
-    assert {kind: [len(told) for told in scene["answers"]] for kind, scene in part["scenes"].items()} == {
+    entry = content["parts"]["hex_nut"]
+    assert {kind: [len(each) for each in scene["answers"]] for kind, scene in entry["scenes"].items()} == {
         "one touch": [4, 4],
         "three sensors": [2, 2],
         "known side": [2, 2],
     }
-    assert all(way["prepare_s"] > 0 for way in part["ways"].values())
-    assert part["ways"]["symmetry ignored"]["poses"] > 0
+    assert all(way["prepare_s"] > 0 for way in entry["ways"].values())
+    assert entry["ways"]["symmetry ignored"]["poses"] > 0
     assert (tmp_path / "a.png").read_bytes() == draw_costs(content)
     assert (tmp_path / "b.png").read_bytes() == draw_modelled(content)
     monkeypatch.setattr(choices, "prepare", None)  # a study that is done prepares nothing
@@ -131,9 +135,9 @@ def test_own_network_weights_are_further_variants(tmp_path):
     assert set(ways) - set(WAYS) == {"encoder small", "the thesis's network"}
     assert ways["encoder small"] == replace(ways["encoder"], choice="encoder", scorer=str(small))
     assert ways["the thesis's network"].max_poses == 150_000
-    told_more = {"encoder": told([1.0, 2.0], 1.0), "encoder small": told([0.5, 1.0], 1.0)}
-    assert modelled(told_more)["encoder small, not encoder"]["adds"][0] == pytest.approx(-0.75)
-    assert front(summarise({DEFAULT: told([1.0, 2.0], 1.0), **told_more}))[0] == DEFAULT
+    more = {"encoder": answers_of([1.0, 2.0], 1.0), "encoder small": answers_of([0.5, 1.0], 1.0)}
+    assert modelled(more)["encoder small, not encoder"]["adds"][0] == pytest.approx(-0.75)
+    assert front(summarise({DEFAULT: answers_of([1.0, 2.0], 1.0), **more}))[0] == DEFAULT
 
 
 def test_a_few_variants_are_evaluated_where_they_differ():

@@ -214,10 +214,10 @@ def test_pixels_given_as_millimetres_are_too_steep_or_too_deep(depth):
 @pytest.mark.parametrize("elastic", [False, True])
 def test_no_simulated_depth_map_raises_a_doubt(elastic):
     warnings = []
-    for part in ("elbow_pipe", "gear", "hex_nut"):  # whose contacts are the steepest
-        space = ContactSpace(load_mesh(part), MINI)
+    for name in ("elbow_pipe", "gear", "hex_nut"):  # whose contacts are the steepest
+        space = ContactSpace(load_mesh(name), MINI)
         for T in space.sample(3, np.random.default_rng(4), (0.3e-3, 1.5e-3))[0]:
-            depths_of(simulate_depth_map(space, T, elastic), part, MINI, warnings)
+            depths_of(simulate_depth_map(space, T, elastic), name, MINI, warnings)
     step = np.where(ROWS < 120, 1.5e-3, 0)  # a sharp edge, as steep as the pixels allow
     depths_of(step, "step", MINI, warnings)
     assert warnings == []

@@ -189,11 +189,11 @@ def test_a_stored_contact_is_most_like_itself(descriptor, flat_nut, rng):
     """Among some of the poses of an index; blind descriptors find others as like."""
     index = flat_nut.index
     masks = index.masks(rng.choice(len(index), 200, replace=False))
-    part = SimpleNamespace(sensor=index.sensor, resolution=index.resolution, height=np.zeros((2, 100)))
+    grid = SimpleNamespace(sensor=index.sensor, resolution=index.resolution, height=np.zeros((2, 100)))
     scorer = VectorScorer(descriptor, descriptor.describe(masks, index.sensor))
     assert scorer.name == descriptor.name
     for i in (0, 70, 199):
-        score = scorer.score(part, masks[i])
+        score = scorer.score(grid, masks[i])
         assert score.shape == (2, 100) and np.ptp(score) > 0
         assert score.ravel()[i] == pytest.approx(float(score.max()), abs=1e-4 * float(np.ptp(score)))
         assert abs(score.ravel()[i]) < 1e-4 * np.ptp(score)

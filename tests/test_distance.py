@@ -9,7 +9,7 @@ from geomtact.geometry.mesh_file import load_mesh
 from geomtact.se3 import apply, exp, random_rotations, transform
 
 PARTS = ["connector_plug", "hex_nut", "gear", "damping_pin", "ball"]
-each_part = pytest.mark.parametrize("part", PARTS)
+each_object = pytest.mark.parametrize("name", PARTS)
 
 
 def near_poses(n, rng, spread=0.3):
@@ -38,17 +38,17 @@ def test_without_symmetry_it_is_the_plain_mean(rng):
     assert distance.largest(T, others) == pytest.approx(d.max(1), rel=1e-12)
 
 
-@pytest.mark.parametrize("part", ["hex_nut", "gear", "damping_pin"])
-def test_it_is_the_least_over_the_symmetry_group(part, rng):
+@pytest.mark.parametrize("name", ["hex_nut", "gear", "damping_pin"])
+def test_it_is_the_least_over_the_symmetry_group(name, rng):
     """Images are aligned in mean square, so the mean is a little above its own minimum."""
-    distance = PoseDistance(load_mesh(part), 128)
+    distance = PoseDistance(load_mesh(name), 128)
     others = transform(random_rotations(40, rng), 5e-3 * rng.normal(size=(40, 3)))
     mean, largest = distance.mean(np.eye(4), others), distance.largest(np.eye(4), others)
     least = by_brute_force(distance, np.eye(4), others, np.mean)
     assert (mean > least - 1e-5).all() and (mean < 1.1 * least + 1e-5).all()
     assert (largest > by_brute_force(distance, np.eye(4), others, np.max) - 1e-5).all()
 
-    images = load_mesh(part).symmetry.sampled(7)
+    images = load_mesh(name).symmetry.sampled(7)
     near = near_poses(40, rng, 0.05) @ images[rng.integers(len(images), size=40)]
     least = by_brute_force(distance, np.eye(4), near, np.mean)
     assert distance.mean(np.eye(4), near) == pytest.approx(least, rel=0.01, abs=1e-5)
@@ -56,28 +56,28 @@ def test_it_is_the_least_over_the_symmetry_group(part, rng):
     assert distance.largest(np.eye(4), near) == pytest.approx(least, rel=0.05, abs=1e-5)
 
 
-@each_part
-def test_a_pose_and_its_images_are_no_distance_apart(part, rng):
-    mesh = load_mesh(part)
+@each_object
+def test_a_pose_and_its_images_are_no_distance_apart(name, rng):
+    mesh = load_mesh(name)
     distance = PoseDistance(mesh)
     T = near_poses(1, rng)[0]
     assert distance.mean(T, T @ mesh.symmetry.sampled(24)).max() < 1e-9
     assert distance.largest(T, T @ mesh.symmetry.sampled(24)).max() < 1e-9
 
 
-@each_part
-def test_distances_do_not_change_with_the_frame_nor_with_the_order(part, rng):
-    distance = PoseDistance(load_mesh(part))
+@each_object
+def test_distances_do_not_change_with_the_frame_nor_with_the_order(name, rng):
+    distance = PoseDistance(load_mesh(name))
     T, world, others = near_poses(1, rng)[0], exp(rng.normal(size=6)), near_poses(50, rng)
     assert distance.mean(world @ T, world @ others) == pytest.approx(distance.mean(T, others), abs=1e-9)
     back = np.array([distance.mean(o, T[None])[0] for o in others])
     assert back == pytest.approx(distance.mean(T, others), rel=0.03)
 
 
-@each_part
+@each_object
 @pytest.mark.parametrize("spread", [0.05, 0.5])
-def test_within_is_the_mean_below_the_radius(part, spread, rng):
-    mesh = load_mesh(part)
+def test_within_is_the_mean_below_the_radius(name, spread, rng):
+    mesh = load_mesh(name)
     distance = PoseDistance(mesh, 128)
     T, others = np.eye(4), near_poses(400, rng, spread)
     images = others @ mesh.symmetry.sampled(6)[rng.integers(len(mesh.symmetry.sampled(6)), size=400)]
@@ -87,10 +87,10 @@ def test_within_is_the_mean_below_the_radius(part, spread, rng):
         assert (distance.within(T, images, radius) == (d <= radius))[clear].all()
 
 
-@each_part
-def test_the_turn_alone_bounds_the_distance(part, rng):
+@each_object
+def test_the_turn_alone_bounds_the_distance(name, rng):
     """What modes are searched by: a rotation turned() puts beyond three radii has no pose within one."""
-    mesh = load_mesh(part)
+    mesh = load_mesh(name)
     distance, radius = PoseDistance(mesh, 128), mode_radius(mesh)
     R = random_rotations(2000, rng)
     R[:1000] = Rotation.from_rotvec(0.15 * rng.normal(size=(1000, 3))).as_matrix()
@@ -105,9 +105,9 @@ def test_the_turn_alone_bounds_the_distance(part, rng):
         assert turned == pytest.approx(rms, rel=1e-9)
 
 
-@each_part
-def test_symmetry_leaves_the_anchor_in_place(part):
-    mesh = load_mesh(part)
+@each_object
+def test_symmetry_leaves_the_anchor_in_place(name):
+    mesh = load_mesh(name)
     distance = PoseDistance(mesh)
     moved = apply(mesh.symmetry.sampled(12), distance.anchor[None])[:, 0]
     assert np.abs(moved - distance.anchor).max() < 1e-9

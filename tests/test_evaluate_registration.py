@@ -63,14 +63,15 @@ def test_a_ball_constrains_its_position_and_not_its_rotation(ball, elastic):
     T = pressed_in_the_middle(ball)
     problem = make_problem(simulate_mask(ball, T, elastic), SENSOR)
     spread = Spread(0.8e-3 / problem.length / np.sqrt(12), 0.8e-3 / np.sqrt(12))
-    told, rest = split(fisher_information(ball, T, elastic, problem, MODERATE), spread, problem.length)
-    assert np.trace(told) == pytest.approx(3) and np.allclose(told @ told, told) and np.allclose(told + rest, np.eye(6))
+    observable, rest = split(fisher_information(ball, T, elastic, problem, MODERATE), spread, problem.length)
+    assert np.trace(observable) == pytest.approx(3) and np.allclose(observable @ observable, observable)
+    assert np.allclose(observable + rest, np.eye(6))
     centre = T @ np.append(ball.mesh.centre, 1)
     for axis in np.eye(3):
         # a turn about the contact's centre that is undone by a shift leaves the ball where it is
         zeta = np.append(axis * problem.length, np.cross(axis, problem.centre - centre[:3]))
         zeta /= np.linalg.norm(zeta)
-        assert np.linalg.norm(told @ zeta) < 0.15
+        assert np.linalg.norm(observable @ zeta) < 0.15
 
 
 def test_information_is_that_of_the_outline(ball):
@@ -87,8 +88,8 @@ def test_information_is_that_of_the_outline(ball):
 
 
 def test_a_touch_that_no_motion_changes_constrains_nothing():
-    told, rest = split(np.zeros((6, 6)), Spread(0.1, 1e-3), 5e-3)
-    assert (told == 0).all() and np.allclose(rest, np.eye(6))
+    observable, rest = split(np.zeros((6, 6)), Spread(0.1, 1e-3), 5e-3)
+    assert (observable == 0).all() and np.allclose(rest, np.eye(6))
 
 
 def test_observability_depends_on_the_grid_and_not_on_the_unit_of_rotation():
@@ -96,8 +97,8 @@ def test_observability_depends_on_the_grid_and_not_on_the_unit_of_rotation():
     spread, length = Spread(np.radians(6) / np.sqrt(12), 4e-3 / np.sqrt(12)), 2e-3
     step = np.repeat([np.radians(6) * length, 4e-3], 3)
     for factor, expected in ((0.99, 6), (1.01, 0)):
-        told, _ = split(np.diag((factor * step / 4) ** -2.0), spread, length)
-        assert np.trace(told) == pytest.approx(expected)
+        observable, _ = split(np.diag((factor * step / 4) ** -2.0), spread, length)
+        assert np.trace(observable) == pytest.approx(expected)
 
 
 def test_agreement_counts_directions():
@@ -132,10 +133,12 @@ def test_a_symmetry_direction_is_not_observable(name, turned):
     grid = Grid(
         Directions.make(space.mesh.symmetry, None, 1, 0.25), choose_resolution(space.mesh, space.sensor, None, 20_000)
     )
-    told, _ = split(fisher_information(space, T, False, problem, MODERATE), Spread(np.radians(4), 2e-3), problem.length)
+    observable, _ = split(
+        fisher_information(space, T, False, problem, MODERATE), Spread(np.radians(4), 2e-3), problem.length
+    )
     other = T @ se3.exp([*turned, 0, 0, 0])
     assert (simulate_mask(space, other, False) ^ mask).mean() < 1e-3 and grid.spread.rotation > 0
-    assert np.linalg.norm(told @ motion_of(T, other, problem)) < 0.15e-3
+    assert np.linalg.norm(observable @ motion_of(T, other, problem)) < 0.15e-3
 
 
 def test_every_method_starts_from_the_same_pose_at_the_stated_distance(nut):

@@ -65,8 +65,8 @@ def whole(evaluate, folder):
     return json.loads(out.read_text()), done.stdout, plot
 
 
-def outcomes(content, part, name):
-    return study_file.outcomes(content["parts"][part]["scores"][name], scores.Scored)
+def outcomes(content, object_name, name):
+    return study_file.outcomes(content["parts"][object_name]["scores"][name], scores.Scored)
 
 
 def test_the_file_records_every_input_of_its_figures(whole, folder):
@@ -82,12 +82,12 @@ def test_the_file_records_every_input_of_its_figures(whole, folder):
         3000,
     ]
     assert list(content["parts"]) == ["ball", "hex_nut"]
-    for part, found in content["parts"].items():
-        assert found["object_sha256"] == load_mesh(part).sha256
+    for object_name, found in content["parts"].items():
+        assert found["object_sha256"] == load_mesh(object_name).sha256
         assert list(found["scores"]) == NAMES
         for name, entry in found["scores"].items():
             localizer = Localizer.prepare(
-                part, sensor="gelsight-mini", scorer=name, max_poses=3000, cache_dir=folder / "cache"
+                object_name, sensor="gelsight-mini", scorer=name, max_poses=3000, cache_dir=folder / "cache"
             )
             assert entry["settings"] == json.loads(json.dumps(describe(localizer)))
             assert entry["settings"]["index"] == localizer.index.key and entry["settings"]["calibration"]["temperature"]
@@ -103,16 +103,16 @@ def test_the_file_records_every_input_of_its_figures(whole, folder):
 
 def test_all_scores_are_evaluated_on_the_same_elastic_touches(whole):
     content, _, _ = whole
-    for part in content["parts"]:
-        depths = [[o.penetration_mm for o in outcomes(content, part, name)] for name in NAMES]
+    for object_name in content["parts"]:
+        depths = [[o.penetration_mm for o in outcomes(content, object_name, name)] for name in NAMES]
         assert depths[0] == depths[1] == depths[2]
-        assert all(o.elastic for name in NAMES for o in outcomes(content, part, name))
+        assert all(o.elastic for name in NAMES for o in outcomes(content, object_name, name))
 
 
 def test_a_score_is_compared_with_iou_touch_by_touch(whole):
     content, _, _ = whole
-    for part, found in content["parts"].items():
-        gain = {name: np.array([o.gain for o in outcomes(content, part, name)]) for name in NAMES}
+    for object_name, found in content["parts"].items():
+        gain = {name: np.array([o.gain for o in outcomes(content, object_name, name)]) for name in NAMES}
         for name, entry in found["scores"].items():
             figures, difference = entry["figures"]["all"], gain[name] - gain["iou"]
             assert figures["over_iou_mean"] == pytest.approx(difference.mean(), abs=1e-12)
@@ -126,12 +126,12 @@ def test_over_all_objects_means_are_of_objects_and_coverage_is_of_touches(whole)
     assert list(content["overall"]) == NAMES
     for name, entry in content["overall"].items():
         together = entry["figures"]["all"]
-        each = [part["scores"][name] for part in content["parts"].values()]
+        each = [entry["scores"][name] for entry in content["parts"].values()]
         for key in ("gain_mean", "over_iou_mean", "mssd_mm_median", "mssd10_mm_median", "score_ms_median"):
             assert together[key] == pytest.approx(np.mean([e["figures"]["all"][key] for e in each]))
         errors = [e["figures"]["all"]["gain_standard_error"] for e in each]
         assert together["gain_standard_error"] == pytest.approx(np.sqrt(np.square(errors).sum()) / 2)
-        level = [o.level for part in content["parts"] for o in outcomes(content, part, name)]
+        level = [o.level for object_name in content["parts"] for o in outcomes(content, object_name, name)]
         assert together["n"] == len(level) == 2 * TOUCHES
         assert [c["share"] for c in together["coverage"]] == [np.mean(np.array(level) <= m) for m in LEVELS]
         assert entry["prepare_s"]["index"] == np.mean([e["prepare_s"]["index"] for e in each])
@@ -163,9 +163,9 @@ def stopped(whole, tmp_path):
 
 def test_a_stopped_study_goes_on_and_ends_as_the_whole_one(whole, stopped, evaluate, monkeypatch):
     asked, before = [], {}
-    for part in whole[0]["parts"]:
+    for object_name in whole[0]["parts"]:
         for name in NAMES:
-            before[part, name] = outcomes(whole[0], part, name)
+            before[object_name, name] = outcomes(whole[0], object_name, name)
 
     def judged(localizer, touches, effort, seed):
         asked.append((localizer.mesh.name, localizer.scorer.name, len(touches)))
@@ -227,23 +227,23 @@ def test_touches_of_both_kinds_are_reported_apart(evaluate, tmp_path):
 def test_other_settings_leave_the_file_as_it_is(whole, evaluate, folder):
     out = folder / "whole.json"
     before = out.read_text()
-    told = evaluate("ball", "--scores", "iou", "--out", out, touches=7, status=3).stderr
-    assert "other settings (touches)" in told and told.count("\n") == 1
+    printed = evaluate("ball", "--scores", "iou", "--out", out, touches=7, status=3).stderr
+    assert "other settings (touches)" in printed and printed.count("\n") == 1
     assert out.read_text() == before
     other = folder / "other_part.json"
     held = json.loads(before)
     held["parts"]["ball"]["object_sha256"] = "0" * 64
     other.write_text(json.dumps(held))
-    told = evaluate("ball", "--scores", "iou", "--out", other, status=3).stderr
-    assert "a study of ball with other settings (object_sha256)" in told and told.count("\n") == 1
+    printed = evaluate("ball", "--scores", "iou", "--out", other, status=3).stderr
+    assert "a study of ball with other settings (object_sha256)" in printed and printed.count("\n") == 1
     assert json.loads(other.read_text()) == held
 
 
 def test_unknown_words_are_named(evaluate):
-    told = evaluate("ball", "--scores", "momens", status=2).stderr
-    assert "no score named 'momens'; did you mean 'moments'?" in told
-    told = evaluate("ball", "--scores", "l1", "iuo", status=2).stderr
-    assert "no score or part named 'iuo'; did you mean 'iou'?" in told
+    printed = evaluate("ball", "--scores", "momens", status=2).stderr
+    assert "no score named 'momens'; did you mean 'moments'?" in printed
+    printed = evaluate("ball", "--scores", "l1", "iuo", status=2).stderr
+    assert "no score or part named 'iuo'; did you mean 'iou'?" in printed
     done = CliRunner().invoke(studies, ["localize", "ball", "--scores", "iou"])
     assert done.exit_code == 2 and "No such option: --scores" in done.stderr
     done = CliRunner().invoke(studies, ["localize"])

@@ -230,23 +230,23 @@ def test_a_study_on_the_command_line_is_resumed_and_repeats(localizer, cache, tm
     assert done.exit_code == 0, done.output
     whole = json.loads(out.read_text())
     assert picture.read_bytes() == draw(whole)
-    part = whole["parts"]["ball"]
+    entry = whole["parts"]["ball"]
     assert whole["schema"] == "geomtact/study/3" and whole["versions"]["numpy"] == np.__version__
-    assert part["settings"]["object_sha256"] == localizer.mesh.sha256 and part["settings"]["seed"] == 1
-    assert len(part["outcomes"]) == 6 and part["figures"]["all"]["n"] == 6
+    assert entry["settings"]["object_sha256"] == localizer.mesh.sha256 and entry["settings"]["seed"] == 1
+    assert len(entry["outcomes"]) == 6 and entry["figures"]["all"]["n"] == 6
 
     asked = []
     monkeypatch.setattr(
         proper,
         "judge",
-        lambda localizer, made, effort, seed, first: asked.append(len(made) - first) or _as_before(part, first),
+        lambda localizer, made, effort, seed, first: asked.append(len(made) - first) or _as_before(entry, first),
     )
     stopped = json.loads(out.read_text())
-    stopped["parts"]["ball"]["outcomes"] = part["outcomes"][:4]
+    stopped["parts"]["ball"]["outcomes"] = entry["outcomes"][:4]
     out.write_text(json.dumps(stopped))
     assert CliRunner().invoke(studies, [*common, "--out", str(out)]).exit_code == 0
     assert asked == [2]
-    assert json.loads(out.read_text())["parts"]["ball"] == part
+    assert json.loads(out.read_text())["parts"]["ball"] == entry
     stopped["schema"] = "geomtact/study/2"
     (tmp_path / "older.json").write_text(json.dumps(stopped))
     older = CliRunner().invoke(studies, [*common, "--out", str(tmp_path / "older.json")])
@@ -277,8 +277,8 @@ def test_a_study_goes_on_on_another_processor(off, goes_on):
             study_file.begun(entry, settings)
 
 
-def _as_before(part, first):
-    return iter([proper.Judged(**o) for o in part["outcomes"][first:]])
+def _as_before(entry, first):
+    return iter([proper.Judged(**o) for o in entry["outcomes"][first:]])
 
 
 def test_a_file_that_is_no_study_is_left_alone(cache, tmp_path):
@@ -332,20 +332,20 @@ def test_touches_of_a_known_contact_face_are_evaluated_before_and_after_refineme
     args = ["thesis", "hex_nut", "--sides", "2", "--touches", "1", "--out", str(out)]
     done = CliRunner().invoke(studies, args)
     assert done.exit_code == 0, done.output
-    part = json.loads(out.read_text("utf-8"))["parts"]["hex_nut"]
+    entry = json.loads(out.read_text("utf-8"))["parts"]["hex_nut"]
     distance = PoseDistance(flat_nut.mesh)
-    assert [o["side"] for o in part["outcomes"]] == [0, 1]
-    for outcome in part["outcomes"]:
+    assert [o["side"] for o in entry["outcomes"]] == [0, 1]
+    for outcome in entry["outcomes"]:
         best, _, _, answer, best10, answer10, of_modes, of_answers_modes = outcome["error_mm"]
         # ten modes hold the first
         assert of_modes <= best + 1e-6 and of_answers_modes <= answer + 1e-6
         touch = next(known_approach.touches_of_side(flat_nut, outcome["side"], 1, 1, MODERATE, True))
         grid = flat_nut.localize(touch.mask, "mask", effort=replace(EFFORTS["exact"], modes=0))
-        told = flat_nut.localize(touch.mask, "mask", effort="exact")
-        near = [1e3 * distance.mean(touch.T_sensor_object, p.likeliest(10)).min() for p in (grid, told)]
+        refined = flat_nut.localize(touch.mask, "mask", effort="exact")
+        near = [1e3 * distance.mean(touch.T_sensor_object, p.likeliest(10)).min() for p in (grid, refined)]
         assert near == pytest.approx([best10, answer10], abs=1e-6)
         assert 0 < outcome["random_mm"] < 100
     # a study that is whole is not made again
     monkeypatch.setattr(Localizer, "prepare", None)
     assert CliRunner().invoke(studies, args).exit_code == 0
-    assert json.loads(out.read_text("utf-8"))["parts"]["hex_nut"] == part
+    assert json.loads(out.read_text("utf-8"))["parts"]["hex_nut"] == entry

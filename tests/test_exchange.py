@@ -55,8 +55,8 @@ def test_a_ros_covariance_is_that_of_the_moved_poses(poses, rng):
     drawn = mode.T @ se3.exp(rng.multivariate_normal(np.zeros(6), mode.covariance, 100_000))
     turns = se3.log(se3.transform(drawn[:, :3, :3] @ mode.T[:3, :3].T, np.zeros(3)))[:, :3]
     found = np.cov(np.concatenate([drawn[:, :3, 3], turns], 1).T)
-    told = np.reshape(message["pose"]["covariance"], (6, 6))
-    np.testing.assert_allclose(found, told, atol=0.03 * np.abs(told).max())
+    stated = np.reshape(message["pose"]["covariance"], (6, 6))
+    np.testing.assert_allclose(found, stated, atol=0.03 * np.abs(stated).max())
     position, q = message["pose"]["pose"]["position"], message["pose"]["pose"]["orientation"]
     assert [position[k] for k in "xyz"] == mode.T[:3, 3].tolist()
     assert [q[k] for k in "xyzw"] == se3.quat_xyzw(mode.T).tolist()
@@ -77,7 +77,7 @@ def test_a_table_has_a_row_for_each_mode(poses):
 
 
 @pytest.mark.parametrize(
-    ("read", "text", "told"),
+    ("read", "text", "expected"),
     [
         (from_tum, "0 1 2 3\n", "line 1: expected timestamp tx ty tz qx qy qz qw, eight numbers"),
         (from_tum, "# t\n\n0 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 x\n", "line 4: expected timestamp .*, eight numbers"),
@@ -104,10 +104,10 @@ def test_a_table_has_a_row_for_each_mode(poses):
         ),
     ],
 )
-def test_broken_files_are_errors(read, text, told, tmp_path):
+def test_broken_files_are_errors(read, text, expected, tmp_path):
     path = tmp_path / "broken.txt"
     with pytest.raises(InputError, match="no such file"):
         read(path)
     path.write_text(text)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=expected):
         read(path)

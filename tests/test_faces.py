@@ -20,13 +20,13 @@ MM = 1e-3
 TURNED = Rotation.from_euler("xyz", [20, 35, 50], degrees=True).as_matrix()
 
 
-def part(solid: trimesh.Trimesh, R=None) -> Mesh:
+def mesh_of(solid: trimesh.Trimesh, R=None) -> Mesh:
     vertices = MM * np.asarray(solid.vertices)
     return Mesh(vertices if R is None else vertices @ R.T, solid.faces, "part", "mm")
 
 
 def test_a_box_has_six_faces_as_wide_as_its_sides():
-    faces = plane_faces(part(trimesh.creation.box((40, 30, 8))))
+    faces = plane_faces(mesh_of(trimesh.creation.box((40, 30, 8))))
     assert len(faces) == 6
     assert [face.area for face in faces] == pytest.approx(MM**2 * np.repeat([1200, 320, 240], 2))
     assert [face.half_width for face in faces] == pytest.approx(MM * np.repeat([15, 4, 4], 2))
@@ -41,7 +41,7 @@ def test_the_object_frame_and_the_triangles_make_no_difference(cuts):
     solid = trimesh.creation.box((40, 30, 8))
     for _ in range(cuts):
         solid = solid.subdivide()
-    here, there = plane_faces(part(solid)), plane_faces(part(trimesh.creation.box((40, 30, 8)), TURNED))
+    here, there = plane_faces(mesh_of(solid)), plane_faces(mesh_of(trimesh.creation.box((40, 30, 8)), TURNED))
     assert len(here) == len(there) == 6
     for face in there:
         same = min(here, key=lambda other: np.linalg.norm(TURNED @ other.normal - face.normal))
@@ -52,7 +52,7 @@ def test_the_object_frame_and_the_triangles_make_no_difference(cuts):
 
 def facing_z(solid, sign):
     """Area and half width, mm, of the faces that look along +z or -z, the largest first."""
-    faces = [face for face in plane_faces(part(solid)) if sign * face.normal[2] > 0.99]
+    faces = [face for face in plane_faces(mesh_of(solid)) if sign * face.normal[2] > 0.99]
     return [(face.area / MM**2, face.half_width / MM) for face in faces]
 
 
@@ -74,7 +74,7 @@ def test_a_rail_hides_no_pad_beside_it():
     rail.apply_translation((0, 10.5, 5))
     pad.apply_translation((0, -2, 4))
     base.vertices[base.vertices[:, 2] > 0, 1] *= 0.02  # a ridge: its own top is an edge too
-    mesh = part(trimesh.boolean.union([base, rail, pad])).with_symmetry()
+    mesh = mesh_of(trimesh.boolean.union([base, rail, pad])).with_symmetry()
     up = [face for face in plane_faces(mesh) if face.normal[2] > 0.99]
     assert up[0].half_width < MM and max(face.half_width for face in up) > 6 * MM
     assert any(v[2] > 0.99 for v, _ in disks_about_faces(mesh, Sensor.load("gelslim"), None, 2))
@@ -89,15 +89,15 @@ def test_nearly_parallel_faces_share_a_disk():
             for y, z in ((-25, 0), (25, 0), (-25, -30), (25, -30), (0, 25 * np.tan(np.radians(0.5))))
         ]
     )
-    up = [face for face in plane_faces(part(roof)) if face.normal[2] > 0.9]
+    up = [face for face in plane_faces(mesh_of(roof)) if face.normal[2] > 0.9]
     assert len(up) == 2
-    disks = disks_about_faces(part(roof).with_symmetry(), Sensor.load("gelslim"), None, 2)
+    disks = disks_about_faces(mesh_of(roof).with_symmetry(), Sensor.load("gelslim"), None, 2)
     assert sum(v[2] > 0.9 for v, _ in disks) == 1
 
 
 def test_what_is_round_has_no_wide_face():
-    assert all(face.half_width < 1.2 * MM for face in plane_faces(part(trimesh.creation.icosphere(4, 10))))
-    rod = plane_faces(part(trimesh.creation.cylinder(10, 60, 64)))
+    assert all(face.half_width < 1.2 * MM for face in plane_faces(mesh_of(trimesh.creation.icosphere(4, 10))))
+    rod = plane_faces(mesh_of(trimesh.creation.cylinder(10, 60, 64)))
     assert [face.half_width > MM for face in rod].count(True) == 2  # its ends; of the mantle each strip is one
 
 
@@ -137,7 +137,7 @@ def test_faces_that_the_approach_rules_out_take_no_place():
 
 
 def test_a_window_or_a_level_that_needs_no_disks_has_none():
-    plate = part(trimesh.creation.box((60, 45, 30)), TURNED).with_symmetry()
+    plate = mesh_of(trimesh.creation.box((60, 45, 30)), TURNED).with_symmetry()
     assert len(disks_about_faces(plate, Sensor.load("gelslim"), None, 2)) == 3  # opposite sides are one by symmetry
     assert disks_about_faces(plate, Sensor.load("digit"), None, 4) == []
     pinhole = Sensor("pinhole", (64, 48), (0.05 * MM, 0.05 * MM), 20 * MM, 2 * MM)

@@ -86,7 +86,7 @@ def test_a_file_of_gsrobotics_shows_its_crop_of_the_minis_frame(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "expected"),
     [
         (
             {"camera_width": None},
@@ -100,9 +100,9 @@ def test_a_file_of_gsrobotics_shows_its_crop_of_the_minis_frame(tmp_path):
         ({"border_fraction": "a"}, "what this one holds is not valid"),
     ],
 )
-def test_an_error_in_a_file_of_gsrobotics_is_named(tmp_path, wrong, told):
+def test_an_error_in_a_file_of_gsrobotics_is_named(tmp_path, wrong, expected):
     text = json.dumps({key: value for key, value in (GSROBOTICS | wrong).items() if value is not None})
-    with pytest.raises(SensorError, match=told) as error:
+    with pytest.raises(SensorError, match=expected) as error:
         Sensor.load(written(tmp_path, text, "config.json"))
     assert "\n" not in str(error.value) and "config.json" in str(error.value)
 
@@ -180,7 +180,7 @@ def test_it_may_be_written_out_as_toml(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [
         ("x: {", "not valid YAML"),
         ("foo: 1", "expected one of gs_sdk with ppmm, imgw and imgh, or one of TACTO"),
@@ -212,8 +212,8 @@ def test_it_may_be_written_out_as_toml(tmp_path):
         ("!!python/object/apply:os.system ['true']", "not valid YAML"),
     ],
 )
-def test_a_faulty_sensor_file_is_one_line(tmp_path, text, told):
-    with pytest.raises(SensorError, match=told) as error:
+def test_a_faulty_sensor_file_is_one_line(tmp_path, text, expected):
+    with pytest.raises(SensorError, match=expected) as error:
         Sensor.load(written(tmp_path, text))
     assert "\n" not in str(error.value) and "mine.yaml" in str(error.value)
 

@@ -126,12 +126,12 @@ def test_training_goes_on_from_weights_that_are_given(parts, tmp_path):
     x = torch.randn(2, CHANNELS, 24, 32, generator=torch.Generator().manual_seed(1))
     grown = [train_mask(parts, still, tmp_path / name, start=shallow)[0] for name in ("grown", "again")]
     with torch.inference_mode():
-        told, blind = grown[0](x), grown[1](x * (torch.arange(CHANNELS) < 6)[:, None, None])
-        assert torch.equal(told, blind)
+        seen_whole, blind = grown[0](x), grown[1](x * (torch.arange(CHANNELS) < 6)[:, None, None])
+        assert torch.equal(seen_whole, blind)
         less = first.eval()
         for block in less.deeper.parameters():
             block.zero_()
-        assert torch.allclose(less(x * (torch.arange(CHANNELS) < 6)[:, None, None]), told, atol=2e-2)
+        assert torch.allclose(less(x * (torch.arange(CHANNELS) < 6)[:, None, None]), seen_whole, atol=2e-2)
     with pytest.raises(InputError, match="--start: the weights of another network"):
         train_mask(parts, still, tmp_path / "other", start={"a": torch.zeros(1)})
     with pytest.raises(InputError, match="not a whole safetensors file"):
@@ -245,11 +245,11 @@ def test_the_contact_method_is_recorded(data_folder):
     drawn = imprints(data_folder)["fots"][0]
     height, width = drawn.image.shape[:2]
     plain = replace(Sensor.load("gelsight-mini"), image_size_px=(width, height))
-    for method, told in (("auto", "learned"), ("pressure", "pressure")):
+    for method, expected in (("auto", "learned"), ("pressure", "pressure")):
         seen = read_observation(
             drawn.image, replace(plain, contact_method=method), "reading", background=drawn.background
         )
-        assert seen.method == told
+        assert seen.method == expected
     assert read_observation(np.zeros((height, width), bool), plain).method is None
 
 

@@ -257,10 +257,10 @@ def test_a_truncated_file_is_named_as_such(tmp_path):
 
 def test_inches_for_millimetres_are_refused(tmp_path):
     sensor = Sensor.load("gelsight-mini")
-    part = save(box((60, 40, 30)), tmp_path / "part.stl")
-    assert load_mesh(part, "mm", sensor=sensor).diameter < 0.1
-    refused("unit is likely wrong", part, "inch", sensor=sensor)
-    refused("expected a geomtact.Sensor, got 'gelsight-mini'", part, "mm", sensor="gelsight-mini")
+    path = save(box((60, 40, 30)), tmp_path / "part.stl")
+    assert load_mesh(path, "mm", sensor=sensor).diameter < 0.1
+    refused("unit is likely wrong", path, "inch", sensor=sensor)
+    refused("expected a geomtact.Sensor, got 'gelsight-mini'", path, "mm", sensor="gelsight-mini")
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

@@ -99,12 +99,12 @@ def test_a_sound_mesh_is_kept_to_the_last_bit(name, tmp_path):
 def test_shuffled_repeated_turned_and_torn_apart_it_comes_back(seed, turned, repeated, name, scale, tmp_path):
     """In any pose and size, with its faces in any order, some stored twice or inside out, each with separate corners."""
     rng = np.random.default_rng(seed)
-    part = load_mesh(name)
+    mesh = load_mesh(name)
     T = se3.transform(se3.random_rotations(1, rng)[0], rng.uniform(-50, 50, 3))
-    vertices = se3.apply(T, 1e3 * scale * part.vertices).astype(np.float32).astype(float)
+    vertices = se3.apply(T, 1e3 * scale * mesh.vertices).astype(np.float32).astype(float)
     path = tmp_path / "sound.ply"
-    write_ply(path, Surface(vertices, part.faces.astype(np.int64)), "mm")
-    faces = rng.permutation(part.faces.astype(np.int64))
+    write_ply(path, Surface(vertices, mesh.faces.astype(np.int64)), "mm")
+    faces = rng.permutation(mesh.faces.astype(np.int64))
     faces = np.concatenate([faces, faces[rng.random(len(faces)) < repeated]])
     flip = rng.random(len(faces)) < turned
     faces[flip] = faces[flip][:, ::-1]
@@ -294,8 +294,8 @@ def test_steps_can_be_left_out(here, tmp_path):
     BOX.export(path)
     done = here(path, "--unit", "mm", "--out", tmp_path / "out", *(x for s in STEPS for x in ("--skip", s)))
     assert done.exit_code == 0, done.output
-    told = json.loads((tmp_path / "out" / "box.json").read_text("utf-8"))
-    assert told["outcome"] == "clean" and told["options"]["skip"] == sorted(STEPS)
+    report = json.loads((tmp_path / "out" / "box.json").read_text("utf-8"))
+    assert report["outcome"] == "clean" and report["options"]["skip"] == sorted(STEPS)
     wrong = here(path, "--unit", "mm", "--skip", "mend")
     assert wrong.exit_code == 2 and "no step named mend" in wrong.output
 
@@ -316,10 +316,10 @@ def apart(a, b, mask):
 
 @pytest.mark.slow
 def test_the_same_object_in_any_format_and_unit_has_the_same_posterior(few_touches, tmp_path, rng):
-    part = load_mesh("bracket")
+    mesh = load_mesh("bracket")
     for file, scale in {"mm.stl": 1e3, "metre.glb": 1.0, "inch.obj": 1 / 25.4e-3}.items():
-        trimesh.Trimesh(scale * part.vertices, part.faces, process=False).export(tmp_path / file)
-    (tmp_path / "part.step").write_text(solid_step(1e3 * part.vertices, part.faces))
+        trimesh.Trimesh(scale * mesh.vertices, mesh.faces, process=False).export(tmp_path / file)
+    (tmp_path / "part.step").write_text(solid_step(1e3 * mesh.vertices, mesh.faces))
     stl = prepared(tmp_path / "mm.stl", "mm", tmp_path)
     # once joined and rounded the metres and the STEP file are the very same mesh; inches are not, in the last bit
     for file in ("metre.glb", "part.step"):
@@ -592,9 +592,9 @@ def test_an_object_of_a_catalogue_is_given_by_its_name(here, tmp_path, monkeypat
         add([tmp_path / "out" / "crate.ply"], "mm", "MIT", "a crate", [symmetry], folder)
         both = tomllib.loads((folder / "catalogue.toml").read_text("utf-8"))
         assert (both["crate"]["licence"], both["other"]["licence"]) == ("MIT", "unknown")
-        part = load_mesh("crate")
-        assert part.unit == "mm" and len(part.symmetry.elements) == 4
-        np.testing.assert_allclose(part.vertices.max(0), [5e-3, 4e-3, 3e-3], atol=1e-9)
+        mesh = load_mesh("crate")
+        assert mesh.unit == "mm" and len(mesh.symmetry.elements) == 4
+        np.testing.assert_allclose(mesh.vertices.max(0), [5e-3, 4e-3, 3e-3], atol=1e-9)
     finally:
         monkeypatch.undo()
         catalogues.catalogue.cache_clear()

@@ -34,20 +34,20 @@ def test_patches_are_the_components_of_the_mask_largest_first(rng):
     mask = rng.random((90, 120)) > 0.55
     pixel_area = 0.3e-6 / 7.5  # eight pixels count, seven do not
     found = patches(mask, pixel_area)
-    sizes = [part.sum() for part in found]
+    sizes = [patch.sum() for patch in found]
     assert len(found) > 3 and sizes == sorted(sizes, reverse=True) and min(sizes) >= 8
     together = np.sum(found, 0)
     assert (together <= mask).all()
     assert not patches(mask & (together == 0), pixel_area)
-    assert all(len(patches(part, pixel_area)) == 1 for part in found)
+    assert all(len(patches(patch, pixel_area)) == 1 for patch in found)
 
 
 def test_patches_keep_their_probabilities(localizer):
     mask, parts = two_patches(localizer)
     shown = np.where(mask, np.float32(0.8), np.float32(0.1))
     found = patches(shown, localizer.sensor.pixel_area(mask.shape))
-    for each, part in zip(found, parts, strict=True):
-        assert np.array_equal(each, np.where(part, np.float32(0.8), np.float32(0)))
+    for each, patch in zip(found, parts, strict=True):
+        assert np.array_equal(each, np.where(patch, np.float32(0.8), np.float32(0)))
         assert each.dtype == np.float32
 
 

@@ -278,16 +278,16 @@ def test_a_camera_of_another_size_is_refused_before_anything_is_prepared(monkeyp
         raise Prepared
 
     monkeypatch.setattr(Localizer, "prepare", prepare)
-    part = ["--object", "pin", "--sensor", "digit"]
+    given = ["--object", "pin", "--sensor", "digit"]
     localize, track = ["localize", "--camera"], ["track"]
     for command, source in ((localize, "film.avi"), (track, "film.avi"), (track, "frames")):
-        result = CliRunner().invoke(app, [*command, source, *part])
+        result = CliRunner().invoke(app, [*command, source, *given])
         assert result.exit_code == 3 and "expected 240 x 320 px for sensor digit" in " ".join(result.output.split())
-    result = CliRunner().invoke(app, [*localize, "digit.avi", *part])
+    result = CliRunner().invoke(app, [*localize, "digit.avi", *given])
     assert isinstance(result.exception, Prepared)
     warning = "turning 320 x 240 px by 90 degrees counter-clockwise, as the driver of digit does"
     assert warning in " ".join(result.output.split())
-    result = CliRunner().invoke(app, [*localize, "digit.avi", *part, "--rotate", "45"])
+    result = CliRunner().invoke(app, [*localize, "digit.avi", *given, "--rotate", "45"])
     assert result.exit_code == 2 and "expected 0, 90, 180 or 270 degrees" in " ".join(result.output.split())
 
 

@@ -31,7 +31,7 @@ def listed(values, form=".0f"):
 
 
 def of_a_known_contact_face(content):
-    scenes = [content["parts"][part]["scenes"]["known side"] for part in PARTS]
+    scenes = [content["parts"][name]["scenes"]["known side"] for name in PARTS]
     variants = "this side alone", "this side, 1 mode", "balanced"
     five, one, unknown = (listed([s["figures"][variant]["mssd_mm_median"] for s in scenes]) for variant in variants)
     (more,) = zip(*(scene["modelled"].values() for scene in scenes), strict=True)
@@ -50,18 +50,18 @@ def counted(some):
 
 def endured(content):
     alike, beyond, jaw, extrinsics = Counter(), [], [], []
-    for part, own in content["parts"].items():
+    for object_name, own in content["parts"].items():
         for name, sweep in own["sweeps"].items():
             for at in sweep["levels"]:
-                told, well = _answers(at["answers"]), at["level"] in sweep["inside"]
-                alike.update([(part, *told)] * well)
-                beyond += told * (not well)
-                jaw += told * (name == "jaw")
-                extrinsics += told * (name.startswith("rig") and not well)
+                found, well = _answers(at["answers"]), at["level"] in sweep["inside"]
+                alike.update([(object_name, *found)] * well)
+                beyond += found * (not well)
+                jaw += found * (name == "jaw")
+                extrinsics += found * (name.startswith("rig") and not well)
     same = max(alike.values())
     yield f"{({9: 'Nine', 10: 'Ten'}).get(same, same)} of these levels are the same touches"
     row = "of {} right ones {} carry a warning ({:.1%}), and of {:,} wrong ones {} are undetected"
-    right, warned, *wrong = counted([each for _, *told in alike for each in told])
+    right, warned, *wrong = counted([each for _, *found in alike for each in found])
     yield filled(row, right, warned, warned / right, *wrong)
     yield "{2:,} estimates are wrong, and {3} of them are undetected".format(*counted(beyond))
     yield "of {} right ones {} carry a warning".format(*counted(jaw))

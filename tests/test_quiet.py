@@ -62,9 +62,9 @@ def test_warnings_show_to_who_asks_for_them():
 
 def test_errors_and_crashes_still_show():
     assert "ZeroDivisionError" in python(CLAIMED + "1 / 0")[1]
-    _, told, status = python(CLAIMED + "import os; os.abort()")
+    _, printed, status = python(CLAIMED + "import os; os.abort()")
     assert status < 0
-    assert "Fatal Python error: Aborted" in told
+    assert "Fatal Python error: Aborted" in printed
 
 
 def test_a_closed_standard_error_is_no_error():

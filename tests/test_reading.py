@@ -400,12 +400,12 @@ def test_a_mask_that_is_hardly_a_touch_is_a_warning(rng):
     rows, columns = np.indices(SHAPE)
     knurl = (rows % 16 < 6) & (columns % 16 < 6)  # 300 tips of 0.38 mm, 1 mm apart
     noise, mostly, dirt = (rng.random(SHAPE) < share for share in (0.3, 0.9, 0.003))
-    told = [("as dust does", dot), ("if that is where nothing touches, invert it", ~MASK)]
+    doubts = [("as dust does", dot), ("if that is where nothing touches, invert it", ~MASK)]
     small, at_the_border = np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
     small[100:110, 100:120] = at_the_border[:30, 40:70] = True
-    told += [("if that is where nothing touches, invert it", ~mask) for mask in (small, at_the_border)]
-    told += [("specks and holes as small as dust", mask) for mask in (noise, mostly, MASK | dirt)]
-    for said, mask in told:
+    doubts += [("if that is where nothing touches, invert it", ~mask) for mask in (small, at_the_border)]
+    doubts += [("specks and holes as small as dust", mask) for mask in (noise, mostly, MASK | dirt)]
+    for said, mask in doubts:
         (warning,) = read_observation(mask, MINI).warnings
         assert said in warning
     for mask in (MASK, knurl):

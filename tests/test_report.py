@@ -227,10 +227,10 @@ def test_the_page_in_a_browser(touch, tmp_path):
         "--window-size=1200,1600",
     ]
     options += [f"--user-data-dir={tmp_path / 'browser'}", "--virtual-time-budget=5000"]
-    told = subprocess.run(
+    printed = subprocess.run(
         [CHROMIUM, *options, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=120, check=True
     ).stdout
-    found = json.loads(unescape(re.search("<title>(.*)</title>", told)[1]))
+    found = json.loads(unescape(re.search("<title>(.*)</title>", printed)[1]))
     assert found == {"errors": [], "chosen": [0, 2, 3, 0, 0, 0], "alike": [0, 1, 2, 0, 4, 5]}
     kept = Path(__file__).parents[1] / "out" / "screenshots"
     kept.mkdir(parents=True, exist_ok=True)

@@ -193,17 +193,17 @@ def test_a_sensor_with_measured_motion_adds_information(flat_nut):
 
 
 def test_a_slip_is_a_warning_and_tracking_recovers(flat_nut):
-    told = 0
+    slips = 0
     for seed in range(3):
         t = random_trajectory(flat_nut.space, 8, seed, slips=(5,))
         posteriors = list(track(flat_nut, t.masks))
         slipped = [p.diagnostics.frame for p in posteriors if any(w.startswith("possible slip") for w in p.warnings)]
         assert set(slipped) <= {6}
-        told += len(slipped)
+        slips += len(slipped)
         found = [p.log_density(T) for p, T in zip(posteriors[6:], t.T_sensor_object[6:], strict=True)]
         single = [alone(flat_nut, m).log_density(T) for m, T in zip(t.masks[6:], t.T_sensor_object[6:], strict=True)]
         assert np.mean(found) > np.mean(single) - 0.3
-    assert told >= 2
+    assert slips >= 2
 
 
 def test_lost_contact_widens_the_prediction(flat_nut, creeping):
@@ -242,8 +242,10 @@ def test_a_frame_that_the_prior_was_made_from_is_a_warning(flat_nut, creeping):
     for posterior in (flat_nut.localize(masks[0], prior=known), next(track(flat_nut, masks, prior=known))):
         assert any("counts twice" in warning for warning in posterior.warnings)
     third = flat_nut.localize(masks[2], prior=None)
-    told = [any("counts twice" in w for w in each.warnings) for each in track(flat_nut, masks[:4], prior=third)]
-    assert told == [False, False, True, False]
+    counted_twice = [
+        any("counts twice" in w for w in each.warnings) for each in track(flat_nut, masks[:4], prior=third)
+    ]
+    assert counted_twice == [False, False, True, False]
     fresh = [flat_nut.localize(masks[3], prior=known), *track(flat_nut, masks[3:5], prior=known)]
     assert not any("counts twice" in warning for posterior in fresh for warning in posterior.warnings)
 
@@ -336,7 +338,7 @@ def test_poses_and_frames_have_to_agree(flat_nut, creeping):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "expected"),
     [
         ({"frames": "folder"}, "got the path 'folder'"),
         ({"frames": np.zeros((240, 320))}, "give it in a list"),
@@ -348,8 +350,8 @@ def test_poses_and_frames_have_to_agree(flat_nut, creeping):
         ({"on_error": "skp"}, "did you mean 'skip'"),
     ],
 )
-def test_wrong_options_are_errors_at_once(flat_nut, wrong, told):
-    with pytest.raises(UsageError, match=told):
+def test_wrong_options_are_errors_at_once(flat_nut, wrong, expected):
+    with pytest.raises(UsageError, match=expected):
         track(flat_nut, **({"frames": [np.zeros((240, 320), bool)]} | wrong))
 
 
@@ -369,15 +371,15 @@ def test_trajectories_creep_and_stay_in_contact(flat_nut):
 
 @pytest.mark.studies
 def test_the_study_reports_the_figures_of_the_posteriors(flat_nut):
-    (told,) = track_study.follow(flat_nut, 3, 0, 3, MODERATE, "fast", first=2)
+    (followed,) = track_study.follow(flat_nut, 3, 0, 3, MODERATE, "fast", first=2)
     t = track_study.make_trajectory(flat_nut, 2, 0, 3, MODERATE)
     for k, (p, T) in enumerate(zip(track(flat_nut, t.masks), t.T_sensor_object, strict=True)):
-        assert told.gain["filter"][k] == pytest.approx(p.log_density(T), abs=1e-4)
-        assert told.claimed["filter"][k] == pytest.approx(-p.entropy_nats, abs=1e-3)
-        assert told.level["filter"][k] == pytest.approx(p.credible_level(T), abs=0.05)
-        assert 0 <= told.mass["filter"][k] <= 1
-    figures = track_study.summarise([told])
-    more = np.mean(np.maximum(told.gain["filter"], -9.3)) - np.mean(np.maximum(told.gain["frames"], -9.3))
+        assert followed.gain["filter"][k] == pytest.approx(p.log_density(T), abs=1e-4)
+        assert followed.claimed["filter"][k] == pytest.approx(-p.entropy_nats, abs=1e-3)
+        assert followed.level["filter"][k] == pytest.approx(p.credible_level(T), abs=0.05)
+        assert 0 <= followed.mass["filter"][k] <= 1
+    figures = track_study.summarise([followed])
+    more = np.mean(np.maximum(followed.gain["filter"], -9.3)) - np.mean(np.maximum(followed.gain["frames"], -9.3))
     assert figures["filter"]["more"][0] == pytest.approx(more, abs=0.2)
 
 
@@ -481,9 +483,12 @@ def test_track_follows_a_folder_that_is_being_filled(command, folder, monkeypatc
 
 
 def test_an_error_of_track_is_one_line(command, folder):
-    for source, told in (("absent", "no such folder, video or camera"), ("text.avi", "OpenCV cannot read this video")):
+    for source, expected in (
+        ("absent", "no such folder, video or camera"),
+        ("text.avi", "OpenCV cannot read this video"),
+    ):
         (folder.parent / "text.avi").write_text("no video")
-        assert told in command(source, status=3).stderr.splitlines()[-1]
+        assert expected in command(source, status=3).stderr.splitlines()[-1]
     assert "is one image" in command(folder / "f_2.png", status=2).stderr
     assert "expected a folder to watch" in command("-", "--follow", status=2).stderr
     assert "frames: expected at least one image" in command("-", input="\n", status=3).stderr

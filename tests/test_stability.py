@@ -66,20 +66,20 @@ def test_outside_the_contact_pose_space_the_error_is_that_of_the_pose_itself(plu
 
 def test_every_mode_of_an_unknown_object_is_wrong(plug):
     sweep = SWEEPS["other_part"]
-    told = list(stability.swept(plug, sweep, 1, 4, 3, "fast"))
-    assert len(told) == 4 and all(a.wrong and a.gain == -np.inf and a.level == 1 for a in told)
+    answers = list(stability.swept(plug, sweep, 1, 4, 3, "fast"))
+    assert len(answers) == 4 and all(a.wrong and a.gain == -np.inf and a.level == 1 for a in answers)
     assert all(a.gain > -np.inf for a in stability.swept(plug, sweep, 0, 4, 3, "fast"))
 
 
 def test_a_sequence_is_evaluated_at_its_last_frame(flat_nut, monkeypatch):
     monkeypatch.setattr(stability, "_FRAMES", 8)
-    told = list(stability.swept(flat_nut, SWEEPS["slips"], 1, 2, 3, "fast"))
-    for number, answer in enumerate(told):
+    answers = list(stability.swept(flat_nut, SWEEPS["slips"], 1, 2, 3, "fast"))
+    for number, answer in enumerate(answers):
         made = random_trajectory(flat_nut.space, 8, 3000 + number, 2 * MM, slips=(4,), elastic=number % 2 == 1)
         frames = list(flat_nut.track(made.masks, effort="fast", kind="mask", seed=3))
         slipped = any("possible slip" in warning for frame in frames for warning in frame.warnings)
         assert answer == replace(judged(flat_nut.mesh, made.T_sensor_object[-1], frames[-1]), warned=slipped)
-    assert any(answer.warned for answer in told)
+    assert any(answer.warned for answer in answers)
 
 
 @pytest.mark.parametrize("degrees", [0, 10, 90])
@@ -204,8 +204,8 @@ def test_the_outline_cut_off_is_counted_in_pixel_edges():
 
 
 def test_an_unperturbed_world_gives_the_localizers_own_posteriors(plug, here):
-    told = list(stability.swept(plug, SWEEPS["size"], 0, 2, 5, "fast"))
-    for answer, (T, mask) in zip(told, worlds.touches(here, 2, 5), strict=True):
+    answers = list(stability.swept(plug, SWEEPS["size"], 0, 2, 5, "fast"))
+    for answer, (T, mask) in zip(answers, worlds.touches(here, 2, 5), strict=True):
         assert answer == judged(plug.mesh, T, plug.localize(mask, "mask", effort="fast", seed=5))
         assert np.isfinite(answer.gain)
 
@@ -221,7 +221,7 @@ def test_a_pose_of_another_world_is_moved_along_the_sensors_axis_into_the_space(
 
 
 @pytest.fixture
-def told(plug, monkeypatch):
+def poses_given(plug, monkeypatch):
     """The sensor poses of every scene that is localized, none of which is answered."""
     poses = []
 
@@ -236,11 +236,11 @@ def told(plug, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "level", "mm", "degrees"), [("rig_shift", 0, 0, 0), ("rig_shift", 5, 5, 0), ("rig_turn", 5, 0, 5)]
 )
-def test_extrinsics_are_perturbed_as_stated_except_for_the_first_sensor(plug, told, name, level, mm, degrees):
+def test_extrinsics_are_perturbed_as_stated_except_for_the_first_sensor(plug, poses_given, name, level, mm, degrees):
     answers = list(stability.swept(plug, SWEEPS[name], level, 8, 1, "fast"))
     assert answers == [REFUSED] * 8
     true = [scene.T_world_sensor for scene in simultaneous_touches(plug.space, 8, 3, 1)]
-    off = inverse(np.array(true)) @ np.array(told)
+    off = inverse(np.array(true)) @ np.array(poses_given)
     assert off[:, 0] == pytest.approx(np.tile(np.eye(4), (8, 1, 1)))
     turned = Rotation.from_matrix(off[:, 1:, :3, :3].reshape(-1, 3, 3)).magnitude()
     # 16 of each, with these root mean squares
@@ -248,10 +248,10 @@ def test_extrinsics_are_perturbed_as_stated_except_for_the_first_sensor(plug, to
     assert np.degrees(np.sqrt((turned**2).mean())) == pytest.approx(degrees, rel=0.3, abs=1e-5)
 
 
-def test_a_jaws_levels_are_degrees(plug, told):
+def test_a_jaws_levels_are_degrees(plug, poses_given):
     list(stability.swept(plug, SWEEPS["jaw"], 30, 3, 1, "fast"))
-    assert len(told) == 3
-    for _, second in told:
+    assert len(poses_given) == 3
+    for _, second in poses_given:
         assert second[2, 2] == pytest.approx(-np.cos(np.radians(30)), abs=1e-9)
 
 
@@ -375,8 +375,8 @@ def test_an_unknown_sweep_is_refused(command):
 def test_an_unknown_object_without_figures_is_printed(command, tmp_path, monkeypatch):
     monkeypatch.setitem(SWEEPS, "other_part", replace(SWEEPS["other_part"], levels=(1,), inside=()))
     words = ["--touches", 4, "--effort", "fast", "--sweep", "other_part"]
-    done = command(*words, "--out", tmp_path / "told.json")
-    sweeps = json.loads((tmp_path / "told.json").read_text("utf-8"))["parts"]["connector_plug"]["sweeps"]
+    done = command(*words, "--out", tmp_path / "outcomes.json")
+    sweeps = json.loads((tmp_path / "outcomes.json").read_text("utf-8"))["parts"]["connector_plug"]["sweeps"]
     (at,) = sweeps["other_part"]["levels"]
     assert at["figures"]["gain_mean"] is None and at["figures"]["wrong"] == 1
     assert "another part" in done.output

@@ -21,9 +21,9 @@ def table(tmp_path):
     middle = (np.arange(BINS) + 0.5) / (BINS - 1)
     steep, towards = np.tan(np.minimum(middle * np.pi / 2, 1.4)), 2 * np.pi * middle - np.pi
     slope = steep[:, None, None] * np.stack([np.cos(towards), np.sin(towards)], -1)
-    told = slope @ LAMPS.T
+    seen = slope @ LAMPS.T
     place = np.zeros((BINS, BINS, 3, 6))
-    place[..., 5], place[..., 3] = told, 0.3 * told / SHAPE[1]
+    place[..., 5], place[..., 3] = seen, 0.3 * seen / SHAPE[1]
     path = tmp_path / "polycalib.npz"
     blue_first = {name: place[:, :, 2 - k] for k, name in enumerate(("grad_r", "grad_g", "grad_b"))}
     np.savez(path, bins=BINS, **blue_first)
@@ -40,8 +40,8 @@ def test_slopes_come_out_as_they_went_in(table, rng):
     slope = rng.uniform(-0.35, 0.35, (SHAPE[0] * SHAPE[1], 2))
     v, u = (each.ravel().astype(float) for each in np.indices(SHAPE))
     change = change_of(read_table(table), slope, u, v)
-    told = colours.slopes(change.reshape(*SHAPE, 3)).reshape(-1, 2)
-    assert np.sqrt(((told - slope) ** 2).mean()) < 0.03  # a bin is 1.5 degrees steep and 6 wide
+    found = colours.slopes(change.reshape(*SHAPE, 3)).reshape(-1, 2)
+    assert np.sqrt(((found - slope) ** 2).mean()) < 0.03  # a bin is 1.5 degrees steep and 6 wide
     assert colours.slope_rms < 0.03
 
 
@@ -49,7 +49,7 @@ def test_slopes_come_out_as_they_went_in(table, rng):
 def test_a_ball_seen_through_the_makers_tables_has_its_size(data_folder, name, shape, pitch):
     path = data_folder / "taxim_calib" / name / "polycalib.npz"
     table, colours = read_table(path), colours_of_taxim(path, shape)
-    told = []
+    diameters = []
     for at in ((0.5, 0.5), (0.3, 0.35), (0.7, 0.6)):
         v, u = (each.astype(float) for each in np.indices(shape))
         off = pitch * np.stack([u - at[0] * shape[1], v - at[1] * shape[0]], -1)
@@ -57,8 +57,8 @@ def test_a_ball_seen_through_the_makers_tables_has_its_size(data_folder, name, s
         slope = -off[on] / np.sqrt((3e-3) ** 2 - (off[on] ** 2).sum(-1, keepdims=True))
         change = np.zeros((*shape, 3))
         change[on] = change_of(table, slope, u[on], v[on]) - change_of(table, 0 * slope, u[on], v[on])
-        told.append(diameter_of(off[on], colours.slopes(change)[on]))
-    assert told == pytest.approx(np.full(3, 6e-3), rel=0.12)
+        diameters.append(diameter_of(off[on], colours.slopes(change)[on]))
+    assert diameters == pytest.approx(np.full(3, 6e-3), rel=0.12)
 
 
 def test_the_command_makes_a_sensor_of_a_table(table, tmp_path):
@@ -66,8 +66,8 @@ def test_the_command_makes_a_sensor_of_a_table(table, tmp_path):
     write_image(background, np.full((*SHAPE, 3), 120, np.uint8))
 
     def run(*words):
-        told = ["calibrate", table, "--background", background, "--out", tmp_path / "mine.toml", *words]
-        return CliRunner().invoke(app, [str(word) for word in told])
+        words_given = ["calibrate", table, "--background", background, "--out", tmp_path / "mine.toml", *words]
+        return CliRunner().invoke(app, [str(word) for word in words_given])
 
     done = run("--pitch-mm", 0.1, 0.1)
     assert done.exit_code == 0, done.output

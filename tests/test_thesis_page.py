@@ -130,17 +130,17 @@ def test_a_posterior_on_exactly_the_equivalent_poses_has_precision_and_recall_on
     distance = PoseDistance(rod.mesh)
     here, there = transform(SIDEWAYS, [0, 0, 0]), transform(SIDEWAYS, [0.09, 0, 0])
 
-    def told(poses, level):
+    def posterior_of(poses, level):
         draw = lambda n, rng: np.repeat(poses, -(-n // len(poses)), 0)[:n]  # noqa: E731
         return SimpleNamespace(contact=True, sample=draw, credible_level=level)
 
-    def judged(posterior, T):
+    def shares(posterior, T):
         return ambiguity.held(posterior, np.stack(T), distance, np.random.default_rng(0))
 
-    assert judged(told([here, there], lambda T: np.full(len(T), 0.5)), [here, there]) == (1, 1)
-    assert judged(told([here, there], lambda T: np.full(len(T), 0.5)), [here]) == (0.5, 1)
-    assert judged(told([here], lambda T: np.where(T[:, 0, 3] < 0.01, 0.5, 1.0)), [here, there]) == (1, 0.5)
-    assert judged(SimpleNamespace(contact=False), [here]) == (0, 0)
+    assert shares(posterior_of([here, there], lambda T: np.full(len(T), 0.5)), [here, there]) == (1, 1)
+    assert shares(posterior_of([here, there], lambda T: np.full(len(T), 0.5)), [here]) == (0.5, 1)
+    assert shares(posterior_of([here], lambda T: np.where(T[:, 0, 3] < 0.01, 0.5, 1.0)), [here, there]) == (1, 0.5)
+    assert shares(SimpleNamespace(contact=False), [here]) == (0, 0)
 
 
 def test_distinctive_and_ambiguous_touches_have_separate_figures():
@@ -183,10 +183,10 @@ def test_an_interrupted_ambiguity_study_resumes_and_keeps_its_results(flat_nut, 
         assert done.exit_code == 0, done.output
         return json.loads(out.read_text("utf-8"))["parts"]["hex_nut"]
 
-    judged = run()
-    assert "ambiguity" not in judged and len(judged["granularity_mm"]) == 2
+    content = run()
+    assert "ambiguity" not in content and len(content["granularity_mm"]) == 2
     both = run("--ambiguity", "1", "--plot", str(plot))
-    assert both["outcomes"] == judged["outcomes"] and both["figures"] == judged["figures"]
+    assert both["outcomes"] == content["outcomes"] and both["figures"] == content["figures"]
     assert [(a["side"], a["touch"]) for a in both["ambiguity"]["outcomes"]] == [(0, 0), (1, 0)]
     assert plot.read_bytes()[:4] == b"\x89PNG"
     # whole, it is not made again, and judging anew forgets nothing
@@ -219,16 +219,16 @@ def test_the_page_agrees_with_the_study():
         left = _cells(page, "## What a touch leaves open")[name]
         mean = open_["mean"]
         share = f"{100 * open_['distinctive']:.0f} %"
-        told = [f"{mean[key]:.0f} mm" for key in ("random_mm", "least_mm")]
+        means = [f"{mean[key]:.0f} mm" for key in ("random_mm", "least_mm")]
         error = [f"{open_['table']['all'][row]['error_mm_mean']:.0f} mm" for row in ("answer", "best")]
         shares = [f"{100 * mean[key]:.0f} %" for key in ("precision", "recall")]
-        assert left[1:] == [str(open_["n"]), share, f"{open_['median']['span_mm']:.0f} mm", *told, *error, *shares]
+        assert left[1:] == [str(open_["n"]), share, f"{open_['median']['span_mm']:.0f} mm", *means, *error, *shares]
         before, after = (part["figures"][row]["near"] for row in ("refined best", "thesis's refinement of best"))
         moved = [f"{mm:.1f} mm" for mm in (*before[1:], after[2])]
         assert _cells(page, "### Refinement alone")[name][1:] == [str(before[0]), *moved]
         few = _cells(page, "### Distinctive touches")[name]
-        judged = open_["table"]["distinctive"]
-        assert few[1:-1] == [str(judged["best"]["n"]), *(_of(judged, row) for row in rows)]
+        distinctive = open_["table"]["distinctive"]
+        assert few[1:-1] == [str(distinctive["best"]["n"]), *(_of(distinctive, row) for row in rows)]
     for image in re.findall(r"\]\((images/[^)]+)\)", page):
         assert (DOCS / image).read_bytes()[:4] == b"\x89PNG"
 

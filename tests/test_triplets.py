@@ -38,11 +38,11 @@ def marker(scenes):
     return SimpleNamespace(mesh=space.mesh, sensor=sensor, space=space, simulate=simulate), scenes[path]
 
 
-def knows(T, told):
-    """A ``localize`` that is certain that the object is at ``T``, and keeps its arguments in ``told``."""
+def knows(T, calls):
+    """A ``localize`` that is certain that the object is at ``T``, and keeps its arguments in ``calls``."""
 
     def localize(images, kind, background, T_world_sensor, **options):
-        told.append((images, kind, background, T_world_sensor))
+        calls.append((images, kind, background, T_world_sensor))
         return SimpleNamespace(
             modes=lambda k: [SimpleNamespace(T=T, probability=1.0)],
             log_density=lambda pose: 5.0,
@@ -95,8 +95,8 @@ def test_the_true_pose_touches_all_three_and_one_moved_off_does_not(marker):
 def test_a_posterior_at_the_true_pose_is_right(marker, monkeypatch):
     localizer, some = marker
     monkeypatch.setattr(triplets, "POINTS", 1000)
-    told = []
-    localizer.localize = knows(some[0].T_world_object, told)
+    calls = []
+    localizer.localize = knows(some[0].T_world_object, calls)
     (outcomes,) = judge(localizer, some[:1], "balanced", 1)
     both = [(shown, n) for shown in ("reading", "ideal") for n in (1, 2, 3)]
     assert [(o.shown, o.touches) for o in outcomes] == [("chance", 0), *both]
@@ -104,7 +104,7 @@ def test_a_posterior_at_the_true_pose_is_right(marker, monkeypatch):
         assert o.position_mm == 0 and o.add_s_mm < 1e-9 and o.touching == 3
         assert (o.gain, o.claimed, o.level) == (5.0, 4.0, 0.25)
     assert outcomes[0].position_mm > 5 and outcomes[0].touching >= 1
-    for (images, kind, background, T), (shown, n) in zip(told, both, strict=True):
+    for (images, kind, background, T), (shown, n) in zip(calls, both, strict=True):
         assert len(images) == len(T) == n
         assert (kind, background is None) == (("mask", True) if shown == "ideal" else ("reading", False))
 
@@ -132,15 +132,15 @@ def test_figures_are_of_each_kind_and_number():
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "told"),
+    ("words", "status", "expected"),
     [
         ([], 2, "Missing argument 'FOLDER'"),
         (["a", "b"], 2, "unexpected extra argument"),
         (["nowhere"], 3, "hsp_digit_sim_ycb"),
     ],
 )
-def test_without_the_data_the_error_names_the_folder(words, status, told, tmp_path, monkeypatch):
+def test_without_the_data_the_error_names_the_folder(words, status, expected, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(studies, ["triplets", *words])
     assert done.exit_code == status, done.output
-    assert told in done.output
+    assert expected in done.output
