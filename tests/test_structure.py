@@ -26,6 +26,7 @@ STAGES = [
     ["json_values"],
     ["geometry"],
     ["sensing"],
+    ["kernels"],
     ["contact_space"],
     ["scoring"],
     ["registration"],

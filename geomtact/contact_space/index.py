@@ -210,11 +210,8 @@ class Index:
         Constant time a pose. A pose between the cells that touch gets the nearest one that does.
         """
         T, k, j = self.directions.lookup(np.asarray(T, float).reshape(-1, 4, 4))
-        rotation = self.directions.first_turn[k] + j
         centre = T[:, :2, :3] @ self.mesh.centre + T[:, :2, 3]
-        ny, nx = self.table.shape[1:]
-        x, y = self.lattice(centre)
-        place = self.table[rotation, np.clip(y, 0, ny - 1), np.clip(x, 0, nx - 1)].astype(np.int64)
+        place = self.place_of(self.directions.first_turn[k] + j, centre)
         bins = len(self.resolution.penetrations)
         depth = np.asarray(penetration, float) / self.sensor.max_penetration
         level = np.clip((depth * bins).astype(np.int64), 0, bins - 1)
@@ -222,6 +219,12 @@ class Index:
         some = self.weight[:, place] > 0
         level = np.where(some[level, np.arange(len(place))], level, _nearest_true(some, level))
         return level * self.places + place
+
+    def place_of(self, rotation: NDArray[np.int64], centre: Array) -> NDArray[np.int64]:
+        """The place (n,) of a rotation (n,) of the grid with the object's centre at ``centre`` (n, 2 or 3), or the nearest."""
+        ny, nx = self.table.shape[1:]
+        x, y = self.lattice(centre)
+        return self.table[rotation, np.clip(y, 0, ny - 1), np.clip(x, 0, nx - 1)].astype(np.int64)
 
     def draw(self, ids: ArrayLike, rng: np.random.Generator) -> tuple[Array, Array]:
         """Poses (m, 4, 4) uniform within the cells of ``ids`` (m,), and the penetration (m,) [m] each one is to have.

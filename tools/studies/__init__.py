@@ -9,6 +9,7 @@ study             what is judged
 ``samples``       nothing: what the touches are like
 ``localize``      one touch: information, calibration, error, time
 ``scores``        one score after another, on the same touches
+``adaptive``      a touch within its cells: opened, or sampled
 ``choices``       every default: speed, accuracy, an ablation study
 ``stability``     what breaks a posterior, and whether it warns
 ``thesis``        the thesis's Table 1, and what a touch leaves open

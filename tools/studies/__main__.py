@@ -8,6 +8,7 @@ import typer
 
 from geomtact.cli.several import Command
 from geomtact.cli.shell import check_words, claim_output, one_line_errors, one_line_usage_errors
+from tools.studies.adaptive import command as adaptive
 from tools.studies.choices import command as choices
 from tools.studies.common.by_part import by_part
 from tools.studies.common.plot_command import plot_study
@@ -47,6 +48,7 @@ COMMANDS: dict[str, Command] = {
     "kitting": by_part(kitting.judge_kitting, kitting.SCHEMA),
     "stability": by_part(stability.judge_stability, stability.SCHEMA),
     "choices": by_part(choices.judge_choices, choices.SCHEMA),
+    "adaptive": by_part(adaptive.judge_adaptive, adaptive.SCHEMA),
     "plot": plot_study,
 }
 for name, command in COMMANDS.items():

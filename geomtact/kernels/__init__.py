@@ -1,0 +1,1 @@
+"""Loops that are compiled: the work that is done for every contact."""

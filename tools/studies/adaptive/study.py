@@ -1,0 +1,183 @@
+"""What a touch constrains within a cell: by cells that are opened, and by a sampled density, on the same touches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from geomtact.contact_space.contact_class import contact_class
+from geomtact.contact_space.contact_maps import ContactMaps, Placements
+from geomtact.contact_space.index import Index
+from geomtact.contact_space.touches import Touch
+from geomtact.inference.sampler import explore
+from geomtact.localizer import Localizer
+from geomtact.log_mass import log_mean_exp
+from geomtact.scoring.contact_likelihood import ContactQuery
+from geomtact.scoring.probability import posterior_log_prob
+from geomtact.se3 import Array
+
+ROOTS = (75_000, 300_000, 1_200_000)  # poses of the grids whose cells are opened
+CONTACTS = (3_000, 10_000, 30_000)  # budgets of the sampler
+CHILDREN = 32  # contacts that open a cell: two parts of each tilt, turn, x and y
+_IN_CELL = 400  # poses drawn in the true cell
+BUDGETS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)  # of opening, for the chart
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One touch; information in nats. Lists hold a number for each of ``ROOTS``, or for each of ``CONTACTS``.
+
+    Attributes
+    ----------
+    contact : one of ``contact_class.CLASSES``
+    rank : of the true cell in the coarse posterior, 0 the most probable
+    coarse_gain : log density of the coarse posterior at the true pose
+    in_cell_gain : log density at the true pose within its cell, by the likelihood; at most log 401
+    touching : share of the true cell in which the object can touch
+    gain, expected_gain, level : of the sampler: at the true pose, by its own particles, credible level of the true pose
+    cut : contacts that the sampler cut
+    """
+
+    elastic: bool
+    contact: str
+    rank: list[int]
+    coarse_gain: list[float]
+    in_cell_gain: list[float]
+    touching: list[float]
+    gain: list[float]
+    expected_gain: list[float]
+    level: list[float]
+    cut: list[int]
+
+
+def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int, first: int) -> Iterator[Outcome]:
+    """The outcome of each touch from the ``first`` on; ``localizers`` are on the grids of ``ROOTS``."""
+    maps = [ContactMaps.cast(localizer.index) for localizer in localizers]
+    for number, touch in enumerate(touches[first:], first):
+        rng = np.random.default_rng([seed, number])
+        query = ContactQuery.of(touch.mask, localizers[-1].sensor)
+        roots = [_root(localizer, each, query, touch, rng) for localizer, each in zip(localizers, maps, strict=True)]
+        rank, coarse, in_cell, touching = zip(*roots, strict=True)
+        mass = np.exp(_coarse(localizers[-1], touch)).sum(0)
+        found = [explore(maps[-1], query, mass, contacts, rng) for contacts in CONTACTS]
+        T, depth = touch.T_sensor_object[None], np.array([touch.penetration])
+        gain = [float(each.log_density(T, depth)[0]) for each in found]
+        yield Outcome(
+            touch.elastic,
+            contact_class(localizers[-1].space, touch.T_sensor_object),
+            [int(each) for each in rank],
+            [float(each) for each in coarse],
+            [float(each) for each in in_cell],
+            [float(each) for each in touching],
+            gain,
+            [each.expected_gain for each in found],
+            [each.credible_level(at) for each, at in zip(found, gain, strict=True)],
+            [each.contacts for each in found],
+        )
+
+
+def _coarse(localizer: Localizer, touch: Touch) -> Array:
+    """Log mass (P, n) of every cell."""
+    index = localizer.index
+    rows = localizer.scorer.cells(index, touch.mask, None, False)
+    out = np.full(index.height.size, -np.inf)
+    out[rows.first] = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
+    return out.reshape(index.height.shape)
+
+
+def _root(
+    localizer: Localizer, maps: ContactMaps, query: ContactQuery, touch: Touch, rng: np.random.Generator
+) -> tuple[int, float, float, float]:
+    """Rank of the true cell, coarse gain and gain within the cell, and the share of the cell that touches."""
+    index, log_mass = localizer.index, _coarse(localizer, touch).ravel()
+    true = int(index.lookup(touch.T_sensor_object[None], np.array([touch.penetration]))[0])
+    inside = _in_cell(index, maps, query, true, rng)
+    at_truth = _log_likelihood(
+        maps, query, maps.locate(touch.T_sensor_object[None], np.array([touch.penetration])), touch.penetration
+    )
+    together = np.concatenate([at_truth, inside])
+    return (
+        int((log_mass > log_mass[true]).sum()),
+        float(log_mass[true] - index.log_weight[true]),
+        float(at_truth[0] - log_mean_exp(together[None])[0]),
+        float(index.touching[true % index.places]),
+    )
+
+
+def _in_cell(index: Index, maps: ContactMaps, query: ContactQuery, cell: int, rng: np.random.Generator) -> Array:
+    """Log likelihoods (n,) of poses drawn evenly in a cell, of those that touch."""
+    T, depth = index.draw(np.full(_IN_CELL, cell), rng)
+    poses = maps.locate(T, depth)
+    found = _log_likelihood(maps, query, poses, depth)
+    return found[np.isfinite(found)]
+
+
+def _log_likelihood(maps: ContactMaps, query: ContactQuery, poses: Placements, depth: Any) -> Array:
+    compared = maps.compare(query.samples, poses, query.area)
+    share = np.broadcast_to(depth, len(poses.reach)) / maps.index.sensor.max_penetration
+    return query.log_likelihood(compared.energy, share)
+
+
+def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Means over touches: what opening cells would gain at each of ``BUDGETS``, and what the sampler gains.
+
+    ``ruled_out`` is the share of touches whose true pose the sampler gives no density; means leave these out.
+    """
+    column = {name: np.array([getattr(o, name) for o in outcomes]) for name in Outcome.__dataclass_fields__}
+    rank, coarse = column["rank"], column["coarse_gain"]
+    # a sliver at the window's edge may lie between the samples: there nothing is gained
+    in_cell = np.where(np.isfinite(column["in_cell_gain"]), column["in_cell_gain"], 0.0)
+    opened = [(coarse + (rank < budget / CHILDREN) * in_cell).mean(0).tolist() for budget in BUDGETS]
+    flat = column["contact"] == "flat"
+    half = column["touching"][:, -1] > 0.5
+    groups = {
+        "flat": flat,
+        "more than half of the cell touches": ~flat & half,
+        "less than half of the cell touches": ~flat & ~half,
+        "rigid": ~column["elastic"],
+        "elastic": column["elastic"],
+    }
+    return {
+        "n": len(outcomes),
+        "coarse_gain": coarse.mean(0).tolist(),
+        "in_cell_gain": in_cell.mean(0).tolist(),
+        "rank_quartiles": np.quantile(rank, [0.25, 0.5, 0.75], axis=0).T.tolist(),
+        "budgets": list(BUDGETS),
+        "opened_gain": opened,
+        "sampled": _sampled(column, np.ones(len(outcomes), bool)),
+        "groups": {
+            name: {
+                "n": int(some.sum()),
+                "rank_median": float(np.median(rank[some, -1])),
+                "in_cell_gain": float(in_cell[some, -1].mean()),
+                "sampled": _sampled(column, some),
+            }
+            for name, some in groups.items()
+            if some.any()
+        },
+    }
+
+
+def _sampled(column: dict[str, Any], some: Any) -> list[dict[str, Any]]:
+    """Figures of the sampler at each of ``CONTACTS``, over ``some`` of the touches."""
+    out = []
+    for k in range(len(CONTACTS)):
+        finite = np.isfinite(column["gain"][:, k])
+        kept = some & finite
+        gain, expected, level = (column[name][kept, k] for name in ("gain", "expected_gain", "level"))
+        off = expected - gain
+        out.append(
+            {
+                "contacts": float(column["cut"][some, k].mean()),
+                "ruled_out": float((some & ~finite).sum() / some.sum()),
+                "gain": float(gain.mean()),
+                "expected_gain": float(expected.mean()),
+                "expected_less_gain": [float(off.mean()), float(1.96 * off.std() / np.sqrt(len(off)))],
+                "coverage": [float((level <= q).mean()) for q in LEVELS],
+            }
+        )
+    return out
