@@ -54,7 +54,7 @@ def test_the_pencils_ends_constrain_most(example, tmp_path):
 @pytest.mark.slow
 def test_a_gripper_that_reads_its_width(example):
     said = example("docs/examples/gripper.py", "--part", "connector_plug", "--max-poses", "60000")
-    assert float(re.search(r"the truth: (\S+) nats", said)[1]) > 0
+    assert float(re.search(r"at the true pose: (\S+) nats", said)[1]) > 0
     assert re.search(r"the jaw is \d+\.\d mm open", said)
 
 
