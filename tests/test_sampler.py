@@ -12,7 +12,7 @@ from geomtact.scoring.contact_likelihood import ContactQuery
 from geomtact.sensing.noise import CLEAN
 
 
-@pytest.fixture(scope="module", params=["gelslim", "digit"])
+@pytest.fixture(scope="module", params=["gelslim", pytest.param("digit", marks=pytest.mark.slow)])
 def localizer(request, make_localizer):
     return make_localizer(load_mesh("pin"), Sensor.load(request.param), max_poses=20_000)
 
