@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from geomtact.contact_space.index import Index
 from geomtact.geometry.approach import facing
 from geomtact.kernels.contact_energy import Maps, Samples, contact_energy
 from geomtact.se3 import Array
+from geomtact.sensing.sensor import Sensor
 
 SHAPE = (48, 64)  # samples of the window, lying
 BLOCK = 4  # samples along each side of a block
@@ -76,8 +78,7 @@ class ContactMaps:
     def cast(cls, index: Index) -> ContactMaps:
         """Cast all of them: 20 ms each for an object of 100 mm."""
         sensor, mesh = index.sensor, index.mesh
-        sample = float(np.sqrt(sensor.pixel_area(sensor.along(SHAPE))))
-        pixel = sample / _PIXELS_PER_SAMPLE
+        pixel = sample_pitch(sensor) / _PIXELS_PER_SAMPLE
 
         def one(a: Array) -> NDArray[np.float32]:
             return HeightMap.cast(index.space.caster, a, mesh.centre, mesh.reach, 0.0, pixel).heights
@@ -91,6 +92,11 @@ class ContactMaps:
         )
         return cls(index, Maps(heights, widest, pixel))
 
+    @cached_property
+    def _from_maps(self) -> Array:
+        """Rotations (D, 3, 3) from the maps' frames into the object's."""
+        return np.swapaxes(facing(self.index.directions.vectors), 1, 2)
+
     def locate(self, T: Array, penetration: Array) -> Placements:
         """The poses ``T_sensor_object`` (n, 4, 4), which press ``penetration`` (n,) [m] deep; images under the symmetry may stand
         for them."""
@@ -101,8 +107,7 @@ class ContactMaps:
     def compare(self, samples: Samples, poses: Placements, area: float) -> Compared:
         """The contacts at ``poses`` compared with the one that ``samples`` describe, whose area is that of ``area`` samples."""
         # from the frame of each map into the sensor's
-        turned = np.swapaxes(facing(self.index.directions.vectors), 1, 2)[poses.direction]
-        tilt = (poses.rotation @ turned).astype(np.float32)
+        tilt = (poses.rotation @ self._from_maps[poses.direction]).astype(np.float32)
         centre, reach = poses.centre.astype(np.float32), poses.reach.astype(np.float32)
         deepest = self.index.sensor.max_penetration
 
@@ -115,3 +120,8 @@ class ContactMaps:
             found = list(pool.map(some, range(0, max(len(reach), 1), _PART)))
         energy, reached, centroid = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
         return Compared(energy, reached, centroid)
+
+
+def sample_pitch(sensor: Sensor) -> float:
+    """Pitch of the window's samples [m]."""
+    return float(np.sqrt(sensor.pixel_area(sensor.along(SHAPE))))

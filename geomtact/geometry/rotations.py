@@ -151,6 +151,10 @@ class Directions:
         """Which of :meth:`rotations` is turn 0 of each direction (D,)."""
         return np.cumsum(self.turns) - self.turns
 
+    def direction_of_rotation(self, rotations: ArrayLike) -> NDArray[np.int64]:
+        """The direction (n,) of rotations (n,), counted as :meth:`rotations` does."""
+        return np.searchsorted(self.first_turn, np.asarray(rotations), side="right") - 1
+
     def coarser_rotations(self, turn_step: float) -> NDArray[np.int64]:
         """The rotation of the next coarser grid that holds each of :meth:`rotations` (M,); disks are cut alike on both.
 
@@ -172,7 +176,7 @@ class Directions:
     def draw(self, cells: ArrayLike, rng: np.random.Generator) -> Array:
         """Allowed rotations (n, 3, 3) uniform within cells (n,), counted as :meth:`rotations` does."""
         cells = np.asarray(cells)
-        k = np.searchsorted(self.first_turn, cells, side="right") - 1
+        k = self.direction_of_rotation(cells)
         turn = cells - self.first_turn[k]
         psi = turn * self.periods[k] / self.turns[k] + rng.uniform(-0.5, 0.5, len(k)) * self.periods[k] / self.turns[k]
         a = self._draw_directions(k, rng)

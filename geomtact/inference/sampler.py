@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp, ndtr, ndtri
 
-from geomtact.contact_space.contact_maps import SHAPE, ContactMaps, Placements
+from geomtact.contact_space.contact_maps import ContactMaps, Placements, sample_pitch
 from geomtact.scoring.contact_likelihood import ContactQuery
 from geomtact.se3 import Array, transform
 
@@ -115,15 +115,18 @@ class Explored:
     def log_density(self, T: ArrayLike, penetration: ArrayLike) -> Array:
         """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4) of the contact pose space that press
         ``penetration`` (n,) [m] deep."""
-        penetration = np.asarray(penetration, float)
-        poses = self.maps.locate(np.asarray(T, float), penetration)
-        compared = self.maps.compare(self.query.samples, poses, self.query.area)
-        share = penetration / self.maps.index.sensor.max_penetration
-        return self.query.log_likelihood(compared.energy, share) - self.log_evidence
+        return log_likelihood_at(self.maps, self.query, T, penetration) - self.log_evidence
 
     def credible_level(self, log_density: float) -> float:
         """Mass of the poses that are denser than ``log_density``."""
         return float((self.particles.log_likelihood - self.log_evidence > log_density).mean())
+
+
+def log_likelihood_at(maps: ContactMaps, query: ContactQuery, T: ArrayLike, penetration: ArrayLike) -> Array:
+    """Log likelihood (n,) of the observed contact at ``T_sensor_object`` (n, 4, 4), where ``penetration`` (n,) is in metres."""
+    penetration = np.asarray(penetration, float)
+    compared = maps.compare(query.samples, maps.locate(np.asarray(T, float), penetration), query.area)
+    return query.log_likelihood(compared.energy, penetration / maps.index.sensor.max_penetration)
 
 
 def explore(maps: ContactMaps, query: ContactQuery, coarse: Array, contacts: int, rng: np.random.Generator) -> Explored:
@@ -136,7 +139,7 @@ def explore(maps: ContactMaps, query: ContactQuery, coarse: Array, contacts: int
     measure = maps.index.weight.sum(0, dtype=float)
     measure /= measure.sum()
     share = (1 - _UNIFORM) * coarse / coarse.sum() + _UNIFORM * measure
-    sampler = _Sampler(maps, query, np.log(share / measure))
+    sampler = _Sampler(maps, query, measure, np.log(share / measure))
     n = max(contacts // (_DRAWS * _CUTS + _MOVES * _STEPS), 20)
     particles, log_weight, cut = sampler.draw(share, _DRAWS * n, rng)
     # the first exponent is the one that the draws suit best
@@ -168,8 +171,13 @@ def _effective(log_weight: Array) -> float:
 
 
 def _resampled(log_weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """``n`` rows by their weight, as evenly as can be (systematic resampling)."""
-    total = np.cumsum(np.exp(log_weight - log_weight.max()))
+    """``n`` rows by their weight."""
+    return _systematic(np.exp(log_weight - log_weight.max()), n, rng)
+
+
+def _systematic(weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """``n`` rows by their ``weight`` (m,), as evenly as can be (systematic resampling)."""
+    total = np.cumsum(weight)
     return np.minimum(np.searchsorted(total, (np.arange(n) + rng.random()) / n * total[-1]), len(total) - 1)
 
 
@@ -187,10 +195,12 @@ def _next_step(particles: Particles, power: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Sampler:
-    """Draws and moves of poses for one touch; ``log_coarse`` (n,) is the coarse log density of the index's places."""
+    """Draws and moves of poses for one touch; ``measure`` (n,) and ``log_coarse`` (n,) are the uniform measure and the coarse log
+    density of the index's places."""
 
     maps: ContactMaps
     query: ContactQuery
+    measure: Array
     log_coarse: Array
 
     def log_target(self, particles: Particles, power: float) -> Array:
@@ -224,7 +234,7 @@ class _Sampler:
         index, n = self.maps.index, len(particles)
         scale = size * 10 ** -rng.random((n, 1))
         turn = Rotation.from_rotvec(scale * _TURN * rng.normal(size=(n, 3))).as_matrix()
-        shift = scale * _WIDTH * _sample(self.maps) * rng.normal(size=(n, 3))
+        shift = scale * _WIDTH * sample_pitch(index.sensor) * rng.normal(size=(n, 3))
         about = np.array([*self.query.centroid, 0.0])
         T = self.transforms(particles.poses, particles.depth)
         moved = T.copy()
@@ -257,20 +267,20 @@ class _Sampler:
         A place is drawn by its ``share`` (m,), a rotation uniformly in its cell, a centre in its lattice cell. A weight is the
         uniform density over that of the draw, over n.
         """
-        index, total = self.maps.index, np.cumsum(share)
-        place = np.minimum(np.searchsorted(total, (np.arange(n) + rng.random()) / n * total[-1]), len(share) - 1)
+        index = self.maps.index
+        place = _systematic(share, n, rng)
         rotation = index.directions.draw(index.rotation[place], rng)
-        direction = (np.searchsorted(index.directions.first_turn, index.rotation[place], "right") - 1).astype(np.int32)
+        direction = index.directions.direction_of_rotation(index.rotation[place]).astype(np.int32)
         step = index.resolution.step
         middle = np.rint(index.shift[place] / step) * step
         reach = index.height[0, place].astype(float) + index.resolution.penetrations[0]
         poses = Placements(direction, rotation, middle, reach)
         target, cut = _aligned(self.maps, self.query, poses, step)
-        centre, density = _centres(target, middle, step, _WIDTH * _sample(self.maps), rng)
+        centre, density = _centres(target, middle, step, _WIDTH * sample_pitch(index.sensor), rng)
         particles = self.evaluated(replace(poses, centre=centre), place, lambda _: rng.random(n))
         # the measure of a whole cell, of which only the share touches that ``touching`` says
-        volume = index.weight.sum(0, dtype=float)[place] / index.weight.sum(dtype=float) / index.touching[place]
-        return particles, np.log(volume) - np.log(share[place] / total[-1]) - np.log(density * n), cut + n
+        volume = self.measure[place] / index.touching[place]
+        return particles, np.log(volume) - np.log(share[place]) - np.log(density * n), cut + n
 
 
 def _aligned(maps: ContactMaps, query: ContactQuery, poses: Placements, step: float) -> tuple[Array, int]:
@@ -285,7 +295,7 @@ def _aligned(maps: ContactMaps, query: ContactQuery, poses: Placements, step: fl
         centre[near] += np.where(compared.touches[:, None], query.centroid - compared.centroid, np.nan)
         reach[near] = compared.reach
         off = np.abs(centre - poses.centre).max(1)
-        inside = off <= 0.5 * step + 2 * _WIDTH * _sample(maps)
+        inside = off <= 0.5 * step + 2 * _WIDTH * sample_pitch(maps.index.sensor)
         centre[~inside] = np.nan
         near = np.flatnonzero(inside)
     return centre, cut
@@ -308,9 +318,3 @@ def _centres(
     centre = np.where(aligned[:, None], np.clip(normal, low, high), uniform)
     density = np.exp(-0.5 * ((centre - about) / width) ** 2) / (np.sqrt(2 * np.pi) * width * within) * step
     return centre, (1 - share) + share * density.prod(1)
-
-
-def _sample(maps: ContactMaps) -> float:
-    """Pitch of the window's samples [m]."""
-    sensor = maps.index.sensor
-    return float(np.sqrt(sensor.pixel_area(sensor.along(SHAPE))))

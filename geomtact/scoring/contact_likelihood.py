@@ -21,6 +21,7 @@ from scipy.special import logsumexp
 
 from geomtact.contact_space.contact_maps import BLOCK, SHAPE
 from geomtact.kernels.contact_energy import DEPTHS, Samples
+from geomtact.scoring.outline import from_outline
 from geomtact.se3 import Array
 from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
@@ -85,7 +86,7 @@ class ContactQuery:
 def _samples(touched: NDArray[np.bool_], pitch: float, sensor: Sensor) -> Samples:
     """Samples of the window, weighed by their distance from the outline of ``touched`` (H, W)."""
     shape = sensor.along(SHAPE)
-    beside = np.clip(_beyond(~touched, pitch) - _beyond(touched, pitch), -_LIMIT, _LIMIT).astype(np.float32)
+    beside = np.clip(from_outline(touched, pitch), -_LIMIT, _LIMIT)
     weight = cv2.resize(beside, shape[::-1], interpolation=cv2.INTER_AREA) * sensor.pixel_area(shape)
     blocks = (shape[0] // BLOCK, shape[1] // BLOCK)
     x, y = sensor.pixel_centres(shape)
@@ -102,16 +103,6 @@ def _samples(touched: NDArray[np.bool_], pitch: float, sensor: Sensor) -> Sample
     return Samples(
         middle.astype(np.float32), within.astype(np.float32), blockwise(sag), weight, float(np.minimum(weight, 0).sum())
     )
-
-
-def _beyond(inside: NDArray[np.bool_], pitch: float) -> NDArray[np.float32]:
-    """How far (H, W) [m] each pixel of ``inside`` lies from the nearest other pixel's border; 0 for the others."""
-    if not inside.any():
-        return np.zeros(inside.shape, np.float32)
-    if inside.all():
-        return np.full(inside.shape, _LIMIT, np.float32)
-    steps = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(pitch * np.maximum(steps - 0.5, 0), np.float32)
 
 
 def _at(energy: NDArray[np.float32], depth: Array) -> Array:

@@ -53,7 +53,7 @@ class OutlineLikelihood:
         most = min(len(points), _POINTS)
         some = (np.arange(most) + np.random.default_rng(0).random(most)) * len(points) / max(most, 1)
         return cls(
-            _beside(mask, float(np.sqrt(pitch.prod()))),
+            from_outline(mask, float(np.sqrt(pitch.prod()))),
             pitch,
             points[some.astype(int)],
             float(length.sum()),
@@ -95,7 +95,7 @@ def _squared(distance: NDArray[np.floating], strength: float) -> Array:
     return np.asarray(np.minimum(distance / strength, _OUTLIER).clip(-_OUTLIER) ** 2)
 
 
-def _beside(mask: NDArray[np.bool_], pitch: float) -> NDArray[np.float32]:
+def from_outline(mask: NDArray[np.bool_], pitch: float) -> NDArray[np.float32]:
     """How far (H, W) [m] each pixel is outside the outline of ``mask``, negative inside; the window's border is no outline."""
     image = mask.astype(np.uint8)
     far = float(np.hypot(*mask.shape))

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from geomtact.contact_space.contact_class import contact_class
-from geomtact.contact_space.contact_maps import ContactMaps, Placements
+from geomtact.contact_space.contact_maps import ContactMaps
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touches import Touch
-from geomtact.inference.sampler import explore
+from geomtact.inference.sampler import explore, log_likelihood_at
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
 from geomtact.scoring.contact_likelihood import ContactQuery
@@ -60,9 +60,13 @@ def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int,
     for number, touch in enumerate(touches[first:], first):
         rng = np.random.default_rng([seed, number])
         query = ContactQuery.of(touch.mask, localizers[-1].sensor)
-        roots = [_root(localizer, each, query, touch, rng) for localizer, each in zip(localizers, maps, strict=True)]
+        log_masses = [_coarse(localizer, touch) for localizer in localizers]
+        roots = [
+            _root(each.index, log_mass.ravel(), each, query, touch, rng)
+            for each, log_mass in zip(maps, log_masses, strict=True)
+        ]
         rank, coarse, in_cell, touching = zip(*roots, strict=True)
-        mass = np.exp(_coarse(localizers[-1], touch)).sum(0)
+        mass = np.exp(log_masses[-1]).sum(0)
         found = [explore(maps[-1], query, mass, contacts, rng) for contacts in CONTACTS]
         T, depth = touch.T_sensor_object[None], np.array([touch.penetration])
         gain = [float(each.log_density(T, depth)[0]) for each in found]
@@ -90,15 +94,17 @@ def _coarse(localizer: Localizer, touch: Touch) -> Array:
 
 
 def _root(
-    localizer: Localizer, maps: ContactMaps, query: ContactQuery, touch: Touch, rng: np.random.Generator
+    index: Index,
+    log_mass: Array,
+    maps: ContactMaps,
+    query: ContactQuery,
+    touch: Touch,
+    rng: np.random.Generator,
 ) -> tuple[int, float, float, float]:
     """Rank of the true cell, coarse gain and gain within the cell, and the share of the cell that touches."""
-    index, log_mass = localizer.index, _coarse(localizer, touch).ravel()
     true = int(index.lookup(touch.T_sensor_object[None], np.array([touch.penetration]))[0])
     inside = _in_cell(index, maps, query, true, rng)
-    at_truth = _log_likelihood(
-        maps, query, maps.locate(touch.T_sensor_object[None], np.array([touch.penetration])), touch.penetration
-    )
+    at_truth = log_likelihood_at(maps, query, touch.T_sensor_object[None], [touch.penetration])
     together = np.concatenate([at_truth, inside])
     return (
         int((log_mass > log_mass[true]).sum()),
@@ -111,15 +117,8 @@ def _root(
 def _in_cell(index: Index, maps: ContactMaps, query: ContactQuery, cell: int, rng: np.random.Generator) -> Array:
     """Log likelihoods (n,) of poses drawn evenly in a cell, of those that touch."""
     T, depth = index.draw(np.full(_IN_CELL, cell), rng)
-    poses = maps.locate(T, depth)
-    found = _log_likelihood(maps, query, poses, depth)
+    found = log_likelihood_at(maps, query, T, depth)
     return found[np.isfinite(found)]
-
-
-def _log_likelihood(maps: ContactMaps, query: ContactQuery, poses: Placements, depth: Any) -> Array:
-    compared = maps.compare(query.samples, poses, query.area)
-    share = np.broadcast_to(depth, len(poses.reach)) / maps.index.sensor.max_penetration
-    return query.log_likelihood(compared.energy, share)
 
 
 def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
