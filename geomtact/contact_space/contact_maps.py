@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from geomtact.contact_space.heightmap import HeightMap
 from geomtact.contact_space.index import Index
 from geomtact.geometry.approach import facing
-from geomtact.kernels.contact_energy import Maps, Samples, contact_energy
+from geomtact.kernels.contact_energy import BLOCK, Cut, Maps, Poses, Samples, contact_energy
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
 SHAPE = (48, 64)  # samples of the window, lying
-BLOCK = 4  # samples along each side of a block
 _PIXELS_PER_SAMPLE = 2  # of the height maps
 _THREADS = 2
 _PART = 512  # poses that a thread takes at a time
@@ -34,37 +33,18 @@ class Placements:
 
     Attributes
     ----------
+    place : (n,) of the index
     direction : (n,) cell of the index's approach directions
     rotation : (n, 3, 3) R_sensor_object
     centre : (n, 2) object's centre along x and y, sensor frame [m]
-    reach : (n,) how far the object reaches beyond its centre, in the window [m]: a guess, or as it was found
+    reach : (n,) a guess of how far the object reaches beyond its centre, in the window [m]
     """
 
+    place: NDArray[np.int64]
     direction: NDArray[np.int32]
     rotation: Array
     centre: Array
     reach: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """What a comparison of n contacts with the observed one gives; see ``kernels.contact_energy``.
-
-    Attributes
-    ----------
-    energy : (n, depths) [m^3]; inf where the object is not in the window
-    reach : (n,) [m]; -inf where the object is not in the window
-    centroid : (n, 2) of the contact [m]
-    """
-
-    energy: NDArray[np.float32]
-    reach: NDArray[np.float32]
-    centroid: NDArray[np.float32]
-
-    @property
-    def touches(self) -> NDArray[np.bool_]:
-        """Where (n,) the object is in the window."""
-        return np.isfinite(self.reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,29 +77,48 @@ class ContactMaps:
         """Rotations (D, 3, 3) from the maps' frames into the object's."""
         return np.swapaxes(facing(self.index.directions.vectors), 1, 2)
 
-    def locate(self, T: Array, penetration: Array) -> Placements:
-        """The poses ``T_sensor_object`` (n, 4, 4), which press ``penetration`` (n,) [m] deep; images under the symmetry may stand
-        for them."""
-        image, direction, _ = self.index.directions.lookup(np.asarray(T, float).reshape(-1, 4, 4))
-        centre = image[:, :3, :3] @ self.index.mesh.centre + image[:, :3, 3]
-        return Placements(direction.astype(np.int32), image[:, :3, :3], centre[:, :2], centre[:, 2] + penetration)
+    def locate(self, T: Array) -> tuple[Placements, Array]:
+        """The poses ``T_sensor_object`` (n, 4, 4), for which images under the symmetry may stand, and how far the membrane's apex
+        is beyond the object's centre (n,) [m]."""
+        index = self.index
+        image, direction, turn = index.directions.lookup(np.asarray(T, float).reshape(-1, 4, 4))
+        R, centre = image[:, :3, :3], image[:, :3, :3] @ index.mesh.centre + image[:, :3, 3]
+        place = index.place_of(index.directions.first_turn[direction] + turn, centre)
+        reach = centre[:, 2] + 0.5 * index.sensor.max_penetration
+        return Placements(place, direction.astype(np.int32), R, centre[:, :2], reach), centre[:, 2]
 
-    def compare(self, samples: Samples, poses: Placements, area: float) -> Compared:
-        """The contacts at ``poses`` compared with the one that ``samples`` describe, whose area is that of ``area`` samples."""
+    def compare(
+        self,
+        samples: Samples,
+        area: float,
+        poses: Placements,
+        membrane: Array | None = None,
+        depth: Array | None = None,
+    ) -> Cut:
+        """The contacts at ``poses`` compared with the observed one.
+
+        Parameters
+        ----------
+        samples : that describe the observed contact
+        area : of it, in samples
+        membrane : (n,) how far the membrane's apex is beyond the object's centre [m], or else
+        depth : (n,) the penetration [m]; by default the deepest
+        """
         # from the frame of each map into the sensor's
-        tilt = (poses.rotation @ self._from_maps[poses.direction]).astype(np.float32)
-        centre, reach = poses.centre.astype(np.float32), poses.reach.astype(np.float32)
-        deepest = self.index.sensor.max_penetration
+        tilt = poses.rotation @ self._from_maps[poses.direction]
+        n, deepest = len(poses.reach), self.index.sensor.max_penetration
+        membrane = np.full(n, np.nan) if membrane is None else membrane
+        depth = np.full(n, deepest) if depth is None else depth
+        numbers = [each.astype(np.float32) for each in (tilt, poses.centre, poses.reach, membrane, depth)]
 
-        def some(start: int) -> tuple[NDArray[np.float32], ...]:
+        def some(start: int) -> Cut:
             part = slice(start, start + _PART)
-            arrays = (poses.direction[part], tilt[part], centre[part], reach[part])
-            return contact_energy(self.maps, samples, *arrays, deepest, area)
+            asked = Poses(poses.direction[part], *(each[part] for each in numbers))
+            return contact_energy(self.maps, samples, asked, deepest, area)
 
         with ThreadPoolExecutor(_THREADS) as pool:
-            found = list(pool.map(some, range(0, max(len(reach), 1), _PART)))
-        energy, reached, centroid = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-        return Compared(energy, reached, centroid)
+            found = list(pool.map(some, range(0, max(n, 1), _PART)))
+        return Cut(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
 
 def sample_pitch(sensor: Sensor) -> float:

@@ -3,7 +3,8 @@
 The density at a pose is the likelihood there over its mean, the evidence. So a posterior needs no cell about a pose: it needs the
 likelihood, which is made where it is asked for, and the evidence, a mean over the contact pose space. Both come from poses that
 are drawn where a coarse posterior puts its mass, weighed, and moved while the target goes, step by step, from the coarse density
-to the likelihood (Del Moral, Doucet and Jasra 2006). What is left are poses drawn from the posterior.
+to the likelihood (Del Moral, Doucet and Jasra 2006). What is left at a step are poses drawn from the posterior by a power of the
+likelihood. The posterior is a mixture of these (see ``scoring.contact_likelihood``).
 
 Given a rotation, a contact moves with the object. So the object's centre is drawn about where the contact's centroid is the
 observed one, and moves turn the object about that point of the membrane.
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp, ndtr, ndtri
 
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, sample_pitch
-from geomtact.scoring.contact_likelihood import ContactQuery
-from geomtact.se3 import Array, transform
+from geomtact.scoring.contact_likelihood import POWERS, WEIGHTS, ContactQuery
+from geomtact.se3 import Array, exp, inverse, log, transform
 
 # All constants choose where poses are drawn: they change how precise the evidence is, not what is estimated.
 _UNIFORM = 0.2  # share of the draws that go by the uniform measure
@@ -31,9 +33,12 @@ _WIDTH = 1.5  # standard deviation of aligned centres, in samples of the window
 _CUTS = 3  # contacts that are cut for a draw, at most
 _DRAWS = 4  # draws for each pose that is kept
 _MOVES = 2  # of every pose at each step
-_STEPS = 8  # that are usual, for the budget
+_STEPS = 9  # that are usual, for the budget
 _KEPT = 0.6  # share of the poses that the weights of a step leave effective
 _ACCEPTED = 0.25  # share of moves accepted at which their size stays
+_SMALL = 0.5  # share of the moves that are small motions
+_NEAR = 8  # poses among which the other one of a difference is drawn
+_ALONG = 1.0  # largest multiple of a difference
 _TURN = 0.1  # rad, standard deviation of the first moves; they differ by a factor of ten from pose to pose
 _EXPONENTS = np.geomspace(0.02, 1, 24)  # of the likelihood, that the first step may have
 _HALVINGS = 30
@@ -46,7 +51,7 @@ class Particles:
     Attributes
     ----------
     poses : n of them, their ``reach`` as it was found
-    depth : (n,) penetration, in shares of the deepest
+    depth : (n,) penetration [m]
     log_likelihood : (n,)
     log_coarse : (n,) log density of the coarse posterior
     """
@@ -59,74 +64,110 @@ class Particles:
     def __len__(self) -> int:
         return len(self.depth)
 
+    def log_target(self, power: float) -> Array:
+        """Log (n,) of the density of the posterior by a power of the likelihood, up to a constant; -inf where nothing is
+        touched."""
+        touches = np.isfinite(self.log_likelihood)
+        return np.where(touches, _log_target(self.log_likelihood, self.log_coarse, power), -np.inf)
+
     def take(self, rows: NDArray[np.int64]) -> Particles:
         """Those of ``rows`` (m,)."""
-        p = self.poses
-        poses = Placements(p.direction[rows], p.rotation[rows], p.centre[rows], p.reach[rows])
-        rest = (self.depth, self.log_likelihood, self.log_coarse)
-        return Particles(poses, *(each[rows] for each in rest))
+        return self._each(lambda a, _: a[rows], self)
 
-    def where(self, chosen: NDArray[np.bool_], other: Particles) -> Particles:
-        """``other`` where ``chosen`` (n,), else this."""
+    def put(self, rows: NDArray[np.int64], other: Particles) -> Particles:
+        """These with ``other`` (m,) at ``rows`` (m,)."""
 
-        def mixed(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-            return np.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), b, a)
+        def replaced(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+            a = a.copy()
+            a[rows] = b
+            return a
 
-        p, q = self.poses, other.poses
-        poses = Placements(
-            mixed(p.direction, q.direction),
-            mixed(p.rotation, q.rotation),
-            mixed(p.centre, q.centre),
-            mixed(p.reach, q.reach),
-        )
-        return Particles(
-            poses,
-            mixed(self.depth, other.depth),
-            mixed(self.log_likelihood, other.log_likelihood),
-            mixed(self.log_coarse, other.log_coarse),
-        )
+        return self._each(replaced, other)
+
+    def _each(self, of: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]], other: Particles) -> Particles:
+        poses = Placements(*map(of, vars(self.poses).values(), vars(other.poses).values()))
+        mine, others = ((each.depth, each.log_likelihood, each.log_coarse) for each in (self, other))
+        return Particles(poses, *map(of, mine, others))
 
 
 @dataclass(frozen=True, eq=False)
 class Explored:
-    """The distribution of the pose after one touch.
+    """The distribution of the pose after one touch: a mixture of the posteriors by powers of the likelihood, ``POWERS``.
 
     Attributes
     ----------
     maps, query : contacts at any pose, and the observed one
-    particles : poses drawn from the distribution, equally probable
-    log_evidence : log of the mean likelihood over the contact pose space
+    log_coarse : (n,) log density of the coarse posterior at the places of the index
+    particles : of each posterior, poses drawn from it, equally probable
+    log_evidence : of each, the log of the mean of the power of the likelihood over the coarse posterior
     exponents : of the likelihood, step by step
     contacts : that were cut
     """
 
     maps: ContactMaps
     query: ContactQuery
-    particles: Particles
-    log_evidence: float
+    log_coarse: Array
+    particles: tuple[Particles, ...]
+    log_evidence: tuple[float, ...]
     exponents: tuple[float, ...]
     contacts: int
+
+    @cached_property
+    def weight(self) -> Array:
+        """Mass of each particle of all posteriors."""
+        return np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(self.particles, WEIGHTS, strict=True)])
+
+    @cached_property
+    def particle_log_density(self) -> Array:
+        """Log density at each particle of all posteriors."""
+        return np.concatenate([self._log_density(p.log_likelihood, p.log_coarse) for p in self.particles])
+
+    def _log_density(self, log_likelihood: Array, log_coarse: Array) -> Array:
+        each = [
+            np.log(weight) + _log_target(log_likelihood, log_coarse, power) - log_evidence
+            for power, weight, log_evidence in zip(POWERS, WEIGHTS, self.log_evidence, strict=True)
+        ]
+        return np.asarray(logsumexp(each, 0))
+
+    @cached_property
+    def poses(self) -> Array:
+        """T_sensor_object (n, 4, 4) of the particles of all posteriors."""
+        return np.concatenate([_transforms(p.poses, p.depth, self.maps.index.mesh.centre) for p in self.particles])
 
     @property
     def expected_gain(self) -> float:
         """Mean log density under the distribution itself [nats]."""
-        return float(self.particles.log_likelihood.mean()) - self.log_evidence
+        return float(self.weight @ self.particle_log_density)
 
-    def log_density(self, T: ArrayLike, penetration: ArrayLike) -> Array:
-        """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4) of the contact pose space that press
-        ``penetration`` (n,) [m] deep."""
-        return log_likelihood_at(self.maps, self.query, T, penetration) - self.log_evidence
+    def log_density(self, T: ArrayLike) -> Array:
+        """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4) of the contact pose space."""
+        poses, membrane = self.maps.locate(np.asarray(T, float))
+        energy = self.maps.compare(self.query.samples, self.query.area, poses, membrane).energy
+        return self._log_density(self.query.log_likelihood(energy), self.log_coarse[poses.place])
 
     def credible_level(self, log_density: float) -> float:
         """Mass of the poses that are denser than ``log_density``."""
-        return float((self.particles.log_likelihood - self.log_evidence > log_density).mean())
+        return float(self.weight @ (self.particle_log_density > log_density))
 
 
-def log_likelihood_at(maps: ContactMaps, query: ContactQuery, T: ArrayLike, penetration: ArrayLike) -> Array:
-    """Log likelihood (n,) of the observed contact at ``T_sensor_object`` (n, 4, 4), where ``penetration`` (n,) is in metres."""
-    penetration = np.asarray(penetration, float)
-    compared = maps.compare(query.samples, maps.locate(np.asarray(T, float), penetration), query.area)
-    return query.log_likelihood(compared.energy, penetration / maps.index.sensor.max_penetration)
+def _transforms(poses: Placements, depth: Array, middle: Array) -> Array:
+    """T_sensor_object (n, 4, 4) of an object with its centre at ``middle`` (3,), that presses ``depth`` (n,) [m] deep."""
+    height = np.where(np.isfinite(poses.reach), poses.reach, depth) - depth
+    return transform(poses.rotation, np.column_stack([poses.centre, height]) - poses.rotation @ middle)
+
+
+def _log_target(log_likelihood: Array, log_coarse: Array, power: float) -> Array:
+    """Log density (n,) of the posterior by a power of the likelihood, up to a constant."""
+    out = (1 - power) * log_coarse
+    if power > 0:
+        out = out + power * log_likelihood
+    return out
+
+
+def log_likelihood_at(maps: ContactMaps, query: ContactQuery, T: ArrayLike) -> Array:
+    """Log likelihood (n,) of the observed contact at ``T_sensor_object`` (n, 4, 4)."""
+    poses, membrane = maps.locate(np.asarray(T, float))
+    return query.log_likelihood(maps.compare(query.samples, query.area, poses, membrane).energy)
 
 
 def explore(maps: ContactMaps, query: ContactQuery, coarse: Array, contacts: int, rng: np.random.Generator) -> Explored:
@@ -141,26 +182,35 @@ def explore(maps: ContactMaps, query: ContactQuery, coarse: Array, contacts: int
     share = (1 - _UNIFORM) * coarse / coarse.sum() + _UNIFORM * measure
     sampler = _Sampler(maps, query, measure, np.log(share / measure))
     n = max(contacts // (_DRAWS * _CUTS + _MOVES * _STEPS), 20)
-    particles, log_weight, cut = sampler.draw(share, _DRAWS * n, rng)
+    drawn, log_weight, cut = sampler.draw(share, _DRAWS * n, rng)
     # the first exponent is the one that the draws suit best
-    first = [log_weight + sampler.log_target(particles, exponent) for exponent in _EXPONENTS]
-    best = int(np.argmax([_effective(each) for each in first]))
-    power, log_evidence = float(_EXPONENTS[best]), float(logsumexp(first[best]))
-    particles = particles.take(_resampled(first[best], n, rng))
-    exponents, size = [power], 1.0
+    first = [log_weight + drawn.log_target(exponent) for exponent in _EXPONENTS]
+    power = float(_EXPONENTS[int(np.argmax([_effective(each) for each in first]))])
+    # the posteriors by powers of at most this one are those of the draws
+    found, evidence = [], []
+    for each in (*(each for each in POWERS if each < power), power):
+        weight = log_weight + drawn.log_target(each)
+        evidence.append(float(logsumexp(weight)) if each > 0 else 0.0)
+        found.append(drawn.take(_resampled(weight, n, rng)))
+    particles, log_evidence, exponents, size = found[-1], evidence[-1], [power], 1.0
     while True:
         for _ in range(_MOVES):
             particles, accepted = sampler.move(particles, power, size, rng)
             size = float(np.clip(size * np.exp(accepted - _ACCEPTED), 1e-3, 1))
             cut += n
+        if power in POWERS:
+            found[POWERS.index(power) :] = [particles]
+            evidence[POWERS.index(power) :] = [log_evidence]
         if power >= 1:
             break
-        step = _next_step(particles, power)
-        change = step * (particles.log_likelihood - particles.log_coarse)
-        log_evidence += float(logsumexp(change)) - np.log(n)
-        particles, power = particles.take(_resampled(change, n, rng)), power + step
+        change = particles.log_likelihood - particles.log_coarse
+        after = min(each for each in POWERS if each > power)
+        step = min(_next_step(change, 1 - power), after - power)
+        log_evidence += float(logsumexp(step * change)) - np.log(n)
+        particles = particles.take(_resampled(step * change, n, rng))
+        power = after if step == after - power else power + step
         exponents.append(power)
-    return Explored(maps, query, particles, log_evidence, tuple(exponents), cut)
+    return Explored(maps, query, sampler.log_coarse, tuple(found), tuple(evidence), tuple(exponents), cut)
 
 
 def _effective(log_weight: Array) -> float:
@@ -181,15 +231,15 @@ def _systematic(weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.i
     return np.minimum(np.searchsorted(total, (np.arange(n) + rng.random()) / n * total[-1]), len(total) - 1)
 
 
-def _next_step(particles: Particles, power: float) -> float:
-    """By how much the exponent may grow so that the weights leave a share ``_KEPT`` of the poses effective."""
-    gain = particles.log_likelihood - particles.log_coarse
-    low, high = 0.0, 1 - power
-    if _effective(high * gain) >= _KEPT * len(gain):
-        return high
+def _next_step(change: Array, most: float) -> float:
+    """By how much, ``most`` at most, the exponent may grow so that weights of exp(step ``change``) leave a share ``_KEPT`` of the
+    poses effective."""
+    if _effective(most * change) >= _KEPT * len(change):
+        return most
+    low, high = 0.0, most
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if _effective(middle * gain) >= _KEPT * len(gain) else (low, middle)
+        low, high = (middle, high) if _effective(middle * change) >= _KEPT * len(change) else (low, middle)
     return max(low, 1e-4)
 
 
@@ -203,63 +253,63 @@ class _Sampler:
     measure: Array
     log_coarse: Array
 
-    def log_target(self, particles: Particles, power: float) -> Array:
-        """Log (n,) of the density that a step draws from, up to a constant."""
-        out = np.full(len(particles), -np.inf)
-        ok = np.isfinite(particles.log_likelihood)
-        out[ok] = power * particles.log_likelihood[ok] + (1 - power) * particles.log_coarse[ok]
-        return out
-
     def _admitted(self, poses: Placements, depth: Array, some: NDArray[np.bool_]) -> NDArray[np.bool_]:
         space = self.maps.index.space
         if space.cones is None and space.sensor.housing_depth is None:
             return np.ones(int(some.sum()), bool)
-        return space.admits(self.transforms(poses, depth)[some])
-
-    def transforms(self, poses: Placements, depth: Array) -> Array:
-        """T_sensor_object (n, 4, 4)."""
-        index = self.maps.index
-        with np.errstate(invalid="ignore"):
-            z = poses.reach - depth * index.sensor.max_penetration
-        centre = np.column_stack([poses.centre, np.where(np.isfinite(z), z, 0)])
-        return transform(poses.rotation, centre - poses.rotation @ index.mesh.centre)
+        return space.admits(_transforms(poses, depth, self.maps.index.mesh.centre)[some])
 
     def move(
         self, particles: Particles, power: float, size: float, rng: np.random.Generator
     ) -> tuple[Particles, float]:
-        """Every pose after one Metropolis step, and the share accepted.
+        """Every pose after one Metropolis step, and the share of small motions that was accepted.
 
-        A pose is turned about the observed contact's centroid and shifted: such a motion keeps the uniform measure.
+        Half of the poses move at a time: some by small motions, some by multiples of the motion from one pose of the other half
+        to another near it (ter Braak 2006), which follow the directions that the contact leaves open. Both keep the uniform
+        measure.
         """
-        index, n = self.maps.index, len(particles)
+        small = rng.random(len(particles)) < _SMALL
+        accepted = np.zeros(len(particles), bool)
+        half = rng.random(len(particles)) < 0.5
+        for some in (np.flatnonzero(half), np.flatnonzero(~half)):
+            others = np.setdiff1d(np.arange(len(particles)), some)
+            if not len(some) or len(others) < 2:
+                continue
+            T = _transforms(particles.poses, particles.depth, self.maps.index.mesh.centre)
+            moved = np.where(
+                small[some, None, None],
+                self._nudged(T[some], size, rng),
+                T[some] @ _differences(T[others], particles.poses.place[others], len(some), rng),
+            )
+            now = particles.take(some)
+            poses, membrane = self.maps.locate(moved)
+            new = self.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane)
+            accepted[some] = np.log(rng.random(len(some))) < new.log_target(power) - now.log_target(power)
+            particles = particles.put(some[accepted[some]], new.take(np.flatnonzero(accepted[some])))
+        return particles, float(accepted[small].mean()) if small.any() else _ACCEPTED
+
+    def _nudged(self, T: Array, size: float, rng: np.random.Generator) -> Array:
+        """``T`` (n, 4, 4) turned about the observed contact's centroid and shifted."""
+        n = len(T)
         scale = size * 10 ** -rng.random((n, 1))
         turn = Rotation.from_rotvec(scale * _TURN * rng.normal(size=(n, 3))).as_matrix()
-        shift = scale * _WIDTH * sample_pitch(index.sensor) * rng.normal(size=(n, 3))
+        shift = scale * _WIDTH * sample_pitch(self.maps.index.sensor) * rng.normal(size=(n, 3))
         about = np.array([*self.query.centroid, 0.0])
-        T = self.transforms(particles.poses, particles.depth)
-        moved = T.copy()
-        moved[:, :3, :3] = turn @ T[:, :3, :3]
-        moved[:, :3, 3] = np.einsum("nij,nj->ni", turn, T[:, :3, 3] - about) + about + shift
-        image, direction, j = index.directions.lookup(moved)
-        centre = image[:, :3, :3] @ index.mesh.centre + image[:, :3, 3]
-        guess = centre[:, 2] + particles.depth * index.sensor.max_penetration
-        poses = Placements(direction.astype(np.int32), image[:, :3, :3], centre[:, :2], guess)
-        place = index.place_of(index.directions.first_turn[direction] + j, centre)
-        other = self.evaluated(poses, place, lambda reach: (reach - centre[:, 2]) / index.sensor.max_penetration)
-        log_ratio = self.log_target(other, power) - self.log_target(particles, power)
-        accepted = np.log(rng.random(n)) < log_ratio
-        return particles.where(accepted, other), float(accepted.mean())
+        where = np.einsum("nij,nj->ni", turn, T[:, :3, 3] - about) + about + shift
+        return transform(turn @ T[:, :3, :3], where)
 
-    def evaluated(self, poses: Placements, place: NDArray[np.int64], depth_at: Callable[[Array], Array]) -> Particles:
-        """Poses at places (n,) as particles; ``depth_at`` gives their depth (n,) where the object's reach (n,) is found."""
-        compared = self.maps.compare(self.query.samples, poses, self.query.area)
-        found = replace(poses, reach=compared.reach.astype(float))
-        depth = depth_at(found.reach)
-        ok = compared.touches & (depth >= 0) & (depth <= 1)
+    def evaluated(self, poses: Placements, membrane: Array | None = None, depth: Array | None = None) -> Particles:
+        """n poses as particles, the membrane's apex ``membrane`` (n,) beyond their centre or ``depth`` (n,) deep."""
+        cut = self.maps.compare(self.query.samples, self.query.area, poses, membrane, depth)
+        found = replace(poses, reach=cut.reach.astype(float))
+        if depth is None:
+            assert membrane is not None
+            depth = found.reach - membrane
+        ok = np.isfinite(cut.energy[:, 0]) & (depth <= self.maps.index.sensor.max_penetration)
         ok[ok] = self._admitted(found, depth, ok)
         log_likelihood = np.full(len(depth), -np.inf)
-        log_likelihood[ok] = self.query.log_likelihood(compared.energy[ok], depth[ok])
-        return Particles(found, np.where(ok, depth, 0.0), log_likelihood, self.log_coarse[place])
+        log_likelihood[ok] = self.query.log_likelihood(cut.energy[ok])
+        return Particles(found, np.where(ok, depth, 0.0), log_likelihood, self.log_coarse[poses.place])
 
     def draw(self, share: Array, n: int, rng: np.random.Generator) -> tuple[Particles, Array, int]:
         """``n`` poses, their log weights (n,), and how many contacts were cut.
@@ -274,13 +324,23 @@ class _Sampler:
         step = index.resolution.step
         middle = np.rint(index.shift[place] / step) * step
         reach = index.height[0, place].astype(float) + index.resolution.penetrations[0]
-        poses = Placements(direction, rotation, middle, reach)
+        poses = Placements(place, direction, rotation, middle, reach)
         target, cut = _aligned(self.maps, self.query, poses, step)
         centre, density = _centres(target, middle, step, _WIDTH * sample_pitch(index.sensor), rng)
-        particles = self.evaluated(replace(poses, centre=centre), place, lambda _: rng.random(n))
+        depth = index.sensor.max_penetration * rng.random(n)
+        particles = self.evaluated(replace(poses, centre=centre), depth=depth)
         # the measure of a whole cell, of which only the share touches that ``touching`` says
         volume = self.measure[place] / index.touching[place]
         return particles, np.log(volume) - np.log(share[place]) - np.log(density * n), cut + n
+
+
+def _differences(T: Array, place: NDArray[np.int64], n: int, rng: np.random.Generator) -> Array:
+    """``n`` motions (n, 4, 4) in the object's frame, along those from poses ``T`` (m, 4, 4) to others at near places (m,)."""
+    order = np.argsort(place, kind="stable")
+    first = rng.integers(len(T), size=n)
+    second = (first + rng.integers(1, _NEAR + 1, size=n)) % len(T)
+    share = _ALONG * rng.choice([-1.0, 1.0], n) * 10 ** -rng.random(n)
+    return exp(share[:, None] * log(inverse(T[order[first]]) @ T[order[second]]))
 
 
 def _aligned(maps: ContactMaps, query: ContactQuery, poses: Placements, step: float) -> tuple[Array, int]:
@@ -289,11 +349,12 @@ def _aligned(maps: ContactMaps, query: ContactQuery, poses: Placements, step: fl
     centre, cut, near = poses.centre.copy(), 0, np.arange(len(poses.reach))
     reach = poses.reach.copy()
     for _ in range(_CUTS - 1):
-        some = Placements(poses.direction[near], poses.rotation[near], centre[near], reach[near])
-        compared = maps.compare(query.samples, some, query.area)
+        some = Placements(poses.place[near], poses.direction[near], poses.rotation[near], centre[near], reach[near])
+        found = maps.compare(query.samples, query.area, some)
         cut += len(near)
-        centre[near] += np.where(compared.touches[:, None], query.centroid - compared.centroid, np.nan)
-        reach[near] = compared.reach
+        touches = np.isfinite(found.reach)[:, None]
+        centre[near] += np.where(touches, query.centroid - found.centroid, np.nan)
+        reach[near] = found.reach
         off = np.abs(centre - poses.centre).max(1)
         inside = off <= 0.5 * step + 2 * _WIDTH * sample_pitch(maps.index.sensor)
         centre[~inside] = np.nan

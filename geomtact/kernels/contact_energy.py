@@ -1,9 +1,9 @@
 """How badly the contacts at many poses fit an observed one: cut from height maps and compared, in one compiled loop.
 
 A height map shows the object along one direction. The object tilted by a few degrees from there is the same surface, seen
-along a sheared map: so one map serves all poses about its direction. The contact at a pose holds the points that reach at
-most an *effective depth* less far than the object's deepest point in the window. So one cut gives the contacts at every
-depth, of a rigid gel and of one that is touched only from a share of the depth on.
+along a sheared map: so one map serves all poses about its direction. A rigid gel is touched where the object is below the
+membrane, an elastic one nearly where it is within a share of the depth of the deepest points about it: one cut gives the contacts
+at all shares.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-DEPTHS = 17  # effective depths at which contacts are compared, evenly from 0 to the deepest penetration
+BLOCK = 4  # samples along each side of a block
+SHARES = 40  # of the depth at which contacts are compared: ((j + 1) / SHARES)^2, the last one a rigid gel's
 _ROUNDS = 3  # cuts at most, until the height of the membrane over the map is known
 _NOTHING = -500.0  # m: lower heights mean that the object is not there
-_SETTLED = 1e-4  # m: by how much a further round may move the window over the map
+_SETTLED = 2e-5  # m: by how much a further round may move the window over the map
 
 
 class Maps(NamedTuple):
@@ -40,13 +41,16 @@ class Samples(NamedTuple):
 
     Attributes
     ----------
+    rows, columns : of blocks, B together
     block : (B, 2) centre of each block on the membrane [m]
-    within : (S, 2) each sample from its block's centre [m]
+    within : (BLOCK^2, 2) each sample from its block's centre [m], row by row
     sag : (B, S) by how much the membrane lies below its apex there [m]
     weight : (B, S) energy of a sample in contact less that of one that is not
-    least : sum of the negative weights, which the observed contact itself would have
+    least : [m^3] sum of the negative weights, which the observed contact itself would have
     """
 
+    rows: int
+    columns: int
     block: NDArray[np.float32]
     within: NDArray[np.float32]
     sag: NDArray[np.float32]
@@ -54,57 +58,55 @@ class Samples(NamedTuple):
     least: float
 
 
-def contact_energy(
-    maps: Maps,
-    samples: Samples,
-    direction: NDArray[np.int32],
-    tilt: NDArray[np.float32],
-    centre: NDArray[np.float32],
-    reach: NDArray[np.float32],
-    deepest: float,
-    area: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Energies of the contacts at n poses: 0 for a contact that is the observed one, larger for worse ones.
+class Poses(NamedTuple):
+    """n poses of the object.
 
-    Parameters
+    Attributes
     ----------
     direction : (n,) map of each pose
     tilt : (n, 3, 3) rotation from that map's frame into the sensor's
     centre : (n, 2) object's centre along x and y, sensor frame [m]
     reach : (n,) first guess of how far the object reaches beyond its centre, in the window [m]
-    deepest : largest effective depth [m]
-    area : of the observed contact, in samples: centroids are those of contacts of that area, or of the deepest ones
+    membrane : (n,) how far the membrane's apex is beyond the object's centre [m]; NaN where ``depth`` says how deep it is
+    depth : (n,) penetration [m]
+    """
 
-    Returns
-    -------
-    energy : (n, DEPTHS); inf where the object is not in the window
+    direction: NDArray[np.int32]
+    tilt: NDArray[np.float32]
+    centre: NDArray[np.float32]
+    reach: NDArray[np.float32]
+    membrane: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+
+class Cut(NamedTuple):
+    """What n poses' contacts are, compared with the observed one.
+
+    Attributes
+    ----------
+    energy : (n, SHARES) 0 for a contact that is the observed one, larger for worse ones; inf where nothing is touched
     reach : (n,) how far the object reaches beyond its centre [m]; -inf where it is not in the window
     centroid : (n, 2) of the contact [m]
     """
-    n = len(direction)
-    energy = np.zeros((n, DEPTHS), np.float32)
-    found = np.zeros(n, np.float32)
-    centroid = np.zeros((n, 2), np.float32)
-    _contact_energy(
-        maps.heights,
-        maps.widest,
-        np.float32(1 / maps.pixel),
-        samples.block,
-        samples.within,
-        samples.sag,
-        samples.weight,
-        np.float32(samples.least),
-        direction,
-        tilt,
-        centre,
-        reach,
-        np.float32(deepest),
-        np.float32(area),
-        energy,
-        found,
-        centroid,
-    )
-    return energy, found, centroid
+
+    energy: NDArray[np.float32]
+    reach: NDArray[np.float32]
+    centroid: NDArray[np.float32]
+
+
+def contact_energy(maps: Maps, samples: Samples, poses: Poses, deepest: float, area: float) -> Cut:
+    """Cut the contacts at n poses and compare them.
+
+    Parameters
+    ----------
+    deepest : largest penetration [m]
+    area : of the observed contact, in samples: centroids are those of contacts of that area, or of the rigid ones
+    """
+    n = len(poses.direction)
+    cut = Cut(np.zeros((n, SHARES), np.float32), np.zeros(n, np.float32), np.zeros((n, 2), np.float32))
+    numbers = np.float32(1 / maps.pixel), np.float32(deepest), np.float32(area)
+    _contact_energy(maps.heights, maps.widest, *numbers, *samples, *poses, *cut)
+    return cut
 
 
 @numba.njit(fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, nogil=True, cache=True)  # type: ignore[untyped-decorator]
@@ -112,6 +114,10 @@ def _contact_energy(  # type: ignore[no-untyped-def]
     heights,
     widest,
     per_pixel,
+    deepest,
+    area,
+    rows,
+    columns,
     block,
     within,
     sag,
@@ -121,8 +127,8 @@ def _contact_energy(  # type: ignore[no-untyped-def]
     tilt,
     centre,
     reach,
-    deepest,
-    area,
+    membrane,
+    depth,
     energy,
     found,
     centroid,
@@ -132,18 +138,19 @@ def _contact_energy(  # type: ignore[no-untyped-def]
     size = heights.shape[1]
     half = np.float32(size // 2 + 0.5)
     one, nothing, empty = np.float32(1), np.float32(-1e3), np.float32(_NOTHING)
-    bins = DEPTHS - 1
-    per_depth, middle = np.float32(bins / deepest), np.float32(0.5) * deepest
+    middle = np.float32(0.5) * deepest
     surface = np.empty((blocks, samples), np.float32)
     highest = np.empty(blocks, np.float32)
     cut = np.empty(blocks, np.uint8)
-    sums = np.empty((DEPTHS, 3), np.float32)
+    sums = np.empty((SHARES, 3), np.float32)
+    deep, wide_deep = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
     # how much higher than at its centre a tilted block may be
     beside = max(np.abs(within[:, 0]).max(), np.abs(within[:, 1]).max()) + np.float32(0.5) / per_pixel
     for i in range(n):
         height, wide, r = heights[direction[i]], widest[direction[i]], tilt[i]
         tx, ty, lean_x, lean_y, up = r[0, 2], r[1, 2], r[2, 0], r[2, 1], r[2, 2]
-        # where the map is met by the window, on the plane in the middle of the deepest contact
+        # where the map is met by the window, on the plane in the middle of the deepest contact; it is known at once where the
+        # membrane is, else once the reach is
         a, b = r[0, 0] - tx * lean_x / up, r[0, 1] - tx * lean_y / up
         c, d = r[1, 0] - ty * lean_x / up, r[1, 1] - ty * lean_y / up
         scale = one / (a * d - b * c)
@@ -151,7 +158,8 @@ def _contact_energy(  # type: ignore[no-untyped-def]
         slack = (abs(lean_x) + abs(lean_y)) * beside
         guess, best = reach[i], nothing
         for _ in range(_ROUNDS):
-            off_x, off_y = centre[i, 0] - tx * (guess - middle) / up, centre[i, 1] - ty * (guess - middle) / up
+            plane = (guess - depth[i] if np.isnan(membrane[i]) else membrane[i]) + middle
+            off_x, off_y = centre[i, 0] - tx * plane / up, centre[i, 1] - ty * plane / up
             best, top = nothing, nothing
             for k in range(blocks):
                 x, y = block[k, 0] - off_x, block[k, 1] - off_y
@@ -165,7 +173,7 @@ def _contact_energy(  # type: ignore[no-untyped-def]
                 top = max(top, h)
             if top < empty:
                 break
-            limit = top - deepest
+            limit = top - deepest if np.isnan(membrane[i]) else max(membrane[i], top - deepest)
             for _again in range(2):
                 for k in range(blocks):
                     if cut[k] or highest[k] < limit:
@@ -181,37 +189,77 @@ def _contact_energy(  # type: ignore[no-untyped-def]
                             h = up * height[row, column] - lean_x * u - lean_y * v - sag[k, j]
                         surface[k, j] = h
                         best = max(best, h)
-                limit = empty if best < empty else best - deepest
-            if best < empty:
+                lowest = best - depth[i] if np.isnan(membrane[i]) else membrane[i]
+                limit = empty if best < empty else max(lowest, best - deepest)
+            if best < empty or not np.isnan(membrane[i]):
                 break
             moves = abs(best - guess) * (abs(tx) + abs(ty))
             guess = best
             if moves < np.float32(_SETTLED):
                 break
-        if best < empty:
-            found[i] = -np.inf
-            energy[i] = np.inf
+        lowest = best - depth[i] if np.isnan(membrane[i]) else membrane[i]
+        found[i] = best if best > empty else -np.inf
+        energy[i] = np.inf
+        if best < empty or best <= lowest:
             continue
-        found[i] = best
+        energy[i] = 0
         sums[:] = 0
+        for k in range(blocks):
+            deep[k // columns, k % columns] = max(surface[k].max() - lowest, np.float32(0)) if cut[k] else np.float32(0)
+        _smooth_maximum(deep, wide_deep)
         for k in range(blocks):
             if not cut[k]:
                 continue
             for j in range(samples):
-                depth = (best - surface[k, j]) * per_depth
-                if depth < bins:
-                    e = int(depth)
-                    share = depth - np.float32(e)
-                    energy[i, e + 1] += weight[k, j] * (one - share)
-                    if e + 2 < DEPTHS:
-                        energy[i, e + 2] += weight[k, j] * share
-                    sums[e + 1, 0] += one
-                    sums[e + 1, 1] += block[k, 0] + within[j, 0]
-                    sums[e + 1, 2] += block[k, 1] + within[j, 1]
-        energy[i, 0] = -least
+                pressed = surface[k, j] - lowest
+                if pressed > 0:
+                    about = _between_blocks(wide_deep, k // columns, k % columns, j // BLOCK, j % BLOCK)
+                    e = int(np.sqrt(max(one - pressed / about, np.float32(0))) * SHARES)
+                    energy[i, e] += weight[k, j]
+                    sums[e, 0] += one
+                    sums[e, 1] += block[k, 0] + within[j, 0]
+                    sums[e, 2] += block[k, 1] + within[j, 1]
+        energy[i, 0] -= least
         count, sum_x, sum_y = sums[0]
-        for e in range(1, DEPTHS):
+        for e in range(1, SHARES):
             energy[i, e] += energy[i, e - 1]
             if count < area:
                 count, sum_x, sum_y = count + sums[e, 0], sum_x + sums[e, 1], sum_y + sums[e, 2]
         centroid[i, 0], centroid[i, 1] = sum_x / count, sum_y / count
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _smooth_maximum(field, out):  # type: ignore[no-untyped-def]
+    """Writes the mean over three by three entries of the maximum over three by three of ``field`` (h, w) to ``out``; what lies
+    beyond the border repeats it. ``field`` is overwritten."""
+    h, w = field.shape
+    for y in range(h):
+        for x in range(w):
+            out[y, x] = max(field[y, max(x - 1, 0)], field[y, x], field[y, min(x + 1, w - 1)])
+    for y in range(h):
+        for x in range(w):
+            field[y, x] = max(out[max(y - 1, 0), x], out[y, x], out[min(y + 1, h - 1), x])
+    third = np.float32(1 / 3)
+    for y in range(h):
+        for x in range(w):
+            out[y, x] = (field[y, max(x - 1, 0)] + field[y, x] + field[y, min(x + 1, w - 1)]) * third
+    for y in range(h):
+        for x in range(w):
+            field[y, x] = (out[max(y - 1, 0), x] + out[y, x] + out[min(y + 1, h - 1), x]) * third
+    out[:] = field
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _between_blocks(field, y, x, row, column):  # type: ignore[no-untyped-def]
+    """``field`` (h, w), known at the centres of blocks, at a sample of block (y, x)."""
+    h, w = field.shape
+    off_y, off_x = (
+        (row + np.float32(0.5)) / BLOCK - np.float32(0.5),
+        (column + np.float32(0.5)) / BLOCK - np.float32(0.5),
+    )
+    y_1 = max(y - 1, 0) if off_y < 0 else min(y + 1, h - 1)
+    x_1 = max(x - 1, 0) if off_x < 0 else min(x + 1, w - 1)
+    off_y, off_x = abs(off_y), abs(off_x)
+    near = field[y, x] + off_x * (field[y, x_1] - field[y, x])
+    far = field[y_1, x] + off_x * (field[y_1, x_1] - field[y_1, x])
+    return near + off_y * (far - near)

@@ -6,8 +6,12 @@ summed along the outline: so the likelihood is that of a normally distributed di
 its area alone.
 
 A rigid gel is touched wherever the object is below the membrane. An elastic one is touched where the pressure is positive: that
-is nearly the contact at a share of the depth, half under a ball and less where several features press. Neither the gel nor the
-share is known, so both are marginalised over, pose by pose.
+is nearly where the object is within a share of the local depth from the deepest point, half of it under a ball and less where
+several features press. Neither the gel nor the share is known, so both are marginalised over, pose by pose.
+
+How far a contact is from any simulated one is not known either: by the noise alone, or by a gel that differs from the model. So
+the posterior is a mixture of posteriors, each by a power of the likelihood, from the coarse one (0) to the full one (1). Their
+weights are fitted like all else by the log score ("stacking", Yao et al. 2018).
 """
 
 from __future__ import annotations
@@ -16,26 +20,26 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
+from numpy.typing import NDArray
+from scipy.stats import beta
 
-from geomtact.contact_space.contact_maps import BLOCK, SHAPE
-from geomtact.kernels.contact_energy import DEPTHS, Samples
+from geomtact.contact_space.contact_maps import SHAPE
+from geomtact.kernels.contact_energy import BLOCK, SHARES, Samples
+from geomtact.kernels.gel_likelihood import gel_log_likelihood
 from geomtact.scoring.outline import from_outline
 from geomtact.se3 import Array
 from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
 
-# Chosen on 100 simulated touches (seed 700) of each of four objects on gelslim, for the mean log density at the true pose and
-# equal coverage of rigid and elastic touches; hand-picked among ten settings, not yet fitted.
-_RIGID_RATE, _ELASTIC_RATE = 8e9, 4e9  # nats for each m^3 of energy
-_CORRELATION = 4e-3  # m of outline that is displaced as one, which sets how the two rates compare
+# Fitted on procedural objects by ``python -m tools.training likelihood``, for the mean log density at the true pose: see
+# docs/results/contact-likelihood.json.
+RATE = 34.1e9  # nats for each m^3 of energy
+SHARE = (5.9, 11.1)  # of the beta distribution of an elastic contact's share of the depth
+POWERS = (0.0, 0.03, 0.1, 0.3, 1.0)  # of the likelihood, by the posteriors that are mixed; hand-set
+WEIGHTS = (0.009, 0.011, 0.133, 0.565, 0.282)  # of these posteriors
+RIGID = 0.5  # share of touches on a rigid gel
 _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more is added
-_SHARES = np.linspace(
-    0.15, 0.75, 7
-)  # effective depths of elastic contacts, in shares of the penetration; equally likely
-_RIGID = 0.5  # share of touches on a rigid gel
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +51,11 @@ class ContactQuery:
     samples : where and how contacts are compared
     centroid : (2,) of the contact [m]
     area : of the contact, in samples
-    outline : length of its outline [m]
     """
 
     samples: Samples
     centroid: Array
     area: float
-    outline: float
 
     @classmethod
     def of(cls, mask: SoftMask, sensor: Sensor) -> ContactQuery:
@@ -63,24 +65,32 @@ class ContactQuery:
         x, y = sensor.pixel_centres(touched.shape)
         count = touched.sum()
         centroid = np.array([touched.sum(0) @ x, touched.sum(1) @ y]) / count
-        edges = (touched[:, 1:] != touched[:, :-1]).sum() + (touched[1:] != touched[:-1]).sum()
         area = count * pitch**2 / sensor.pixel_area(sensor.along(SHAPE))
-        return cls(_samples(touched, pitch, sensor), centroid, float(area), float(np.pi / 4 * pitch * edges))
+        return cls(_samples(touched, pitch, sensor), centroid, float(area))
 
-    def log_likelihood(self, energy: NDArray[np.float32], depth: ArrayLike) -> Array:
-        """Log likelihood (n,) of the contact at poses whose contacts have ``energy`` (n, depths), up to a constant of the image;
-        -inf where that is inf.
+    def log_likelihood(self, energy: NDArray[np.float32]) -> Array:
+        """Log likelihood (n,) of the contact at poses whose contacts have ``energy`` (n, SHARES), up to a constant of the image;
+        -inf where that is inf."""
+        return gel_log_likelihood(energy, RATE, _LOG_SHARE)
 
-        Parameters
-        ----------
-        depth : (n,) penetration of each pose, in shares of the deepest
-        """
-        depth = np.asarray(depth, float)
-        independent = 0.5 * self.outline / _CORRELATION
-        rigid = np.log(_RIGID) + independent * np.log(_RIGID_RATE / _ELASTIC_RATE) - _RIGID_RATE * _at(energy, depth)
-        elastic = [-_ELASTIC_RATE * _at(energy, share * depth) for share in _SHARES]
-        each = np.log((1 - _RIGID) / len(_SHARES)) + np.stack(elastic)
-        return np.asarray(logsumexp(np.concatenate([rigid[None], each]), 0))
+
+def share_cells() -> tuple[Array, Array]:
+    """A share of the depth in the middle of each of the cells (SHARES,) about the shares that are compared, and their widths."""
+    edges = np.minimum((np.arange(SHARES + 1) + 0.5) / SHARES, 1) ** 2
+    edges[0] = 0
+    return 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+
+
+def _log_shares() -> Array:
+    """Log probability (SHARES,) of the shares of the depth, the last one a rigid gel's too."""
+    middle, width = share_cells()
+    elastic = beta.pdf(middle, *SHARE) * width
+    elastic *= (1 - RIGID) / elastic.sum()
+    elastic[-1] += RIGID
+    return np.log(np.maximum(elastic, 1e-300))
+
+
+_LOG_SHARE = _log_shares()
 
 
 def _samples(touched: NDArray[np.bool_], pitch: float, sensor: Sensor) -> Samples:
@@ -100,17 +110,5 @@ def _samples(touched: NDArray[np.bool_], pitch: float, sensor: Sensor) -> Sample
         return np.ascontiguousarray(parts.reshape(-1, BLOCK**2), np.float32)
 
     weight = blockwise(weight)
-    return Samples(
-        middle.astype(np.float32), within.astype(np.float32), blockwise(sag), weight, float(np.minimum(weight, 0).sum())
-    )
-
-
-def _at(energy: NDArray[np.float32], depth: Array) -> Array:
-    """``energy`` (n, depths) at effective depths ``depth`` (n,), in shares of the deepest: (n,)."""
-    where = np.clip(depth, 0, 1) * (DEPTHS - 1)
-    below = np.minimum(where.astype(np.int64), DEPTHS - 2)
-    row = np.arange(len(energy))
-    low, high = energy[row, below].astype(float), energy[row, below + 1].astype(float)
-    with np.errstate(invalid="ignore"):
-        between = low + (where - below) * (high - low)
-    return np.where(np.isfinite(low), between, np.inf)
+    least = float(np.minimum(weight, 0).sum())
+    return Samples(*blocks, middle.astype(np.float32), within.astype(np.float32), blockwise(sag), weight, least)

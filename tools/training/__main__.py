@@ -1,4 +1,7 @@
-"""``python -m tools.training encoder|contact``: train the bundled networks anew. A stopped run goes on where it was."""
+"""``python -m tools.training encoder|contact|likelihood``: train the bundled networks anew, fit the likelihood of contacts anew.
+
+A stopped run goes on where it was.
+"""
 
 from __future__ import annotations
 
@@ -55,6 +58,25 @@ def contact(
     with progress_bar("training") as progress:
         overlap = train_contact_network(out, folder_of(work, out), scenes, settings, start, progress)
     to_stderr(f"overlaps the contact by {overlap:.2f} on objects that it never saw")
+
+
+@app.command()
+def likelihood(
+    out: Annotated[Path, typer.Option(help="JSON file to write.")] = Path("contact-likelihood.json"),
+    objects: Annotated[int, typer.Option(min=2, help="Procedural objects to touch.")] = 16,
+    touches: Annotated[int, typer.Option(min=2, help="Touches of each.")] = 36,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    work: Work = None,
+) -> None:
+    """Fit what the likelihood of a contact depends on, on simulated touches of procedural objects.
+
+    The package holds the fitted numbers in scoring/contact_likelihood.py.
+    """
+    from tools.training.likelihood import fit_likelihood
+
+    with progress_bar("fitting") as progress:
+        found = fit_likelihood(out, folder_of(work, out), objects, touches, seed, progress)
+    to_stderr(f"{found.gain:.2f} nats at the true poses, {found.expected_gain:.2f} expected")
 
 
 def with_rate(settings: Any, rate: float | None) -> Any:

@@ -11,7 +11,7 @@ from geomtact.cli.shell import print_table
 from geomtact.cli.simulate import NoiseName
 from tools.studies.common import study_file, study_options
 
-SCHEMA = "geomtact/adaptive/1"
+SCHEMA = "geomtact/adaptive/2"
 
 
 def judge_adaptive(
@@ -71,7 +71,8 @@ def _print(parts: Mapping[str, Any]) -> None:
         for s in part["figures"]["sampled"]:
             off, half = s["expected_less_gain"]
             coverage = " ".join(f"{100 * each:.0f}" for each in s["coverage"])
-            figures = [f"{s['contacts']:,.0f}", f"{s['gain']:.2f}", f"{off:+.2f} +- {half:.2f}", coverage]
+            missed = f"{100 * s['missed']:.1f}"
+            figures = [f"{s['contacts']:,.0f}", f"{s['gain']:.2f}", f"{off:+.2f} +- {half:.2f}", coverage, missed]
             rows.append([name, *figures])
     headings = [
         "object",
@@ -79,5 +80,6 @@ def _print(parts: Mapping[str, Any]) -> None:
         "information gain [nats]",
         "expected less measured",
         "coverage [%] at 50 80 90 95",
+        "missed [%]",
     ]
     print_table(headings, rows, headings[1:])

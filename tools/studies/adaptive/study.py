@@ -38,7 +38,9 @@ class Outcome:
     coarse_gain : log density of the coarse posterior at the true pose
     in_cell_gain : log density at the true pose within its cell, by the likelihood; at most log 401
     touching : share of the true cell in which the object can touch
-    gain, expected_gain, level : of the sampler: at the true pose, by its own particles, credible level of the true pose
+    gain, expected_gain, level : of the sampler: at the true pose, at most that of the densest particle; by its own particles;
+        credible level of the true pose
+    missed : whether the true pose is denser than every particle of the sampler
     cut : contacts that the sampler cut
     """
 
@@ -51,6 +53,7 @@ class Outcome:
     gain: list[float]
     expected_gain: list[float]
     level: list[float]
+    missed: list[bool]
     cut: list[int]
 
 
@@ -68,8 +71,8 @@ def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int,
         rank, coarse, in_cell, touching = zip(*roots, strict=True)
         mass = np.exp(log_masses[-1]).sum(0)
         found = [explore(maps[-1], query, mass, contacts, rng) for contacts in CONTACTS]
-        T, depth = touch.T_sensor_object[None], np.array([touch.penetration])
-        gain = [float(each.log_density(T, depth)[0]) for each in found]
+        true = [float(each.log_density(touch.T_sensor_object[None])[0]) for each in found]
+        most = [float(each.particle_log_density.max()) for each in found]
         yield Outcome(
             touch.elastic,
             contact_class(localizers[-1].space, touch.T_sensor_object),
@@ -77,9 +80,10 @@ def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int,
             [float(each) for each in coarse],
             [float(each) for each in in_cell],
             [float(each) for each in touching],
-            gain,
+            [min(pair) for pair in zip(true, most, strict=True)],
             [each.expected_gain for each in found],
-            [each.credible_level(at) for each, at in zip(found, gain, strict=True)],
+            [each.credible_level(at) for each, at in zip(found, true, strict=True)],
+            [at > top for at, top in zip(true, most, strict=True)],
             [each.contacts for each in found],
         )
 
@@ -104,7 +108,7 @@ def _root(
     """Rank of the true cell, coarse gain and gain within the cell, and the share of the cell that touches."""
     true = int(index.lookup(touch.T_sensor_object[None], np.array([touch.penetration]))[0])
     inside = _in_cell(index, maps, query, true, rng)
-    at_truth = log_likelihood_at(maps, query, touch.T_sensor_object[None], [touch.penetration])
+    at_truth = log_likelihood_at(maps, query, touch.T_sensor_object[None])
     together = np.concatenate([at_truth, inside])
     return (
         int((log_mass > log_mass[true]).sum()),
@@ -116,16 +120,12 @@ def _root(
 
 def _in_cell(index: Index, maps: ContactMaps, query: ContactQuery, cell: int, rng: np.random.Generator) -> Array:
     """Log likelihoods (n,) of poses drawn evenly in a cell, of those that touch."""
-    T, depth = index.draw(np.full(_IN_CELL, cell), rng)
-    found = log_likelihood_at(maps, query, T, depth)
+    found = log_likelihood_at(maps, query, index.draw(np.full(_IN_CELL, cell), rng)[0])
     return found[np.isfinite(found)]
 
 
 def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Means over touches: what opening cells would gain at each of ``BUDGETS``, and what the sampler gains.
-
-    ``ruled_out`` is the share of touches whose true pose the sampler gives no density; means leave these out.
-    """
+    """Means over touches: what opening cells would gain at each of ``BUDGETS``, and what the sampler gains."""
     column = {name: np.array([getattr(o, name) for o in outcomes]) for name in Outcome.__dataclass_fields__}
     rank, coarse = column["rank"], column["coarse_gain"]
     # a sliver at the window's edge may lie between the samples: there nothing is gained
@@ -165,14 +165,12 @@ def _sampled(column: dict[str, Any], some: Any) -> list[dict[str, Any]]:
     """Figures of the sampler at each of ``CONTACTS``, over ``some`` of the touches."""
     out = []
     for k in range(len(CONTACTS)):
-        finite = np.isfinite(column["gain"][:, k])
-        kept = some & finite
-        gain, expected, level = (column[name][kept, k] for name in ("gain", "expected_gain", "level"))
+        gain, expected, level = (column[name][some, k] for name in ("gain", "expected_gain", "level"))
         off = expected - gain
         out.append(
             {
                 "contacts": float(column["cut"][some, k].mean()),
-                "ruled_out": float((some & ~finite).sum() / some.sum()),
+                "missed": float(column["missed"][some, k].mean()),
                 "gain": float(gain.mean()),
                 "expected_gain": float(expected.mean()),
                 "expected_less_gain": [float(off.mean()), float(1.96 * off.std() / np.sqrt(len(off)))],

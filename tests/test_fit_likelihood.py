@@ -1,0 +1,45 @@
+"""The fit of the contact likelihood: settings come back from touches that were drawn with them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geomtact.kernels.contact_energy import SHARES
+from geomtact.scoring.contact_likelihood import POWERS, RATE, SHARE, WEIGHTS
+from tools.training.likelihood import Example, fit
+
+TRUE_RATE = 4.0  # nats/mm^3
+
+
+def drawn(rng, elastic, poses=120):
+    """A touch among poses of any energy, the true one drawn by its likelihood."""
+    rigid = rng.uniform(0, 5, poses + 1)
+    energy = np.full((poses + 1, SHARES), 1e3, np.float32)
+    energy[:, -1] = rigid
+    true = rng.choice(poses + 1, p=np.exp(-TRUE_RATE * rigid) / np.exp(-TRUE_RATE * rigid).sum())
+    rest = np.delete(np.arange(poses + 1), true)
+    zeros = np.zeros(poses)
+    return Example(energy[rest], zeros, zeros, energy[true], 0.0, 0.0, elastic)
+
+
+@pytest.mark.slow
+def test_the_rate_that_touches_were_drawn_with_is_fitted():
+    """Whatever power bears it, the sharpest posterior with much weight has that rate, within a quarter."""
+    rng = np.random.default_rng(0)
+    found = fit([drawn(rng, i % 2 == 1) for i in range(300)])
+    rates = found.rate * np.array(POWERS)
+    assert np.dot(found.weights, rates) == pytest.approx(TRUE_RATE, rel=0.25)
+    assert found.expected_gain == pytest.approx(found.gain, abs=0.2)
+    assert np.abs(np.array(found.coverage[0]) - [0.5, 0.8, 0.9, 0.95]).max() < 0.09
+
+
+def test_the_package_holds_what_was_fitted():
+    path = Path(__file__).parents[1] / "docs" / "results" / "contact-likelihood.json"
+    fitted = json.loads(path.read_text("utf-8"))
+    assert pytest.approx(RATE / 1e9, rel=5e-3) == fitted["rate"]
+    assert pytest.approx(SHARE, rel=1e-2) == fitted["share"]
+    assert pytest.approx(WEIGHTS, abs=1e-3) == fitted["weights"]
+    assert list(POWERS) == fitted["powers"]
+    assert sum(WEIGHTS) == pytest.approx(1)
