@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from speed import slow_but
 
 from geomtact import Sensor
 from geomtact.contact_space.contact_maps import SHAPE, ContactMaps
@@ -11,10 +12,13 @@ from geomtact.inference.sampler import explore
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.sensing.noise import CLEAN
 
+SCENES = {"gelslim": None, "digit": None, "gelslim from above": [((0.0, 0.0, 1.0), 1.0)]}
 
-@pytest.fixture(scope="module", params=["gelslim", pytest.param("digit", marks=pytest.mark.slow)])
+
+@pytest.fixture(scope="module", params=slow_but(SCENES, "gelslim"))
 def localizer(request, make_localizer):
-    return make_localizer(load_mesh("pin"), Sensor.load(request.param), max_poses=20_000)
+    sensor = Sensor.load(request.param.split()[0])
+    return make_localizer(load_mesh("pin"), sensor, approach=SCENES[request.param], max_poses=20_000)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +49,7 @@ def energies_of(localizer, maps, elastic):
 def test_a_cut_contact_is_the_cast_one(localizer, maps):
     """A clean rigid contact has next to no energy at its own pose and at the whole depth."""
     energies, off = energies_of(localizer, maps, elastic=False)
-    assert np.median(energies[:, -1]) < 0.05
+    assert np.median(energies[:, -1]) < 0.1
     pitch = np.sqrt(localizer.sensor.pixel_area(localizer.sensor.along(SHAPE)))
     assert np.median(off) < pitch  # the deepest point lies between samples
 

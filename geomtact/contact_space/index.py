@@ -245,10 +245,21 @@ class Index:
     @cached_property
     def touching(self) -> NDArray[np.float32]:
         """Share (n,) of the lattice cell of each place in which the object can touch."""
-        directions = self.directions
-        of_rotation = np.repeat(directions.weights / directions.turns, directions.turns)
-        share = self.weight.max(0) / of_rotation[self.rotation]
+        share = self.weight.max(0) / self._of_rotation[self.rotation]
         return (share / share.max()).astype(np.float32)
+
+    @cached_property
+    def cell_measure(self) -> Array:
+        """Uniform measure (n,) of the whole lattice cell of each place at all depths, whether it touches or not."""
+        of_rotation = self._of_rotation[self.rotation]
+        largest = (self.weight.max(0) / of_rotation).max() * len(self.weight)
+        return np.asarray(of_rotation * largest / self.weight.sum(dtype=float), float)
+
+    @cached_property
+    def _of_rotation(self) -> Array:
+        """Measure of every rotation of the grid, relative to the others."""
+        directions = self.directions
+        return np.repeat(directions.weights / directions.turns, directions.turns)
 
     @cached_property
     def _mass_before(self) -> Array:

@@ -23,11 +23,12 @@ from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp, ndtr, ndtri
 
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, sample_pitch
+from geomtact.errors import InputError
 from geomtact.scoring.contact_likelihood import POWERS, WEIGHTS, ContactQuery
 from geomtact.se3 import Array, exp, inverse, log, transform
 
-# All constants choose where poses are drawn: they change how precise the evidence is, not what is estimated.
-_UNIFORM = 0.2  # share of the draws that go by the uniform measure
+_UNIFORM = 0.2  # share of the uniform distribution in the coarse posterior, by which poses are drawn; hand-set
+# All other constants choose where poses are drawn: they change how precise the evidence is, not what is estimated.
 _ALIGNED = 0.7  # share of the draws whose centre is aligned
 _WIDTH = 1.5  # standard deviation of aligned centres, in samples of the window
 _CUTS = 3  # contacts that are cut for a draw, at most
@@ -175,14 +176,24 @@ def explore(maps: ContactMaps, query: ContactQuery, coarse: Array, contacts: int
 
     Parameters
     ----------
-    coarse : (n,) mass of the places of the index in a coarse posterior
+    coarse : (n,) mass of the places of the index in a coarse posterior; a share of the uniform one is mixed in
+
+    Raises
+    ------
+    InputError
+        No pose that was drawn touches the sensor.
     """
     measure = maps.index.weight.sum(0, dtype=float)
     measure /= measure.sum()
     share = (1 - _UNIFORM) * coarse / coarse.sum() + _UNIFORM * measure
-    sampler = _Sampler(maps, query, measure, np.log(share / measure))
+    sampler = _Sampler(maps, query, np.log(share / measure))
     n = max(contacts // (_DRAWS * _CUTS + _MOVES * _STEPS), 20)
     drawn, log_weight, cut = sampler.draw(share, _DRAWS * n, rng)
+    # the coarse posterior has the evidence 1, by definition: what is left is an error of the measure, which all share
+    whole = float(logsumexp(log_weight + drawn.log_target(0)))
+    if not np.isfinite(whole):
+        raise InputError(f"{maps.index.mesh.name}: no pose that was drawn touches the sensor; allow more contacts")
+    log_weight = log_weight - whole
     # the first exponent is the one that the draws suit best
     first = [log_weight + drawn.log_target(exponent) for exponent in _EXPONENTS]
     power = float(_EXPONENTS[int(np.argmax([_effective(each) for each in first]))])
@@ -190,7 +201,7 @@ def explore(maps: ContactMaps, query: ContactQuery, coarse: Array, contacts: int
     found, evidence = [], []
     for each in (*(each for each in POWERS if each < power), power):
         weight = log_weight + drawn.log_target(each)
-        evidence.append(float(logsumexp(weight)) if each > 0 else 0.0)
+        evidence.append(float(logsumexp(weight)))
         found.append(drawn.take(_resampled(weight, n, rng)))
     particles, log_evidence, exponents, size = found[-1], evidence[-1], [power], 1.0
     while True:
@@ -245,12 +256,10 @@ def _next_step(change: Array, most: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Sampler:
-    """Draws and moves of poses for one touch; ``measure`` (n,) and ``log_coarse`` (n,) are the uniform measure and the coarse log
-    density of the index's places."""
+    """Draws and moves of poses for one touch; ``log_coarse`` (n,) is the coarse log density at the index's places."""
 
     maps: ContactMaps
     query: ContactQuery
-    measure: Array
     log_coarse: Array
 
     def _admitted(self, poses: Placements, depth: Array, some: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -279,7 +288,7 @@ class _Sampler:
             moved = np.where(
                 small[some, None, None],
                 self._nudged(T[some], size, rng),
-                T[some] @ _differences(T[others], particles.poses.place[others], len(some), rng),
+                _differences(T[others], particles.poses.place[others], len(some), rng) @ T[some],
             )
             now = particles.take(some)
             poses, membrane = self.maps.locate(moved)
@@ -306,10 +315,11 @@ class _Sampler:
             assert membrane is not None
             depth = found.reach - membrane
         ok = np.isfinite(cut.energy[:, 0]) & (depth <= self.maps.index.sensor.max_penetration)
+        depth = np.where(ok, depth, 0.0)
         ok[ok] = self._admitted(found, depth, ok)
         log_likelihood = np.full(len(depth), -np.inf)
         log_likelihood[ok] = self.query.log_likelihood(cut.energy[ok])
-        return Particles(found, np.where(ok, depth, 0.0), log_likelihood, self.log_coarse[poses.place])
+        return Particles(found, depth, log_likelihood, self.log_coarse[poses.place])
 
     def draw(self, share: Array, n: int, rng: np.random.Generator) -> tuple[Particles, Array, int]:
         """``n`` poses, their log weights (n,), and how many contacts were cut.
@@ -319,7 +329,8 @@ class _Sampler:
         """
         index = self.maps.index
         place = _systematic(share, n, rng)
-        rotation = index.directions.draw(index.rotation[place], rng)
+        drawn = transform(index.directions.draw(index.rotation[place], rng), np.zeros(3))
+        rotation = index.directions.canonical(drawn)[:, :3, :3]
         direction = index.directions.direction_of_rotation(index.rotation[place]).astype(np.int32)
         step = index.resolution.step
         middle = np.rint(index.shift[place] / step) * step
@@ -329,18 +340,20 @@ class _Sampler:
         centre, density = _centres(target, middle, step, _WIDTH * sample_pitch(index.sensor), rng)
         depth = index.sensor.max_penetration * rng.random(n)
         particles = self.evaluated(replace(poses, centre=centre), depth=depth)
-        # the measure of a whole cell, of which only the share touches that ``touching`` says
-        volume = self.measure[place] / index.touching[place]
-        return particles, np.log(volume) - np.log(share[place]) - np.log(density * n), cut + n
+        log_weight = np.log(index.cell_measure[place]) - np.log(share[place]) - np.log(density * n)
+        return particles, log_weight, cut + n
 
 
 def _differences(T: Array, place: NDArray[np.int64], n: int, rng: np.random.Generator) -> Array:
-    """``n`` motions (n, 4, 4) in the object's frame, along those from poses ``T`` (m, 4, 4) to others at near places (m,)."""
+    """``n`` motions (n, 4, 4) along those from poses ``T`` (m, 4, 4) to others at near places (m,).
+
+    They are motions in the sensor frame, so that they act on images under the symmetry alike.
+    """
     order = np.argsort(place, kind="stable")
     first = rng.integers(len(T), size=n)
     second = (first + rng.integers(1, _NEAR + 1, size=n)) % len(T)
     share = _ALONG * rng.choice([-1.0, 1.0], n) * 10 ** -rng.random(n)
-    return exp(share[:, None] * log(inverse(T[order[first]]) @ T[order[second]]))
+    return exp(share[:, None] * log(T[order[second]] @ inverse(T[order[first]])))
 
 
 def _aligned(maps: ContactMaps, query: ContactQuery, poses: Placements, step: float) -> tuple[Array, int]:

@@ -10,8 +10,8 @@ is nearly where the object is within a share of the local depth from the deepest
 several features press. Neither the gel nor the share is known, so both are marginalised over, pose by pose.
 
 How far a contact is from any simulated one is not known either: by the noise alone, or by a gel that differs from the model. So
-the posterior is a mixture of posteriors, each by a power of the likelihood, from the coarse one (0) to the full one (1). Their
-weights are fitted like all else by the log score ("stacking", Yao et al. 2018).
+the posterior is a mixture of posteriors, each by a power of the likelihood: 0 gives the coarse one, 1 that of the whole
+likelihood. Their weights are fitted like all else by the log score ("stacking", Yao et al. 2018).
 """
 
 from __future__ import annotations
