@@ -69,7 +69,7 @@ class Particles:
         """Log (n,) of the density of the posterior by a power of the likelihood, up to a constant; -inf where nothing is
         touched."""
         touches = np.isfinite(self.log_likelihood)
-        return np.where(touches, _log_target(self.log_likelihood, self.log_coarse, power), -np.inf)
+        return np.where(touches, log_target(self.log_likelihood, self.log_coarse, power), -np.inf)
 
     def take(self, rows: NDArray[np.int64]) -> Particles:
         """Those of ``rows`` (m,)."""
@@ -125,7 +125,7 @@ class Explored:
 
     def _log_density(self, log_likelihood: Array, log_coarse: Array) -> Array:
         each = [
-            np.log(weight) + _log_target(log_likelihood, log_coarse, power) - log_evidence
+            np.log(weight) + log_target(log_likelihood, log_coarse, power) - log_evidence
             for power, weight, log_evidence in zip(POWERS, WEIGHTS, self.log_evidence, strict=True)
         ]
         return np.asarray(logsumexp(each, 0))
@@ -157,7 +157,7 @@ def _transforms(poses: Placements, depth: Array, middle: Array) -> Array:
     return transform(poses.rotation, np.column_stack([poses.centre, height]) - poses.rotation @ middle)
 
 
-def _log_target(log_likelihood: Array, log_coarse: Array, power: float) -> Array:
+def log_target(log_likelihood: Array, log_coarse: Array, power: float) -> Array:
     """Log density (n,) of the posterior by a power of the likelihood, up to a constant."""
     out = (1 - power) * log_coarse
     if power > 0:
@@ -165,10 +165,12 @@ def _log_target(log_likelihood: Array, log_coarse: Array, power: float) -> Array
     return out
 
 
-def log_likelihood_at(maps: ContactMaps, query: ContactQuery, T: ArrayLike) -> Array:
-    """Log likelihood (n,) of the observed contact at ``T_sensor_object`` (n, 4, 4)."""
+def log_likelihood_at(maps: ContactMaps, query: ContactQuery, T: ArrayLike, depth: Array | None = None) -> Array:
+    """Log likelihood (n,) of the observed contact at ``T_sensor_object`` (n, 4, 4), where the object is moved along z to press
+    ``depth`` (n,) [m] deep if that is given."""
     poses, membrane = maps.locate(np.asarray(T, float))
-    return query.log_likelihood(maps.compare(query.samples, query.area, poses, membrane).energy)
+    where = {"membrane": membrane} if depth is None else {"depth": depth}
+    return query.log_likelihood(maps.compare(query.samples, query.area, poses, **where).energy)
 
 
 def explore(maps: ContactMaps, query: ContactQuery, coarse: Array, contacts: int, rng: np.random.Generator) -> Explored:

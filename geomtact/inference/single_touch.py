@@ -23,7 +23,6 @@ from geomtact.inference.repeated_images import digest
 from geomtact.inference.search import SensorView
 from geomtact.inference.views import Placed
 from geomtact.scoring.fitted import FittedScorer
-from geomtact.scoring.probability import posterior_log_prob
 from geomtact.sensing.contact import Contact, SoftMask
 
 LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
@@ -74,7 +73,7 @@ def touch_posterior(
         else:
             rows = scorer.cells(index, shown, log_prior, resolved == "all", above)
     with timed(timing, "posterior"):
-        log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
+        log_prob = rows.log_prob
         model = scorer.evidence_model
         usual, likeliest = model.evidence(index, shown)
         evidence = usual if log_prior is None else model.evidence(index, shown, log_prior, above)[0]

@@ -113,6 +113,11 @@ class Rows:
     calibration: Calibration
     by: str
 
+    @property
+    def log_prob(self) -> NDArray[np.floating]:
+        """Log mass (N,) of each run, by its score."""
+        return posterior_log_prob(self.score, self.log_prior, self.calibration)
+
 
 @dataclass(frozen=True, eq=False)
 class Cascade:
@@ -145,7 +150,7 @@ class Cascade:
         for mask, true in zip(touches.masks, touches.ids, strict=True):
             rows = out.expanded(index, mask)
             row = int(np.searchsorted(rows.first, true, "right")) - 1
-            log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
+            log_prob = rows.log_prob
             gains.append(log_prob[row] - rows.log_prior[row])
         floor, gain = best_floor(np.array(gains))
         return replace(out, partly=replace(fine, floor=floor, gain=gain))

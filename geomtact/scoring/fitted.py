@@ -109,6 +109,13 @@ class FittedScorer:
         score = score if len(cells) == len(score) else score[cells]
         return Rows(cells, None, score, prior, calibration, scorer.name)
 
+    def log_mass(self, index: Index, mask: SoftMask) -> NDArray[np.float64]:
+        """Log mass (P, n) of every cell at all places of ``index``, under the uniform prior."""
+        rows = self.cells(index, mask, None, False)
+        out = np.full(index.height.size, -np.inf)
+        out[rows.first] = rows.log_prob
+        return out.reshape(index.height.shape)
+
 
 def fitted_scorer(
     name: str, index: Index, folder: Path | None = None, progress: Progress | None = None

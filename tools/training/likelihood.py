@@ -21,12 +21,11 @@ from scipy.special import logsumexp
 from geomtact.contact_space.contact_maps import ContactMaps
 from geomtact.contact_space.touches import Touch, random_touches
 from geomtact.files import write_text, write_whole
-from geomtact.inference.sampler import Explored, Particles, explore
+from geomtact.inference.sampler import Explored, Particles, explore, log_target
 from geomtact.kernels.contact_energy import SHARES
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.contact_likelihood import POWERS, RATE, RIGID, SHARE, WEIGHTS, ContactQuery, share_cells
-from geomtact.scoring.probability import posterior_log_prob
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 from geomtact.versions import versions
@@ -40,7 +39,6 @@ KEPT = 1000  # poses of each power, at most
 _STEPS, _RATE = 150, 0.08  # of the ascent (Adam)
 _UNIT = 1e-9  # m^3, in which energies are held
 _NOTHING = 1e3  # energy where the object is not touched
-
 
 SCHEMA = "geomtact/contact-likelihood/1"
 LEVELS = (0.5, 0.8, 0.9, 0.95)
@@ -120,7 +118,8 @@ def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
 
 def _example(localizer: Localizer, maps: ContactMaps, touch: Touch, rng: np.random.Generator) -> Example:
     query = ContactQuery.of(touch.mask, localizer.sensor)
-    explored = explore(maps, query, coarse_mass(localizer, touch), CONTACTS, rng)
+    coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
+    explored = explore(maps, query, coarse, CONTACTS, rng)
     mixed = [p.take(rng.permutation(len(p))[:KEPT]) for p in explored.particles[1:]]
     energy = np.concatenate([_energy(maps, query, p) for p in mixed])
     at_truth, place = _at_truth(maps, query, touch)
@@ -139,15 +138,6 @@ def _example(localizer: Localizer, maps: ContactMaps, touch: Touch, rng: np.rand
     )
 
 
-def coarse_mass(localizer: Localizer, touch: Touch) -> Array:
-    """Mass (n,) of every place of the index in the coarse posterior."""
-    index = localizer.index
-    rows = localizer.scorer.cells(index, touch.mask, None, False)
-    mass = np.zeros(index.height.size)
-    mass[rows.first] = np.exp(posterior_log_prob(rows.score, rows.log_prior, rows.calibration))
-    return mass.reshape(index.height.shape).sum(0)
-
-
 def _energy(maps: ContactMaps, query: ContactQuery, particles: Particles) -> NDArray[np.float32]:
     poses = particles.poses
     return maps.compare(query.samples, query.area, poses, poses.reach - particles.depth).energy
@@ -161,7 +151,7 @@ def _at_truth(maps: ContactMaps, query: ContactQuery, touch: Touch) -> tuple[NDA
 def _mixture(explored: Explored, ll: Array, lc: Array) -> Array:
     """Log density (n,) of the poses of all powers but 0 together, each the same share."""
     each = [
-        power * ll + (1 - power) * lc - evidence
+        log_target(ll, lc, power) - evidence
         for power, evidence in zip(POWERS[1:], explored.log_evidence[1:], strict=True)
     ]
     return np.asarray(logsumexp(each, 0)) - np.log(len(each))
