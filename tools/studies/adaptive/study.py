@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import logsumexp
 
 from geomtact.contact_space.contact_class import contact_class
 from geomtact.contact_space.contact_maps import ContactMaps
@@ -15,8 +16,7 @@ from geomtact.contact_space.touches import Touch
 from geomtact.inference.sampler import explore, log_likelihood_at
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
-from geomtact.scoring.contact_likelihood import ContactQuery
-from geomtact.scoring.probability import posterior_log_prob
+from geomtact.scoring.contact_likelihood import POWERS, WEIGHTS, ContactQuery
 from geomtact.se3 import Array
 
 ROOTS = (75_000, 300_000, 1_200_000)  # poses of the grids whose cells are opened
@@ -36,7 +36,7 @@ class Outcome:
     contact : one of ``contact_class.CLASSES``
     rank : of the true cell in the coarse posterior, 0 the most probable
     coarse_gain : log density of the coarse posterior at the true pose
-    in_cell_gain : log density at the true pose within its cell, by the likelihood; at most log 401
+    in_cell_gain : log density at the true pose within its cell, by the sampler's mixture; at most log 401
     touching : share of the true cell in which the object can touch
     gain, expected_gain, level : of the sampler: at the true pose, at most that of the densest particle; by its own particles;
         credible level of the true pose
@@ -63,7 +63,7 @@ def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int,
     for number, touch in enumerate(touches[first:], first):
         rng = np.random.default_rng([seed, number])
         query = ContactQuery.of(touch.mask, localizers[-1].sensor)
-        log_masses = [_coarse(localizer, touch) for localizer in localizers]
+        log_masses = [localizer.scorer.log_mass(localizer.index, touch.mask) for localizer in localizers]
         roots = [
             _root(each.index, log_mass.ravel(), each, query, touch, rng)
             for each, log_mass in zip(maps, log_masses, strict=True)
@@ -88,15 +88,6 @@ def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int,
         )
 
 
-def _coarse(localizer: Localizer, touch: Touch) -> Array:
-    """Log mass (P, n) of every cell."""
-    index = localizer.index
-    rows = localizer.scorer.cells(index, touch.mask, None, False)
-    out = np.full(index.height.size, -np.inf)
-    out[rows.first] = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
-    return out.reshape(index.height.shape)
-
-
 def _root(
     index: Index,
     log_mass: Array,
@@ -108,19 +99,27 @@ def _root(
     """Rank of the true cell, coarse gain and gain within the cell, and the share of the cell that touches."""
     true = int(index.lookup(touch.T_sensor_object[None], np.array([touch.penetration]))[0])
     inside = _in_cell(index, maps, query, true, rng)
-    at_truth = log_likelihood_at(maps, query, touch.T_sensor_object[None])
-    together = np.concatenate([at_truth, inside])
+    at_truth = float(log_likelihood_at(maps, query, touch.T_sensor_object[None])[0])
     return (
         int((log_mass > log_mass[true]).sum()),
         float(log_mass[true] - index.log_weight[true]),
-        float(at_truth[0] - log_mean_exp(together[None])[0]),
+        _gain(at_truth, inside),
         float(index.touching[true % index.places]),
     )
 
 
+def _gain(at_truth: float, inside: Array) -> float:
+    """Log density at the true pose relative to the cell's mean, by the mixture of powers of the likelihood, of which the log is
+    ``at_truth`` there and ``inside`` (n,) at others. The true pose counts for the mean."""
+    together = np.append(inside, at_truth)
+    each = [power * np.array([at_truth]) - log_mean_exp(power * together[None]) for power in POWERS[1:]]
+    return float(logsumexp([0.0, *np.concatenate(each)], b=WEIGHTS))
+
+
 def _in_cell(index: Index, maps: ContactMaps, query: ContactQuery, cell: int, rng: np.random.Generator) -> Array:
     """Log likelihoods (n,) of poses drawn evenly in a cell, of those that touch."""
-    found = log_likelihood_at(maps, query, index.draw(np.full(_IN_CELL, cell), rng)[0])
+    T, depth = index.draw(np.full(_IN_CELL, cell), rng)
+    found = log_likelihood_at(maps, query, T, depth)
     return found[np.isfinite(found)]
 
 
