@@ -19,7 +19,7 @@ from geomtact.inference.preparation import PreparedObject, prepare_each
 from geomtact.inference.prior import opened, reference_of
 from geomtact.inference.repeated_images import counted_once
 from geomtact.inference.sequence import track
-from geomtact.inference.single_touch import drop_lost_contact_prior, refine_modes, touch_posterior
+from geomtact.inference.single_touch import drop_lost_contact_prior, explore_touch, refine_modes, touch_posterior
 from geomtact.inference.views import read_views
 from geomtact.planning.next_touch import Action, next_touch
 from geomtact.progress import Progress
@@ -114,6 +114,7 @@ class Localizer(PreparedObject):
         if len(views) == 1:
             posterior, log_prior = touches[0]
             posterior, prior = drop_lost_contact_prior(posterior, prior)
+            posterior = explore_touch(posterior, log_prior, self.scorer, resolved)
             posterior = refine_modes(posterior, log_prior, self.mode_refiner, resolved)
         else:
             refiners = [one.mode_refiner for one in each]

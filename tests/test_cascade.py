@@ -133,8 +133,8 @@ def test_blocks_are_as_many_poses_as_their_cells(localizer, rng):
     each = np.repeat(np.exp(blocks.log_prob.astype(float)), blocks.runs)
     total = np.repeat(localizer.index.mass(blocks.cells, blocks.runs), blocks.runs)
     p = each * w / total
-    p = p[p > 0]
-    assert blocks.effective_poses == pytest.approx(np.exp(-(p * np.log(p)).sum()), rel=1e-4)
+    single = Posterior(localizer.index, cells[p > 0], np.log(p[p > 0]))
+    assert blocks.effective_poses == pytest.approx(single.effective_poses, rel=1e-4)
 
 
 def test_the_heaviest_hold_their_share_and_hardly_more(rng):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from geomtact.kernels.contact_energy import SHARES
-from geomtact.scoring.contact_likelihood import POWERS, RATE, SHARE, WEIGHTS
+from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, RATE, SHARE, SLOPE
 from tools.training.likelihood import Example, fit
 
 TRUE_RATE = 4.0  # nats/mm^3
@@ -36,10 +36,11 @@ def test_the_rate_that_touches_were_drawn_with_is_fitted():
 
 
 def test_the_package_holds_what_was_fitted():
-    path = Path(__file__).parents[1] / "docs" / "results" / "contact-likelihood.json"
-    fitted = json.loads(path.read_text("utf-8"))
+    folder = Path(__file__).parents[1] / "docs" / "results"
+    fitted = json.loads((folder / "contact-likelihood.json").read_text("utf-8"))
     assert pytest.approx(RATE / 1e9, rel=5e-3) == fitted["rate"]
     assert pytest.approx(SHARE, rel=1e-2) == fitted["share"]
-    assert pytest.approx(WEIGHTS, abs=1e-3) == fitted["weights"]
-    assert list(POWERS) == fitted["powers"]
-    assert sum(WEIGHTS) == pytest.approx(1)
+    mixture = json.loads((folder / "mixture.json").read_text("utf-8"))
+    assert pytest.approx(INTERCEPT, abs=6e-3) == mixture["intercept"]
+    assert pytest.approx(SLOPE, abs=6e-3) == mixture["slope"]
+    assert list(POWERS) == mixture["powers"] == fitted["powers"]

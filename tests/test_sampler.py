@@ -1,11 +1,13 @@
 """Contacts cut at any pose, their likelihood, and the density that is sampled from it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from speed import slow_but
 
 from geomtact import Sensor
-from geomtact.contact_space.contact_maps import SHAPE, ContactMaps
+from geomtact.contact_space.contact_maps import SHAPE, ContactMaps, located
 from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.sampler import explore
@@ -23,14 +25,14 @@ def localizer(request, make_localizer):
 
 @pytest.fixture(scope="module")
 def maps(localizer):
-    return ContactMaps.cast(localizer.index)
+    return ContactMaps.of(localizer.index)
 
 
 def coarse_of(localizer, mask):
     """Mass of every place in the coarse posterior."""
     posterior = localizer.localize(mask, kind="mask")
     mass = np.zeros(localizer.index.height.size)
-    np.add.at(mass, posterior.cells, np.exp(posterior.log_prob))
+    np.add.at(mass, posterior.cells, np.exp(posterior.cell_log_prob))
     return mass.reshape(localizer.index.height.shape).sum(0)
 
 
@@ -39,7 +41,7 @@ def energies_of(localizer, maps, elastic):
     energies, off = [], []
     for touch in random_touches(localizer.space, 12, 5, elastic=elastic, noise=CLEAN):
         query = ContactQuery.of(touch.mask, localizer.sensor)
-        poses, membrane = maps.locate(touch.T_sensor_object[None])
+        poses, membrane = located(maps.index, touch.T_sensor_object[None])
         found = maps.compare(query.samples, query.area, poses, membrane)
         energies.append(found.energy[0] / -query.samples.least)
         off.append(abs(found.reach[0] - membrane[0] - touch.penetration))
@@ -66,7 +68,7 @@ def test_an_elastic_contact_is_near_a_share_of_the_depth(localizer, maps):
 def test_images_under_the_symmetry_are_equally_dense(localizer, maps):
     touch = random_touches(localizer.space, 1, 7)[0]
     query = ContactQuery.of(touch.mask, localizer.sensor)
-    explored = explore(maps, query, coarse_of(localizer, touch.mask), 2000, np.random.default_rng(0))
+    explored = explore(maps.index, query, coarse_of(localizer, touch.mask), 2000, np.random.default_rng(0))
     images = touch.T_sensor_object @ localizer.mesh.symmetry.elements
     assert len(images) > 1
     density = explored.log_density(images)
@@ -76,7 +78,7 @@ def test_images_under_the_symmetry_are_equally_dense(localizer, maps):
 def test_the_same_seed_gives_the_same_posterior(localizer, maps):
     touch = random_touches(localizer.space, 1, 8)[0]
     query, coarse = ContactQuery.of(touch.mask, localizer.sensor), coarse_of(localizer, touch.mask)
-    one, other = (explore(maps, query, coarse, 2000, np.random.default_rng(3)) for _ in range(2))
+    one, other = (explore(maps.index, query, coarse, 2000, np.random.default_rng(3)) for _ in range(2))
     assert one.log_evidence == other.log_evidence
     np.testing.assert_array_equal(one.poses, other.poses)
 
@@ -88,7 +90,7 @@ def test_the_evidence_does_not_depend_on_the_budget(localizer, maps):
     query, coarse = ContactQuery.of(touch.mask, localizer.sensor), coarse_of(localizer, touch.mask)
 
     def evidence(contacts, seed):
-        return explore(maps, query, coarse, contacts, np.random.default_rng(seed)).log_evidence[-2]
+        return explore(maps.index, query, coarse, contacts, np.random.default_rng(seed)).log_evidence[-2]
 
     ratio = np.exp(np.array([evidence(4000, 1 + i) for i in range(12)]) - evidence(60_000, 0))
     assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(len(ratio)) + 0.1
@@ -97,7 +99,7 @@ def test_the_evidence_does_not_depend_on_the_budget(localizer, maps):
 def test_particles_stay_in_the_contact_pose_space(localizer, maps):
     touch = random_touches(localizer.space, 1, 10)[0]
     query = ContactQuery.of(touch.mask, localizer.sensor)
-    explored = explore(maps, query, coarse_of(localizer, touch.mask), 3000, np.random.default_rng(0))
+    explored = explore(maps.index, query, coarse_of(localizer, touch.mask), 3000, np.random.default_rng(0))
     assert len(explored.particles) == len(POWERS) == len(explored.log_evidence)
     for particles in explored.particles[1:]:
         assert np.isfinite(particles.log_likelihood).all()
@@ -110,8 +112,21 @@ def test_the_density_at_a_particle_is_what_the_sampler_found(localizer, maps):
     """The poses alone give the densities back, those that moved exactly."""
     touch = random_touches(localizer.space, 1, 11)[0]
     query = ContactQuery.of(touch.mask, localizer.sensor)
-    explored = explore(maps, query, coarse_of(localizer, touch.mask), 3000, np.random.default_rng(0))
+    explored = explore(maps.index, query, coarse_of(localizer, touch.mask), 3000, np.random.default_rng(0))
     n = len(explored.particles[-1])
     off = np.abs(explored.log_density(explored.poses) - explored.particle_log_density)
     assert np.quantile(off[-n:], 0.9) < 0.01
     assert np.quantile(off, 0.75) < 0.1
+
+
+def test_maps_in_the_cache_are_those_that_were_cast(localizer, maps):
+    """In another process, or after the file was damaged, contacts are the same to the last bit."""
+    (path,) = localizer.index.folder.glob("maps-*.npz")
+    again = ContactMaps.of(replace(localizer.index)).maps
+    np.testing.assert_array_equal(again.heights, maps.maps.heights)
+    np.testing.assert_array_equal(again.widest, maps.maps.widest)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    anew = ContactMaps.of(replace(localizer.index)).maps
+    np.testing.assert_array_equal(anew.heights, maps.maps.heights)
+    assert path.read_bytes() == whole

@@ -6,16 +6,22 @@ size, so what a touch constrains within a cell is lost. Here the contact is made
 
 from __future__ import annotations
 
+import contextlib
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.heightmap import HeightMap
+from geomtact.contact_space.heightmap import NOTHING, HeightMap
 from geomtact.contact_space.index import Index
+from geomtact.files import write_whole
 from geomtact.geometry.approach import facing
 from geomtact.kernels.contact_energy import BLOCK, Cut, Maps, Poses, Samples, contact_energy
 from geomtact.se3 import Array
@@ -25,6 +31,8 @@ SHAPE = (48, 64)  # samples of the window, lying
 _PIXELS_PER_SAMPLE = 2  # of the height maps
 _THREADS = 2
 _PART = 512  # poses that a thread takes at a time
+_FORMAT = 1  # of the file in an index's folder
+_LEVELS = 65_534  # of the heights in it, besides one for where the object is not
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,37 +63,28 @@ class ContactMaps:
     maps: Maps
 
     @classmethod
-    def cast(cls, index: Index) -> ContactMaps:
-        """Cast all of them: 20 ms each for an object of 100 mm."""
-        sensor, mesh = index.sensor, index.mesh
-        pixel = sample_pitch(sensor) / _PIXELS_PER_SAMPLE
+    def of(cls, index: Index) -> ContactMaps:
+        """Those of ``index``: as they are in memory or lie in its folder of the cache, else cast now, 20 ms each for an object of
+        100 mm, and written there."""
+        if index not in _OPENED:
+            path = None if index.folder is None else index.folder / f"maps-{_FORMAT}.npz"
+            heights = None if path is None else _read(path)
+            if heights is None:
+                heights = _cast(index)
+                if path is not None:
+                    with contextlib.suppress(OSError):  # a read-only cache costs the casts each time, no more
+                        heights = _written(path, heights)
+            _OPENED[index] = _maps(heights, sample_pitch(index.sensor) / _PIXELS_PER_SAMPLE)
+        return cls(index, _OPENED[index])
 
-        def one(a: Array) -> NDArray[np.float32]:
-            return HeightMap.cast(index.space.caster, a, mesh.centre, mesh.reach, 0.0, pixel).heights
-
-        with ThreadPoolExecutor(_THREADS) as pool:
-            heights = np.stack(list(pool.map(one, index.directions.vectors)))
-        # a block reaches half its side from its centre, and half a pixel more where it is cut
-        side = 2 * int(np.ceil(BLOCK / 2 * _PIXELS_PER_SAMPLE * np.sqrt(2) + 1)) + 1
-        widest = np.stack(
-            [np.asarray(cv2.dilate(each, np.ones((side, side), np.uint8)), np.float32) for each in heights]
-        )
-        return cls(index, Maps(heights, widest, pixel))
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled without what the index's folder holds."""
+        return ContactMaps.of, (self.index,)
 
     @cached_property
     def _from_maps(self) -> Array:
         """Rotations (D, 3, 3) from the maps' frames into the object's."""
         return np.swapaxes(facing(self.index.directions.vectors), 1, 2)
-
-    def locate(self, T: Array) -> tuple[Placements, Array]:
-        """The poses ``T_sensor_object`` (n, 4, 4), for which images under the symmetry may stand, and how far the membrane's apex
-        is beyond the object's centre (n,) [m]."""
-        index = self.index
-        image, direction, turn = index.directions.lookup(np.asarray(T, float).reshape(-1, 4, 4))
-        R, centre = image[:, :3, :3], image[:, :3, :3] @ index.mesh.centre + image[:, :3, 3]
-        place = index.place_of(index.directions.first_turn[direction] + turn, centre)
-        reach = centre[:, 2] + 0.5 * index.sensor.max_penetration
-        return Placements(place, direction.astype(np.int32), R, centre[:, :2], reach), centre[:, 2]
 
     def compare(
         self,
@@ -119,6 +118,78 @@ class ContactMaps:
         with ThreadPoolExecutor(_THREADS) as pool:
             found = list(pool.map(some, range(0, max(n, 1), _PART)))
         return Cut(*(np.concatenate(each) for each in zip(*found, strict=True)))
+
+
+def located(index: Index, T: Array) -> tuple[Placements, Array]:
+    """The poses ``T_sensor_object`` (n, 4, 4), for which images under the symmetry may stand, and how far the membrane's apex is
+    beyond the object's centre (n,) [m]."""
+    image, direction, turn = index.directions.lookup(np.asarray(T, float).reshape(-1, 4, 4))
+    R, centre = image[:, :3, :3], image[:, :3, :3] @ index.mesh.centre + image[:, :3, 3]
+    place = index.place_of(index.directions.first_turn[direction] + turn, centre)
+    reach = centre[:, 2] + 0.5 * index.sensor.max_penetration
+    return Placements(place, direction.astype(np.int32), R, centre[:, :2], reach), centre[:, 2]
+
+
+_OPENED: WeakKeyDictionary[Index, Maps] = WeakKeyDictionary()
+
+
+def _cast(index: Index) -> NDArray[np.float32]:
+    """Heights (D, n, n) [m] along each approach direction; ``NOTHING`` where the object is not."""
+    pixel = sample_pitch(index.sensor) / _PIXELS_PER_SAMPLE
+
+    def one(a: Array) -> NDArray[np.float32]:
+        return HeightMap.cast(index.space.caster, a, index.mesh.centre, index.mesh.reach, 0.0, pixel).heights
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return np.stack(list(pool.map(one, index.directions.vectors)))
+
+
+def _maps(heights: NDArray[np.float32], pixel: float) -> Maps:
+    # a block reaches half its side from its centre, and half a pixel more where it is cut
+    side = 2 * int(np.ceil(BLOCK / 2 * _PIXELS_PER_SAMPLE * np.sqrt(2) + 1)) + 1
+    square = np.ones((side, side), np.uint8)
+    return Maps(heights, np.stack([np.asarray(cv2.dilate(each, square), np.float32) for each in heights]), pixel)
+
+
+def _written(path: Path, heights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Write ``heights`` (D, n, n) as 16-bit images; returns them as they will be read."""
+    there = heights > NOTHING / 2
+    low, high = float(heights[there].min()), float(heights[there].max())
+    step = max(high - low, 1e-9) / _LEVELS
+    images = np.where(there, np.rint((np.where(there, heights, low) - low) / step) + 1, 0).astype(np.uint16)
+    coded = [cv2.imencode(".png", image)[1] for image in images]
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as file:
+            np.savez(
+                file,
+                allow_pickle=False,
+                bytes=np.concatenate(coded),
+                ends=np.cumsum([len(each) for each in coded]),
+                scale=np.array([low, step]),
+            )
+
+    write_whole(path, write)
+    return _heights(images, low, step)
+
+
+def _heights(images: NDArray[np.uint16], low: float, step: float) -> NDArray[np.float32]:
+    return np.where(images > 0, np.float32(low - step) + np.float32(step) * images, np.float32(NOTHING))
+
+
+def _decoded(png: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    return np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), np.uint16)
+
+
+def _read(path: Path) -> NDArray[np.float32] | None:
+    """What :func:`_written` wrote; None where there is nothing that can be read."""
+    with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, cv2.error):
+        with np.load(path, allow_pickle=False) as data:
+            coded, ends, (low, step) = data["bytes"], data["ends"], data["scale"]
+        with ThreadPoolExecutor(_THREADS) as pool:
+            images = list(pool.map(_decoded, np.split(coded, ends[:-1])))
+        return _heights(np.stack(images), float(low), float(step))
+    return None
 
 
 def sample_pitch(sensor: Sensor) -> float:

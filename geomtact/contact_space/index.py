@@ -212,13 +212,15 @@ class Index:
         T, k, j = self.directions.lookup(np.asarray(T, float).reshape(-1, 4, 4))
         centre = T[:, :2, :3] @ self.mesh.centre + T[:, :2, 3]
         place = self.place_of(self.directions.first_turn[k] + j, centre)
+        return self.level_of(place, np.asarray(penetration, float)) * self.places + place
+
+    def level_of(self, place: NDArray[np.int64], penetration: Array) -> NDArray[np.int64]:
+        """The bin (n,) of each ``penetration`` (n,) [m] at a place (n,), or the nearest that the housing does not forbid."""
         bins = len(self.resolution.penetrations)
-        depth = np.asarray(penetration, float) / self.sensor.max_penetration
+        depth = np.where(np.isfinite(penetration), penetration, 0) / self.sensor.max_penetration
         level = np.clip((depth * bins).astype(np.int64), 0, bins - 1)
-        # the housing may forbid the deeper bins of a place
         some = self.weight[:, place] > 0
-        level = np.where(some[level, np.arange(len(place))], level, _nearest_true(some, level))
-        return level * self.places + place
+        return np.where(some[level, np.arange(len(place))], level, _nearest_true(some, level))
 
     def place_of(self, rotation: NDArray[np.int64], centre: Array) -> NDArray[np.int64]:
         """The place (n,) of a rotation (n,) of the grid with the object's centre at ``centre`` (n, 2 or 3), or the nearest."""
@@ -294,18 +296,6 @@ class Index:
         one = np.asarray(self.weight).reshape(-1)[first].astype(float)
         # the difference of sums has an error of its own, which a single cell need not have
         return np.where(counts == 1, one, self._mass_before[first + counts] - self._mass_before[first])
-
-    def log_share(self, first: ArrayLike, counts: ArrayLike) -> Array:
-        """Mean log (n,) of the share that a pose has of its run's measure, weighed by that measure; 0 for a single pose."""
-        first = np.asarray(first, np.int64)
-        weight = np.asarray(self.weight).reshape(-1).astype(float)
-        before = np.concatenate(
-            [[0.0], np.cumsum(np.where(weight > 0, weight * np.log(np.maximum(weight, 1e-300)), 0))]
-        )
-        mass = self.mass(first, counts)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            mean = (before[first + counts] - before[first]) / mass - np.log(mass)
-        return np.where((np.asarray(counts) > 1) & (mass > 0), mean, 0.0)
 
     def within_runs(self, first: ArrayLike, counts: ArrayLike, share: ArrayLike) -> NDArray[np.int64]:
         """The pose id (n,) up to which a run of poses holds ``share`` (n,), 0 to 1, of the run's measure."""

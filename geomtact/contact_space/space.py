@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.errors import MeshError
-from geomtact.geometry.approach import Approach, allowed, approach_of, check_approach, facing, in_cones
+from geomtact.geometry.approach import NO_TILT, Approach, allowed, approach_of, check_approach, facing, in_cones
 from geomtact.geometry.mesh import Mesh, outermost
 from geomtact.se3 import Array, random_rotations, transform
 from geomtact.sensing.cast import Caster
@@ -45,6 +45,11 @@ class ContactSpace:
     @cached_property
     def _corners(self) -> Array:
         return outermost(self.mesh.vertices)
+
+    @property
+    def on_known_faces(self) -> bool:
+        """Whether the approach leaves single directions, so that the object only turns and shifts on a face."""
+        return self.cones is not None and max(half for _, half in self.cones) <= NO_TILT
 
     @cached_property
     def cones(self) -> list[tuple[Array, float]] | None:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.contact_space.index import Index, expand_runs
 from geomtact.inference.facts import Diagnostics, Provenance
 from geomtact.inference.reference import Reference
+from geomtact.inference.sampler import Explored
 from geomtact.se3 import Array
 from geomtact.sensing.reading import Observation
 
@@ -36,7 +37,7 @@ class CellDistribution:
     ----------
     index : the discretised contact pose space it lives on
     cells : (N,) pose ids of the index, ascending; cells that are not among them, nor in their runs, have no mass
-    log_prob : (N,) log probability of each, normalised
+    cell_log_prob : (N,) log probability of each, normalised
     frame : "sensor" or "world"
     T_frame_sensor : (4, 4)
     contact : whether the image shows any contact
@@ -46,6 +47,7 @@ class CellDistribution:
     runs : (N,) how many cells from each of ``cells`` on share one density, as those of a coarse cell do where there is
         little mass; one each by default
     refined : what registration found, by pose id
+    explored : the distribution within the cells, which keep the masses that they had before; None where it is that of the cells
     reference : poses of the prior or of the frame before, by which modes are reported at one of their images under the object's
         symmetry
     observations : one for each image, in the order given; none for a loaded posterior
@@ -55,7 +57,7 @@ class CellDistribution:
 
     index: Index
     cells: NDArray[np.int64]
-    log_prob: NDArray[np.floating]
+    cell_log_prob: NDArray[np.floating]
     frame: str = "sensor"
     T_frame_sensor: Array = field(default_factory=lambda: np.eye(4))
     contact: bool = True
@@ -64,6 +66,7 @@ class CellDistribution:
     seed: int = 0
     runs: NDArray[np.int64] | None = None
     refined: dict[int, Refined] = field(default_factory=dict)
+    explored: Explored | None = None
     reference: Reference | None = None
     observations: list[Observation] = field(default_factory=list)
     provenance: Provenance = field(default_factory=Provenance)
@@ -90,7 +93,7 @@ def row_log_density(posterior: CellDistribution, rows: NDArray[np.int64]) -> Arr
             log_mass = posterior.index.log_weight[posterior.cells[rows]]
         else:
             log_mass = np.log(posterior.index.mass(posterior.cells[rows], posterior.runs[rows]))
-        density = (posterior.log_prob[rows] - log_mass).astype(float)
+        density = (posterior.cell_log_prob[rows] - log_mass).astype(float)
     return np.where(np.isfinite(density), density, -np.inf)
 
 
@@ -105,7 +108,7 @@ def cell_densities(posterior: CellDistribution) -> NDArray[np.float32]:
     index, cells = posterior.index, posterior.cells
     out = np.zeros(len(index), np.float32)
     if posterior.runs is None:
-        out[cells] = np.exp(posterior.log_prob.astype(np.float32) - index.log_weight[cells])
+        out[cells] = np.exp(posterior.cell_log_prob.astype(np.float32) - index.log_weight[cells])
     else:
         density = np.exp(row_log_density(posterior, np.arange(len(cells))).astype(np.float32))
         out[expand_runs(cells, posterior.runs)] = np.repeat(density, posterior.runs)
@@ -123,7 +126,14 @@ def cell_poses(posterior: CellDistribution, cells: NDArray[np.int64]) -> Array:
 
 def row_poses(posterior: CellDistribution, rows: ArrayLike) -> Array:
     """Poses (m, 4, 4) of ``rows`` (m,) in the posterior's frame: those rows of ``Posterior.poses``."""
+    if posterior.explored is not None:
+        return posterior.T_frame_sensor @ posterior.explored.poses[np.asarray(rows, np.int64)]
     return posterior.T_frame_sensor @ cell_poses(posterior, middle_cells(posterior, np.asarray(rows, np.int64)))
+
+
+def row_log_prob(posterior: CellDistribution) -> NDArray[np.floating]:
+    """Log probability (N,) of each of ``Posterior.poses``, normalised."""
+    return posterior.cell_log_prob if posterior.explored is None else np.log(posterior.explored.weight)
 
 
 def middle_cells(posterior: CellDistribution, rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -137,7 +147,7 @@ def middle_cells(posterior: CellDistribution, rows: NDArray[np.int64]) -> NDArra
 
 def log_mass_per_cell(posterior: CellDistribution) -> NDArray[np.floating]:
     """Log mass (N,) of one cell of each row; the cells of a run share its mass equally."""
-    log_mass = posterior.log_prob
+    log_mass = posterior.cell_log_prob
     if posterior.runs is not None:
         many = np.flatnonzero(posterior.runs > 1)
         log_mass = log_mass.copy()
@@ -163,7 +173,7 @@ def leading_rows(posterior: CellDistribution, n: int = LEADING_CELLS) -> NDArray
 def likeliest_cells(posterior: CellDistribution, n: int) -> NDArray[np.int64]:
     """Pose ids (m,) of the ``n`` most probable cells, or of the middles of runs of them, the most probable first."""
     rows = leading_rows(posterior, n)
-    return middle_cells(posterior, rows[np.argsort(-posterior.log_prob[rows], kind="stable")[:n]])
+    return middle_cells(posterior, rows[np.argsort(-posterior.cell_log_prob[rows], kind="stable")[:n]])
 
 
 def nearest_images(posterior: CellDistribution, T: Array) -> Array:

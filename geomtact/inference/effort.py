@@ -21,12 +21,15 @@ class Effort:
     thorough : whether each is refined by all registrations or by one
     outlines : whether, of one mask, the outline refines the modes where few enough cells are left (see
         ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by FilterReg
+    contacts : that are cut, of one mask that is not of a known face, to resolve the pose within the cells (see
+        ``inference.sampler``)
     """
 
     resolved: str
     modes: int
     thorough: bool = True
     outlines: bool = False
+    contacts: int = 0
 
     def __post_init__(self) -> None:
         if self.resolved not in RESOLVED:
@@ -35,6 +38,8 @@ class Effort:
             )
         if self.modes < 0:
             raise UsageError(f"Effort: expected 0 refined modes or more, got {self.modes}; give 0 for none")
+        if self.contacts < 0:
+            raise UsageError(f"Effort: expected 0 contacts or more, got {self.contacts}; give 0 for none")
 
 
 EFFORTS = {

@@ -19,9 +19,10 @@ from geomtact.files import write_whole
 from geomtact.geometry.approach import to_json
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
-from geomtact.inference.distribution import CellDistribution, Refined, row_poses
+from geomtact.inference.distribution import CellDistribution, Refined, row_log_prob, row_poses
 from geomtact.inference.facts import Diagnostics, Provenance
 from geomtact.inference.reference import Reference
+from geomtact.inference.sampler import Explored
 from geomtact.se3 import check_pose, check_transforms
 from geomtact.sensing.sensor import Sensor
 
@@ -30,7 +31,7 @@ _OFF = 1e-3  # largest deviation of the sum of probabilities from 1; hand-set
 WITHOUT_PRIOR = (
     "this file lacks the prior and other sensors: it holds only that one sensor without contact rules poses out"
 )
-_FORMAT = "geomtact/posterior/3"
+_FORMAT = "geomtact/posterior/4"
 _BROKEN = (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError)
 
 
@@ -39,15 +40,17 @@ def save(posterior: CellDistribution, path: str | Path) -> None:
     :func:`load` needs.
 
     A posterior may be spread over a million poses. For other programs the most probable are written out, those that
-    hold 99 % of the mass but at most 50,000, with log_prob normalised over them; ``row_log_prob`` holds all, for the runs
-    of ``row_length`` cells that begin at ``row_cell``; it is empty where each is one cell.
+    hold 99 % of the mass but at most 50,000, with log_prob normalised over them; ``row_log_prob`` holds all cells, for the runs
+    of ``row_length`` cells that begin at ``row_cell``; it is empty where each is one cell. What begins with ``explored`` is of a
+    posterior resolved within the cells; it is empty for others.
 
     Raises
     ------
     InputError
         The file cannot be written.
     """
-    p = np.exp(posterior.log_prob)
+    log_prob = row_log_prob(posterior)
+    p = np.exp(log_prob)
     order = np.argsort(-p, kind="stable")
     some = np.sort(order[: min(_MOST, int(np.searchsorted(np.cumsum(p[order]), _KEPT)) + 1)])
     refined, symmetry, reference = posterior.refined, posterior.index.mesh.symmetry, posterior.reference
@@ -69,16 +72,17 @@ def save(posterior: CellDistribution, path: str | Path) -> None:
         "warnings": posterior.warnings + [WITHOUT_PRIOR] * provenance.lacks_prior,
         "refined": [[refined[int(k)].length, refined[int(k)].moved, refined[int(k)].observable.tolist()] for k in keys],
     }
+    explored = posterior.explored.arrays() if posterior.explored else {}
     arrays = {
         "poses": row_poses(posterior, some),
-        "log_prob": posterior.log_prob[some] - (np.log(p[some].sum()) if len(some) else 0.0),
+        "log_prob": log_prob[some] - (np.log(p[some].sum()) if len(some) else 0.0),
         "frame": np.array(posterior.frame),
         "object_sha256": np.array(posterior.index.mesh.sha256),
         "sensor_toml": np.array(posterior.index.sensor.to_toml()),
         "seed": np.array(posterior.seed),
         "row_cell": posterior.cells,
         "row_length": np.zeros(0, np.int64) if posterior.runs is None else posterior.runs,
-        "row_log_prob": posterior.log_prob,
+        "row_log_prob": posterior.cell_log_prob,
         "index_poses": np.array(len(posterior.index)),
         "T_frame_sensor": posterior.T_frame_sensor,
         "symmetry_elements": symmetry.elements,
@@ -92,6 +96,7 @@ def save(posterior: CellDistribution, path: str | Path) -> None:
         "reference_poses": np.zeros((0, 4, 4)) if reference is None else reference.poses,
         "reference_log_mass": np.zeros(0) if reference is None else reference.log_mass,
         "meta": np.array(json.dumps(meta)),
+        **{f"explored_{name}": value for name, value in explored.items()},
     }
 
     def write(temporary: Path) -> None:
@@ -160,6 +165,11 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> CellDistribut
     index = open_index(mesh, sensor, meta["approach"], max_poses, cache_dir, key=str(data["index_key"]))
     if poses != len(index):
         raise InputError(f"{path}: its poses are not those of this version's grid; localize again")
+    try:
+        held = {name.removeprefix("explored_"): value for name, value in data.items() if name.startswith("explored_")}
+        explored = Explored.of_arrays(index, held) if held else None
+    except (*_BROKEN, GeomtactError) as error:
+        raise _not_saved(path, error) from None
     return CellDistribution(
         index,
         cells,
@@ -171,6 +181,7 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> CellDistribut
         seed=seed,
         runs=runs if len(runs) else None,
         refined=refined,
+        explored=explored,
         reference=reference,
         provenance=provenance,
         diagnostics=diagnostics,

@@ -97,7 +97,7 @@ class Filter:
         if seen.contact and last is not None and np.array_equal(_observation(seen).image, _observation(last).image):
             warnings.append(f"frame {self.frames} is the same image as the one before: it counts once")
             rests = np.array_equal(last.T_frame_sensor, seen.T_frame_sensor)
-            result = (last.cells, last.log_prob) if rests else self._passed_over(seen.T_frame_sensor)
+            result = (last.cells, last.cell_log_prob) if rests else self._passed_over(seen.T_frame_sensor)
         elif seen.contact:
             if self.missed and self.leading is not None:
                 lost = "a frame" if self.missed == 1 else f"{self.missed} frames"
@@ -124,7 +124,7 @@ class Filter:
             warnings=warnings,
         )
         if result is not None:
-            out = replace(out, cells=result[0], log_prob=result[1], runs=None, contact=True)
+            out = replace(out, cells=result[0], cell_log_prob=result[1], runs=None, contact=True)
         self._last = out if out.contact and not out.diagnostics.is_skipped else None
         return out
 
@@ -262,8 +262,8 @@ def _gain(seen: Posterior) -> NDArray[np.float32]:
     """Log density (n,) of a posterior in all possible cells, relative to the uniform distribution."""
     index = seen.index
     if seen.runs is None:
-        return np.asarray(seen.log_prob - index.log_possible_weight, np.float32)
-    density = (seen.log_prob - np.log(index.mass(seen.cells, seen.runs))).astype(np.float32)
+        return np.asarray(seen.cell_log_prob - index.log_possible_weight, np.float32)
+    density = (seen.cell_log_prob - np.log(index.mass(seen.cells, seen.runs))).astype(np.float32)
     out = np.zeros(len(index), np.float32)
     out[expand_runs(seen.cells, seen.runs)] = np.repeat(density, seen.runs)
     return out[index.possible]

@@ -163,7 +163,7 @@ def fused_posterior(
     posterior = replace(
         first,
         cells=fused.cells,
-        log_prob=fused.log_prob,
+        cell_log_prob=fused.log_prob,
         runs=None,
         log_evidence=float(fused.weight @ [t.log_evidence for t in touches]) + fused.log_evidence,
         timing_ms=timing,

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
+from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.distribution import Refined
-from geomtact.inference.modes import leading_cells
+from geomtact.inference.modes import leading_cells, leading_particles
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.reweight import reweight_cells
 from geomtact.registration.contact_problem import make_problem
@@ -77,6 +78,30 @@ class ModeRefiner:
         by = [refinements[best - len(candidates)] if best >= len(candidates) else None for best in winner]
         refined = refined_at(index, cells, poses[winner, np.arange(len(cells))], by, problem.length, winner > 0)
         return replace(reweight_cells(posterior, cells, LIKELIHOOD_POWER * likelihood), refined=refined)
+
+    def register(self, posterior: Posterior, contact: Contact, k: int) -> Posterior:
+        """An explored ``posterior`` with the hearts of its ``k`` leading modes moved to where registration against ``contact``
+        finds a denser pose."""
+        explored = posterior.explored
+        rows = leading_particles(posterior, k)
+        if explored is None or not len(rows):
+            return posterior
+        hearts = explored.settled(rows)
+        problem = make_problem(cleaned(contact.soft_mask, self.space.sensor), self.space.sensor)
+        found = [refiner.refine(problem, hearts) for refiner in self.refiners(posterior.index, True)]
+        T = np.stack([hearts, *(each.T for each in found)])
+        density = np.full(T.shape[:2], -np.inf)
+        density[0] = explored.particle_log_density[rows]
+        distance, radius = PoseDistance(self.space.mesh), mode_radius(self.space.mesh)
+        near = np.stack([distance.within(heart, T[1:, i], radius) for i, heart in enumerate(hearts)], 1)
+        near[near] = np.isfinite(self.space.penetration(T[1:][near]))
+        density[1:][near] = explored.log_density(T[1:][near])
+        best = density.argmax(0)
+        # where no registration helped, the covariance is that of the first one
+        by = [found[max(b - 1, 0)] for b in best]
+        each = [one if one.converged[i] else None for i, one in enumerate(by)]
+        chosen = T[best, np.arange(len(rows))]
+        return replace(posterior, refined=refined_at(posterior.index, rows, chosen, each, problem.length, best > 0))
 
     def _best(self, mask: NDArray[np.bool_], poses: Array) -> tuple[NDArray[np.int64], Array]:
         """At which of the poses (c, n, 4, 4) ``mask`` is most likely, for each of n modes, the first where none touches;

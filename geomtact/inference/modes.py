@@ -1,4 +1,4 @@
-"""The modes of a posterior: grown around its most probable cells, each cell counting for one of them."""
+"""The modes of a posterior: grown around its densest particles or cells, each counting for one of them."""
 
 from __future__ import annotations
 
@@ -18,10 +18,12 @@ from geomtact.inference.distribution import (
     nearest_images,
     rows_of,
 )
-from geomtact.se3 import Array, adjoint, inverse
+from geomtact.se3 import Array, adjoint, inverse, log
 
 _LEAST, _SPARE = 6, 2  # modes grown at least, and beyond those requested; hand-set
 _POINTS = 128  # points of the surface for distances between modes; hand-set
+# Particles that count as much as the covariance of registration (as many as a pose has directions) or of a cell; hand-set.
+_REGISTERED, _OF_CELL = 6, 1
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,60 @@ def grown(posterior: CellDistribution, k: int, full: bool = True) -> list[tuple[
             members.append((cell, np.union1d(near, [cell])))
             covered.update(near.tolist())
     return _share_out(posterior, members)[:k]
+
+
+def modes_within(posterior: CellDistribution, k: int) -> list[Mode]:
+    """The ``k`` leading modes of an explored posterior, in its frame."""
+    explored = posterior.explored
+    assert explored is not None
+    out, distance = [], PoseDistance(posterior.index.mesh, _POINTS)
+    for row, members, mass in _grown_within(posterior, k):
+        heart = explored.settled(np.array([row]))[0]
+        found = posterior.refined.get(row)
+        if found is None:
+            covariance = posterior.index.cell_covariance(heart)
+            found = Refined(heart, covariance, np.zeros((0, 6)), posterior.index.mesh.radius_rms, False)
+        # a covariance of few particles is that of registration or of a cell, more or less
+        fixed = _REGISTERED if len(found.observable) else _OF_CELL
+        near = log(inverse(found.T) @ distance.aligned(found.T, explored.poses[members]))
+        weight = explored.weight[members] / explored.weight[members].sum()
+        n = 1 / float(weight @ weight)
+        spread = (near * weight[:, None]).T @ near
+        found = replace(found, covariance=(n * spread + fixed * found.covariance) / (n + fixed))
+        found = carried(found, nearest_images(posterior, found.T[None])[0])
+        T = posterior.T_frame_sensor @ found.T
+        out.append(Mode(T, mass, found.covariance, found.observable, found.length, found.moved))
+    return out
+
+
+def leading_particles(posterior: CellDistribution, k: int) -> NDArray[np.int64]:
+    """Rows (m,) of the particles at the hearts of the ``k`` leading modes of an explored posterior."""
+    return np.array([row for row, _, _ in _grown_within(posterior, k)], np.int64)
+
+
+def _grown_within(posterior: CellDistribution, k: int) -> list[tuple[int, NDArray[np.int64], float]]:
+    """The densest particle of each of the ``k`` leading modes, the particles in it, and their mass."""
+    explored = posterior.explored
+    assert explored is not None
+    distance, radius = PoseDistance(posterior.index.mesh, _POINTS), mode_radius(posterior.index.mesh)
+    covered = np.zeros(len(explored.poses), bool)
+    left: list[tuple[int, NDArray[np.int64]]] = []
+    for row in np.argsort(-explored.particle_log_density, kind="stable").tolist():
+        if len(left) == max(k, _LEAST) + _SPARE:
+            break
+        if not covered[row]:
+            inside = distance.within(explored.poses[row], explored.poses, radius)
+            covered |= inside
+            left.append((row, np.flatnonzero(inside)))
+    out: list[tuple[int, NDArray[np.int64], float]] = []
+    free = np.ones(len(explored.poses), bool)
+    while left and len(out) < k:
+        mass = [float(explored.weight[inside[free[inside]]].sum()) for _, inside in left]
+        best = int(np.argmax(mass))
+        row, members = left.pop(best)
+        out.append((row, members[free[members]], mass[best]))
+        free[members] = False
+    return [each for each in out if each[2] > 0]
 
 
 def leading_cells(posterior: CellDistribution, k: int) -> NDArray[np.int64]:
@@ -143,4 +199,4 @@ def _within(
 def _mass_of(posterior: CellDistribution, cells: NDArray[np.int64]) -> Array:
     """Probability (m,) of the run that each of ``cells`` (m,) stands for; 0 where it stands for none."""
     row, held = rows_of(posterior, cells)
-    return np.where(held & (middle_cells(posterior, row) == cells), np.exp(posterior.log_prob[row]), 0.0)
+    return np.where(held & (middle_cells(posterior, row) == cells), np.exp(posterior.cell_log_prob[row]), 0.0)

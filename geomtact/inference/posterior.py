@@ -25,11 +25,12 @@ from geomtact.inference.distribution import (
     middle_cells,
     nearest_images,
     row_log_density,
+    row_log_prob,
     row_poses,
     run_lengths,
 )
 from geomtact.inference.files import load, save
-from geomtact.inference.modes import Mode, grown, mode_at
+from geomtact.inference.modes import Mode, grown, mode_at, modes_within
 from geomtact.se3 import Array, check_transforms, inverse
 from geomtact.sensing.reading import Observation
 from geomtact.sensing.sensor import Sensor
@@ -84,8 +85,14 @@ class Posterior(CellDistribution):
 
     @cached_property
     def poses(self) -> Array:
-        """Poses (N, 4, 4) of the object in ``frame``, one per run; refined ones where registration found better."""
-        return row_poses(self, np.arange(len(self.cells)))
+        """Poses (N, 4, 4) of the object in ``frame``, one per particle, or per run of cells; refined ones where registration
+        found better."""
+        return row_poses(self, np.arange(len(self.log_prob)))
+
+    @cached_property
+    def log_prob(self) -> NDArray[np.floating]:
+        """Log probability (N,) of each of :attr:`poses`, normalised."""
+        return row_log_prob(self)
 
     @cached_property
     def entropy_nats(self) -> float:
@@ -100,10 +107,8 @@ class Posterior(CellDistribution):
 
     @property
     def effective_poses(self) -> float:
-        """How many equally likely cells would be as uncertain: exp of the discrete entropy."""
-        p = self._probability
-        each = self.log_prob if self.runs is None else self.log_prob + self.index.log_share(self.cells, self.runs)
-        return float(np.exp(-(p @ np.where(p > 0, each, 0.0)))) if len(p) else 0.0
+        """How many cells of mean size, equally likely, would be as uncertain."""
+        return float(len(self.index) * np.exp(self.entropy_nats)) if self.contact else 0.0
 
     def modes(self, k: int = 5) -> list[Mode]:
         """The ``k`` most probable modes, most probable first; none without contact.
@@ -114,6 +119,8 @@ class Posterior(CellDistribution):
         """
         if not self.contact or k < 1:
             return []
+        if self.explored is not None:
+            return modes_within(self, k)
         return [mode_at(self, cell, mass) for cell, mass in grown(self, k)]
 
     def likeliest(self, n: int) -> Array:
@@ -123,6 +130,9 @@ class Posterior(CellDistribution):
         Fewer where there are fewer, none without contact. Most are neighbours; for places that are apart see :meth:`modes`, which
         has the same images under the object's symmetry.
         """
+        if self.explored is not None:
+            rows = np.argsort(-self._log_density, kind="stable")[: max(n, 0)]
+            return self.T_frame_sensor @ nearest_images(self, self.explored.poses[rows])
         rows = leading_rows(self, n) if self.contact and n > 0 else np.zeros(0, np.int64)
         rows = rows[np.argsort(-log_mass_per_cell(self)[rows], kind="stable")]
         return self.T_frame_sensor @ nearest_images(self, cell_poses(self, middle_cells(self, rows)))
@@ -145,7 +155,7 @@ class Posterior(CellDistribution):
             depth = self.space.penetration(inside)
             touching = np.isfinite(depth)
             if touching.any():
-                out[touching] = cell_log_density(self, self.index.lookup(inside[touching], depth[touching]))
+                out[touching] = self._within(inside[touching], depth[touching])
         else:
             off_contact = self.off_contact_log_density
             free = self.space.caster.penetration(self.sensor, inside) <= 0
@@ -166,7 +176,7 @@ class Posterior(CellDistribution):
         T = check_transforms(T)
         density = np.atleast_1d(self.log_density(T)).ravel()
         finite, share = np.isfinite(density), np.array([_share(pose, self.seed) for pose in T.reshape(-1, 4, 4)])
-        if len(self.cells):
+        if self.contact:
             edges = np.unique(np.concatenate([density[finite] - _TIE, density[finite] + _TIE]))
             whole = np.rint(self._probability * 2.0**52)  # whole numbers up to 2**53 add up to the same in any order
             below = np.cumsum(np.bincount(np.searchsorted(edges, self._log_density), whole, len(edges) + 1))
@@ -176,8 +186,8 @@ class Posterior(CellDistribution):
         return float(out[0]) if T.ndim == 2 else out.reshape(T.shape[:-2])
 
     def sample(self, n: int, rng: np.random.Generator | int) -> Array:
-        """``n`` poses (n, 4, 4) drawn by ``rng``, or by one of that seed, from the posterior: uniform within each cell, even a
-        refined one, and over the symmetry.
+        """``n`` poses (n, 4, 4) drawn by ``rng``, or by one of that seed, from the posterior: among its particles, or uniform
+        within each cell, even a refined one; and over the symmetry.
 
         Raises
         ------
@@ -191,6 +201,8 @@ class Posterior(CellDistribution):
         if not self.contact:
             raise UsageError("sample: the image shows no contact, so there is no distribution of touching poses")
         rng = np.random.default_rng(rng)
+        if self.explored is not None:
+            return self.T_frame_sensor @ self.explored.draw(n, rng)
         cells = self._draw_cells(n, rng)
         return self.T_frame_sensor @ draw_within(self.index, self.space, cells, rng)[0]
 
@@ -220,13 +232,23 @@ class Posterior(CellDistribution):
 
     @cached_property
     def _probability(self) -> Array:
+        if self.explored is not None:
+            return self.explored.weight
         # exponentials in single precision take a fifth of the time, and the scores have no more
-        return np.exp(self.log_prob.astype(np.float32)).astype(float)
+        return np.exp(self.cell_log_prob.astype(np.float32)).astype(float)
 
     @cached_property
     def _log_density(self) -> Array:
-        """Log density (N,) of the runs relative to the uniform distribution."""
+        """Log density (N,) of the particles or runs relative to the uniform distribution."""
+        if self.explored is not None:
+            return self.explored.particle_log_density
         return row_log_density(self, np.arange(len(self.cells)))
+
+    def _within(self, T: Array, depth: Array) -> Array:
+        """Log density (n,) at poses ``T`` (n, 4, 4) in the sensor frame, which press ``depth`` (n,) [m] deep."""
+        if self.explored is not None:
+            return self.explored.log_density(T)
+        return cell_log_density(self, self.index.lookup(T, depth))
 
     def _draw_cells(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
         total = np.cumsum(self._probability)

@@ -39,7 +39,7 @@ def reweight_cells(
     likeliest = np.full(len(row), -np.inf)
     np.maximum.at(likeliest, which, np.asarray(log_likelihood, float)[held_here])
     row, likeliest = row[likeliest > -np.inf], likeliest[likeliest > -np.inf]
-    log_mass = posterior.log_prob[row].astype(float)
+    log_mass = posterior.cell_log_prob[row].astype(float)
     gain, at = row_log_density(posterior, row), posterior.cells[row]
     with np.errstate(invalid="ignore"):
         if log_prior is not None:
@@ -51,6 +51,6 @@ def reweight_cells(
     new += held - np.logaddexp.reduce(new)
     log_total = np.log(others_factor + (1 - others_factor) * np.exp(held))
     with np.errstate(divide="ignore"):
-        log_prob = posterior.log_prob + posterior.log_prob.dtype.type(np.log(others_factor) - log_total)
+        log_prob = posterior.cell_log_prob + posterior.cell_log_prob.dtype.type(np.log(others_factor) - log_total)
         log_prob[row] = np.logaddexp(new + np.log1p(-kept_share), log_mass + np.log(kept_share)) - log_total
-    return replace(posterior, log_prob=log_prob)
+    return replace(posterior, cell_log_prob=log_prob)

@@ -12,7 +12,7 @@ observed one, and moves turn the object about that point of the membrane.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -22,10 +22,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp, ndtr, ndtri
 
-from geomtact.contact_space.contact_maps import ContactMaps, Placements, sample_pitch
+from geomtact.contact_space.contact_maps import ContactMaps, Placements, located, sample_pitch
+from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
-from geomtact.scoring.contact_likelihood import POWERS, WEIGHTS, ContactQuery
-from geomtact.se3 import Array, exp, inverse, log, transform
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.se3 import Array, check_transforms, exp, inverse, log, transform
 
 _UNIFORM = 0.2  # share of the uniform distribution in the coarse posterior, by which poses are drawn; hand-set
 # All other constants choose where poses are drawn: they change how precise the evidence is, not what is estimated.
@@ -34,15 +35,18 @@ _WIDTH = 1.5  # standard deviation of aligned centres, in samples of the window
 _CUTS = 3  # contacts that are cut for a draw, at most
 _DRAWS = 4  # draws for each pose that is kept
 _MOVES = 2  # of every pose at each step
-_STEPS = 9  # that are usual, for the budget
+_STEPS = 11  # that are usual, for the budget
 _KEPT = 0.6  # share of the poses that the weights of a step leave effective
 _ACCEPTED = 0.25  # share of moves accepted at which their size stays
 _SMALL = 0.5  # share of the moves that are small motions
 _NEAR = 8  # poses among which the other one of a difference is drawn
 _ALONG = 1.0  # largest multiple of a difference
 _TURN = 0.1  # rad, standard deviation of the first moves; they differ by a factor of ten from pose to pose
-_EXPONENTS = np.geomspace(0.02, 1, 24)  # of the likelihood, that the first step may have
+_EXPONENTS = np.geomspace(2e-4, 1, 40)  # of the likelihood, that the first step may have
 _HALVINGS = 30
+# Mean difference of two log evidences, by the weights of the powers, above which neither is believed [nats], and by how much more
+# contacts are cut then; hand-set.
+_AGREE, _MORE = 2.0, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +58,15 @@ class Particles:
     poses : n of them, their ``reach`` as it was found
     depth : (n,) penetration [m]
     log_likelihood : (n,)
-    log_coarse : (n,) log density of the coarse posterior
+    log_coarse : (n,) log density of the coarse posterior, without the prior
+    log_prior : (n,) log density of the prior
     """
 
     poses: Placements
     depth: Array
     log_likelihood: Array
     log_coarse: Array
+    log_prior: Array
 
     def __len__(self) -> int:
         return len(self.depth)
@@ -69,7 +75,7 @@ class Particles:
         """Log (n,) of the density of the posterior by a power of the likelihood, up to a constant; -inf where nothing is
         touched."""
         touches = np.isfinite(self.log_likelihood)
-        return np.where(touches, log_target(self.log_likelihood, self.log_coarse, power), -np.inf)
+        return np.where(touches, self.log_prior + log_target(self.log_likelihood, self.log_coarse, power), -np.inf)
 
     def take(self, rows: NDArray[np.int64]) -> Particles:
         """Those of ``rows`` (m,)."""
@@ -85,9 +91,13 @@ class Particles:
 
         return self._each(replaced, other)
 
+    def joined(self, other: Particles) -> Particles:
+        """These and ``other`` (m,)."""
+        return self._each(lambda a, b: np.concatenate([a, b]), other)
+
     def _each(self, of: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]], other: Particles) -> Particles:
         poses = Placements(*map(of, vars(self.poses).values(), vars(other.poses).values()))
-        mine, others = ((each.depth, each.log_likelihood, each.log_coarse) for each in (self, other))
+        mine, others = (list(vars(each).values())[1:] for each in (self, other))
         return Particles(poses, *map(of, mine, others))
 
 
@@ -97,17 +107,19 @@ class Explored:
 
     Attributes
     ----------
-    maps, query : contacts at any pose, and the observed one
-    log_coarse : (n,) log density of the coarse posterior at the places of the index
+    index, query : all touches of the object, and the observed contact
+    log_coarse : (n,) log density of the coarse posterior at the places of the index, without the prior
+    log_prior : (N,) log density of the prior in the cells of the index; None for the uniform
     particles : of each posterior, poses drawn from it, equally probable
     log_evidence : of each, the log of the mean of the power of the likelihood over the coarse posterior
     exponents : of the likelihood, step by step
     contacts : that were cut
     """
 
-    maps: ContactMaps
+    index: Index
     query: ContactQuery
     log_coarse: Array
+    log_prior: NDArray[np.floating] | None
     particles: tuple[Particles, ...]
     log_evidence: tuple[float, ...]
     exponents: tuple[float, ...]
@@ -116,24 +128,27 @@ class Explored:
     @cached_property
     def weight(self) -> Array:
         """Mass of each particle of all posteriors."""
-        return np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(self.particles, WEIGHTS, strict=True)])
+        return np.concatenate(
+            [np.full(len(p), w / len(p)) for p, w in zip(self.particles, self.query.weights, strict=True)]
+        )
 
     @cached_property
     def particle_log_density(self) -> Array:
         """Log density at each particle of all posteriors."""
-        return np.concatenate([self._log_density(p.log_likelihood, p.log_coarse) for p in self.particles])
+        return np.concatenate([p.log_prior + self._posteriors(p.log_likelihood, p.log_coarse) for p in self.particles])
 
-    def _log_density(self, log_likelihood: Array, log_coarse: Array) -> Array:
+    def _posteriors(self, log_likelihood: Array, log_coarse: Array) -> Array:
+        """Log density (n,) over the prior."""
         each = [
             np.log(weight) + log_target(log_likelihood, log_coarse, power) - log_evidence
-            for power, weight, log_evidence in zip(POWERS, WEIGHTS, self.log_evidence, strict=True)
+            for power, weight, log_evidence in zip(POWERS, self.query.weights, self.log_evidence, strict=True)
         ]
         return np.asarray(logsumexp(each, 0))
 
     @cached_property
     def poses(self) -> Array:
         """T_sensor_object (n, 4, 4) of the particles of all posteriors."""
-        return np.concatenate([_transforms(p.poses, p.depth, self.maps.index.mesh.centre) for p in self.particles])
+        return np.concatenate([_transforms(p.poses, p.depth, self.index.mesh.centre) for p in self.particles])
 
     @property
     def expected_gain(self) -> float:
@@ -142,9 +157,74 @@ class Explored:
 
     def log_density(self, T: ArrayLike) -> Array:
         """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4) of the contact pose space."""
-        poses, membrane = self.maps.locate(np.asarray(T, float))
-        energy = self.maps.compare(self.query.samples, self.query.area, poses, membrane).energy
-        return self._log_density(self.query.log_likelihood(energy), self.log_coarse[poses.place])
+        poses, membrane = located(self.index, np.asarray(T, float))
+        cut = ContactMaps.of(self.index).compare(self.query.samples, self.query.area, poses, membrane)
+        density = self._posteriors(self.query.log_likelihood(cut.energy), self.log_coarse[poses.place])
+        return density + prior_at(self.index, self.log_prior, poses.place, cut.reach - membrane)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """``n`` poses T_sensor_object (n, 4, 4) drawn by ``rng`` among the particles, at any image under the symmetry."""
+        T = self.settled(rng.choice(len(self.weight), n, p=self.weight))
+        return self.index.directions.any_image(T, rng)
+
+    def settled(self, rows: NDArray[np.int64]) -> Array:
+        """Poses T_sensor_object (n, 4, 4) of the particles ``rows`` (n,).
+
+        Height maps miss what lies between their pixels, so that a pose may touch by them and not quite by the mesh, or press a
+        little too deep: it is moved along z.
+        """
+        T, space = self.poses[rows], self.index.space
+        off = np.flatnonzero(~np.isfinite(space.penetration(T)))
+        settled, ok = space.settle(T[off], np.concatenate([p.depth for p in self.particles])[rows[off]])
+        T[off[ok]] = settled[ok]
+        return T
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that :meth:`of_arrays` needs beside the index."""
+        return {
+            "T": self.poses,
+            "log_likelihood": np.concatenate([p.log_likelihood for p in self.particles]),
+            "depth": np.concatenate([p.depth for p in self.particles]),
+            "counts": np.array([len(p) for p in self.particles]),
+            "log_evidence": np.array(self.log_evidence),
+            "log_coarse": self.log_coarse.astype(np.float32),
+            "log_prior": np.zeros(0) if self.log_prior is None else self.log_prior,
+            "exponents": np.array(self.exponents),
+            "contacts": np.array(self.contacts),
+            "touched": self.query.touched,
+        }
+
+    @classmethod
+    def of_arrays(cls, index: Index, arrays: Mapping[str, NDArray[Any]]) -> Explored:
+        """Inverse of :meth:`arrays`.
+
+        Raises
+        ------
+        KeyError, ValueError, PoseError
+            They are not what it gives.
+        """
+        T, depth, counts = check_transforms(arrays["T"]), arrays["depth"], arrays["counts"]
+        log_coarse = arrays["log_coarse"].astype(float)
+        log_prior = arrays["log_prior"] if len(arrays["log_prior"]) else None
+        if len(counts) != len(POWERS) or not len(T) == len(depth) == len(arrays["log_likelihood"]) == counts.sum():
+            raise ValueError("particles of different number")
+        if len(log_coarse) != index.places or (log_prior is not None and len(log_prior) != len(index)):
+            raise ValueError("densities that are not of its grid")
+        poses, membrane = located(index, T)
+        prior = prior_at(index, log_prior, poses.place, depth)
+        whole = Particles(
+            replace(poses, reach=membrane + depth), depth, arrays["log_likelihood"], log_coarse[poses.place], prior
+        )
+        return cls(
+            index,
+            ContactQuery.showing(arrays["touched"].astype(bool), index.sensor),
+            log_coarse,
+            log_prior,
+            tuple(whole.take(rows) for rows in np.split(np.arange(len(T)), np.cumsum(counts)[:-1])),
+            tuple(arrays["log_evidence"].tolist()),
+            tuple(arrays["exponents"].tolist()),
+            int(arrays["contacts"]),
+        )
 
     def credible_level(self, log_density: float) -> float:
         """Mass of the poses that are denser than ``log_density``."""
@@ -168,37 +248,96 @@ def log_target(log_likelihood: Array, log_coarse: Array, power: float) -> Array:
 def log_likelihood_at(maps: ContactMaps, query: ContactQuery, T: ArrayLike, depth: Array | None = None) -> Array:
     """Log likelihood (n,) of the observed contact at ``T_sensor_object`` (n, 4, 4), where the object is moved along z to press
     ``depth`` (n,) [m] deep if that is given."""
-    poses, membrane = maps.locate(np.asarray(T, float))
+    poses, membrane = located(maps.index, np.asarray(T, float))
     where = {"membrane": membrane} if depth is None else {"depth": depth}
     return query.log_likelihood(maps.compare(query.samples, query.area, poses, **where).energy)
 
 
-def explore(maps: ContactMaps, query: ContactQuery, coarse: Array, contacts: int, rng: np.random.Generator) -> Explored:
+def prior_at(index: Index, log_prior: NDArray[np.floating] | None, place: NDArray[np.int64], depth: Array) -> Array:
+    """Log density (n,) of the prior, known in the cells of ``index``, at places (n,) and penetrations (n,) [m]."""
+    if log_prior is None:
+        return np.zeros(len(place))
+    return log_prior[index.level_of(place, depth) * index.places + place].astype(float)
+
+
+def explore_twice(
+    index: Index,
+    query: ContactQuery,
+    coarse: Array,
+    contacts: int,
+    rng: np.random.Generator,
+    log_prior: NDArray[np.floating] | None = None,
+) -> Explored:
+    """As :func:`explore`, by two runs that share the ``contacts`` and have to agree on the evidence. Where they do not, one has
+    missed what the other found, and both are repeated with more contacts.
+
+    Raises
+    ------
+    InputError
+        No pose that was drawn touches the sensor, or the runs do not agree even so.
+    """
+    cut = 0
+    for more in (1, _MORE):
+        one, other = (explore(index, query, coarse, more * contacts // 2, rng, log_prior) for _ in range(2))
+        cut += one.contacts + other.contacts
+        apart = query.weights @ np.abs(np.array(one.log_evidence) - other.log_evidence)
+        if apart < _AGREE:
+            return replace(_pooled(one, other, rng), contacts=cut)
+    raise InputError(
+        f"{index.mesh.name}: two runs differ by {apart:.0f} nats in how likely the contact is; allow more contacts"
+    )
+
+
+def _pooled(one: Explored, other: Explored, rng: np.random.Generator) -> Explored:
+    """Two runs as one: of each posterior the particles of both, by how likely each run makes the contact."""
+    particles, evidence = [], []
+    for first, second, a, b in zip(one.particles, other.particles, one.log_evidence, other.log_evidence, strict=True):
+        evidence.append(float(np.logaddexp(a, b) - np.log(2)))
+        share, n = float(np.exp(a - np.logaddexp(a, b))), len(first) + len(second)
+        of_first = _systematic(np.ones(len(first)), round(share * n), rng)
+        of_second = _systematic(np.ones(len(second)), n - round(share * n), rng)
+        particles.append(first.take(of_first).joined(second.take(of_second)))
+    return replace(one, particles=tuple(particles), log_evidence=tuple(evidence))
+
+
+def explore(
+    index: Index,
+    query: ContactQuery,
+    coarse: Array,
+    contacts: int,
+    rng: np.random.Generator,
+    log_prior: NDArray[np.floating] | None = None,
+) -> Explored:
     """The distribution of the pose, from about ``contacts`` contacts.
 
     Parameters
     ----------
     coarse : (n,) mass of the places of the index in a coarse posterior; a share of the uniform one is mixed in
+    log_prior : (N,) log density of the prior in the cells of the index, relative to the uniform; None for the uniform
 
     Raises
     ------
     InputError
         No pose that was drawn touches the sensor.
     """
-    measure = maps.index.weight.sum(0, dtype=float)
-    measure /= measure.sum()
+    each = index.weight.astype(float) / index.weight.sum(dtype=float)
+    measure = each.sum(0)
     share = (1 - _UNIFORM) * coarse / coarse.sum() + _UNIFORM * measure
-    sampler = _Sampler(maps, query, np.log(share / measure))
+    sampler = _Sampler(ContactMaps.of(index), query, np.log(share / measure), log_prior)
+    known = 0.0  # log of the mean of the coarse density under the prior
+    if log_prior is not None:
+        share = share / measure * (each * np.exp(log_prior.reshape(each.shape))).sum(0)
+        known = float(np.log(share.sum()))
     n = max(contacts // (_DRAWS * _CUTS + _MOVES * _STEPS), 20)
     drawn, log_weight, cut = sampler.draw(share, _DRAWS * n, rng)
-    # the coarse posterior has the evidence 1, by definition: what is left is an error of the measure, which all share
+    # the evidence of the coarse posterior is known: what is left is an error of the measure, which all share
     whole = float(logsumexp(log_weight + drawn.log_target(0)))
     if not np.isfinite(whole):
-        raise InputError(f"{maps.index.mesh.name}: no pose that was drawn touches the sensor; allow more contacts")
-    log_weight = log_weight - whole
-    # the first exponent is the one that the draws suit best
-    first = [log_weight + drawn.log_target(exponent) for exponent in _EXPONENTS]
-    power = float(_EXPONENTS[int(np.argmax([_effective(each) for each in first]))])
+        raise InputError(f"{index.mesh.name}: no pose that was drawn touches the sensor; allow more contacts")
+    log_weight = log_weight + known - whole
+    # the first exponent is the largest that leaves enough draws effective: a distinctive contact begins low
+    effective = np.array([_effective(log_weight + drawn.log_target(exponent)) for exponent in _EXPONENTS])
+    power = float(_EXPONENTS[np.flatnonzero(effective >= min(n, effective.max()))[-1]])
     # the posteriors by powers of at most this one are those of the draws
     found, evidence = [], []
     for each in (*(each for each in POWERS if each < power), power):
@@ -223,7 +362,7 @@ def explore(maps: ContactMaps, query: ContactQuery, coarse: Array, contacts: int
         particles = particles.take(_resampled(step * change, n, rng))
         power = after if step == after - power else power + step
         exponents.append(power)
-    return Explored(maps, query, sampler.log_coarse, tuple(found), tuple(evidence), tuple(exponents), cut)
+    return Explored(index, query, sampler.log_coarse, log_prior, tuple(found), tuple(evidence), tuple(exponents), cut)
 
 
 def _effective(log_weight: Array) -> float:
@@ -258,11 +397,12 @@ def _next_step(change: Array, most: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Sampler:
-    """Draws and moves of poses for one touch; ``log_coarse`` (n,) is the coarse log density at the index's places."""
+    """Draws and moves of poses for one touch; densities are as of :class:`Explored`."""
 
     maps: ContactMaps
     query: ContactQuery
     log_coarse: Array
+    log_prior: NDArray[np.floating] | None
 
     def _admitted(self, poses: Placements, depth: Array, some: NDArray[np.bool_]) -> NDArray[np.bool_]:
         space = self.maps.index.space
@@ -293,7 +433,7 @@ class _Sampler:
                 _differences(T[others], particles.poses.place[others], len(some), rng) @ T[some],
             )
             now = particles.take(some)
-            poses, membrane = self.maps.locate(moved)
+            poses, membrane = located(self.maps.index, moved)
             new = self.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane)
             accepted[some] = np.log(rng.random(len(some))) < new.log_target(power) - now.log_target(power)
             particles = particles.put(some[accepted[some]], new.take(np.flatnonzero(accepted[some])))
@@ -303,7 +443,10 @@ class _Sampler:
         """``T`` (n, 4, 4) turned about the observed contact's centroid and shifted."""
         n = len(T)
         scale = size * 10 ** -rng.random((n, 1))
-        turn = Rotation.from_rotvec(scale * _TURN * rng.normal(size=(n, 3))).as_matrix()
+        rotvec = scale * _TURN * rng.normal(size=(n, 3))
+        if self.maps.index.space.on_known_faces:
+            rotvec[:, :2] = 0
+        turn = Rotation.from_rotvec(rotvec).as_matrix()
         shift = scale * _WIDTH * sample_pitch(self.maps.index.sensor) * rng.normal(size=(n, 3))
         about = np.array([*self.query.centroid, 0.0])
         where = np.einsum("nij,nj->ni", turn, T[:, :3, 3] - about) + about + shift
@@ -321,16 +464,17 @@ class _Sampler:
         ok[ok] = self._admitted(found, depth, ok)
         log_likelihood = np.full(len(depth), -np.inf)
         log_likelihood[ok] = self.query.log_likelihood(cut.energy[ok])
-        return Particles(found, depth, log_likelihood, self.log_coarse[poses.place])
+        log_prior = prior_at(self.maps.index, self.log_prior, poses.place, depth)
+        return Particles(found, depth, log_likelihood, self.log_coarse[poses.place], log_prior)
 
     def draw(self, share: Array, n: int, rng: np.random.Generator) -> tuple[Particles, Array, int]:
         """``n`` poses, their log weights (n,), and how many contacts were cut.
 
-        A place is drawn by its ``share`` (m,), a rotation uniformly in its cell, a centre in its lattice cell. A weight is the
-        uniform density over that of the draw, over n.
+        A place is drawn in proportion to ``share`` (m,), a rotation uniformly in its cell, a centre in its lattice cell. A weight
+        is the uniform density over that of the draw, over n.
         """
         index = self.maps.index
-        place = _systematic(share, n, rng)
+        place, share = _systematic(share, n, rng), share / share.sum()
         drawn = transform(index.directions.draw(index.rotation[place], rng), np.zeros(3))
         rotation = index.directions.canonical(drawn)[:, :3, :3]
         direction = index.directions.direction_of_rotation(index.rotation[place]).astype(np.int32)

@@ -12,6 +12,7 @@ import numpy as np
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError, PoseError, UsageError, nearest_name
+from geomtact.inference.effort import Effort, effort_of
 from geomtact.inference.facts import Diagnostics, TrackRecord
 from geomtact.inference.filter import FRAME_POWER, UNIFORM_SHARE, Counts, Filter
 from geomtact.inference.motion import Motion, UniformBall
@@ -35,7 +36,7 @@ def track(
     frames: Iterable[Any],
     T_world_sensor: Any = None,
     motion: Motion | None = None,
-    effort: str = "balanced",
+    effort: str | Effort = "balanced",
     prior: Any = None,
     most: int | None = None,
     *,
@@ -82,6 +83,9 @@ def track(
     _check(frames, index.sensor.image_size_px, motion, counts, fresh, most, on_error)
     state = make_filter(index, scorer, motion, counts, fresh, most, seed)
     pairs = _pairs(frames, _poses(frames, T_world_sensor))
+    # the filter's powers are those of distributions over cells, so that frames are not resolved within them
+    resolved = effort_of(effort)
+    effort = replace(resolved, contacts=0) if resolved.contacts else effort
     options = {"effort": effort, "kind": kind, "background": background, "seed": seed}
     return _tracked(localize, index, cache_dir, pairs, state, prior, options, on_error == "skip")
 

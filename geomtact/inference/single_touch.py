@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
+from geomtact.errors import InputError
 from geomtact.inference.effort import Effort, effort_of
 from geomtact.inference.facts import Diagnostics, Provenance, ViewRecord
 from geomtact.inference.joint_refinement import refine_jointly
@@ -20,8 +21,10 @@ from geomtact.inference.outline_refinement import few_are_left, refine_by_outlin
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import lost_contact, prior_log_density, prior_log_mass
 from geomtact.inference.repeated_images import digest
+from geomtact.inference.sampler import explore_twice
 from geomtact.inference.search import SensorView
 from geomtact.inference.views import Placed
+from geomtact.scoring.contact_likelihood import ContactQuery
 from geomtact.scoring.fitted import FittedScorer
 from geomtact.sensing.contact import Contact, SoftMask
 
@@ -91,7 +94,7 @@ def touch_posterior(
     posterior = replace(
         posterior,
         cells=rows.first,
-        log_prob=log_prob,
+        cell_log_prob=log_prob,
         runs=rows.runs,
         log_evidence=evidence,
         provenance=replace(
@@ -100,6 +103,31 @@ def touch_posterior(
         diagnostics=Diagnostics(is_outlier=is_outlier),
     )
     return posterior, log_prior
+
+
+def explore_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer, effort: Effort) -> Posterior:
+    """The ``posterior`` of one mask, resolved within the cells by the contacts of ``effort``.
+
+    It is as it was for none, for depth maps, and on known faces: there an elastic gel's contacts err too much for single poses,
+    and outlines are compared with those of solved gels instead. ``log_prior`` is as of :func:`touch_posterior`.
+    """
+    observation, index = posterior.observation, posterior.index
+    if not effort.contacts or not posterior.contact or observation is None or observation.contact.height is not None:
+        return posterior
+    if index.space.on_known_faces:
+        return posterior
+    with timed(posterior.timing_ms, "explore"):
+        mask = observation.contact.soft_mask
+        coarse = np.exp(scorer.log_mass(index, mask)).sum(0)
+        density = None
+        if log_prior is not None:
+            density = np.where(index.log_weight > -np.inf, log_prior - np.maximum(index.log_weight, -1e3), -np.inf)
+        query, rng = ContactQuery.of(mask, posterior.sensor), np.random.default_rng(posterior.seed)
+        try:
+            return replace(posterior, explored=explore_twice(index, query, coarse, effort.contacts, rng, density))
+        except InputError as error:
+            warning = f"the pose is not resolved within the grid's cells: {error}"
+            return replace(posterior, warnings=[*posterior.warnings, warning])
 
 
 def drop_lost_contact_prior(posterior: Posterior, prior: Any) -> tuple[Posterior, Any]:
@@ -123,6 +151,8 @@ def refine_modes(posterior: Posterior, log_prior: LogMass, refiner: ModeRefiner,
     with timed(posterior.timing_ms, "refine"):
         contact = posterior.observation.contact
         has_height = contact.height is not None
+        if posterior.explored is not None:
+            return refiner.register(posterior, contact, effort.modes)
         if not effort.modes or not (has_height or (effort.outlines and few_are_left(posterior))):
             return refiner.refine(posterior, contact, effort.modes, effort.thorough)
         view = SensorView(refiner, contact, np.eye(4))

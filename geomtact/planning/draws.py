@@ -17,7 +17,7 @@ def draw_cells(posterior: Posterior, n: int, rng: np.random.Generator, within: i
     Poses lie anywhere within a cell, but around refined modes they scatter by their covariance: two such cells can differ by less
     than the grid's step.
     """
-    p = np.exp(np.asarray(posterior.log_prob, float))
+    p = np.exp(np.asarray(posterior.cell_log_prob, float))
     row = rng.choice(len(p), n, p=p / p.sum())
     cells = posterior.index.within_runs(posterior.cells[row], run_lengths(posterior, row), rng.random(n))
     T = draw_within(posterior.index, posterior.space, np.tile(cells, within), rng)[0].reshape(-1, n, 4, 4)

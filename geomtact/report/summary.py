@@ -136,7 +136,7 @@ def summaries_of(posterior: Posterior, modes: Sequence[Mode]) -> list[ModeSummar
 
 
 def facts(posterior: Posterior) -> list[str]:
-    """Sentences on the whole distribution: contacts, information gain, number of poses."""
+    """Sentences on the whole distribution: contacts and information gain."""
     if not posterior.contact:
         several = len(posterior.provenance.views) > 1
         return [f"No contact was found in {'any of the images' if several else 'the image'}."]
@@ -157,7 +157,6 @@ def facts(posterior: Posterior) -> list[str]:
     return [
         *lines,
         f"Information gain: {gain:.1f} nats; {left} of all touching poses remains.",
-        f"{posterior.effective_poses:,.0f} of {len(posterior.index):,} grid poses carry the probability.",
     ]
 
 

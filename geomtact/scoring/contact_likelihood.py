@@ -11,7 +11,8 @@ several features press. Neither the gel nor the share is known, so both are marg
 
 How far a contact is from any simulated one is not known either: by the noise alone, or by a gel that differs from the model. So
 the posterior is a mixture of posteriors, each by a power of the likelihood: 0 gives the coarse one, 1 that of the whole
-likelihood. Their weights are fitted like all else by the log score ("stacking", Yao et al. 2018).
+likelihood. Errors go together along an outline, so a long one tells less than its length says: the weights depend on it. They
+are fitted like all else by the log score ("covariate-dependent stacking", Yao et al. 2022).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 from scipy.stats import beta
 
 from geomtact.contact_space.contact_maps import SHAPE
@@ -32,12 +34,20 @@ from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
 
-# Fitted on procedural objects by ``python -m tools.training likelihood``, for the mean log density at the true pose: see
-# docs/results/contact-likelihood.json.
+# Fitted on procedural objects for the mean log density at the true pose: the first two by ``python -m tools.training likelihood``
+# (docs/results/contact-likelihood.json), the weights by ``python -m tools.training mixture`` (docs/results/mixture.json).
 RATE = 34.1e9  # nats for each m^3 of energy
 SHARE = (5.9, 11.1)  # of the beta distribution of an elastic contact's share of the depth
 POWERS = (0.0, 0.03, 0.1, 0.3, 1.0)  # of the likelihood, by the posteriors that are mixed; hand-set
-WEIGHTS = (0.009, 0.011, 0.133, 0.565, 0.282)  # of these posteriors
+INTERCEPT = (
+    -3.73,
+    -1.22,
+    -0.10,
+    0.36,
+    0.0,
+)  # their weights are the softmax of intercept + slope log(outline / OUTLINE)
+SLOPE = (0.59, -0.04, 1.25, -0.10, 0.0)
+OUTLINE = 15e-3  # m, the length of a usual outline
 RIGID = 0.5  # share of touches on a rigid gel
 _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more is added
 
@@ -48,25 +58,41 @@ class ContactQuery:
 
     Attributes
     ----------
+    touched : (H, W) bool, the contact without specks
     samples : where and how contacts are compared
     centroid : (2,) of the contact [m]
     area : of the contact, in samples
+    log_outline : log of the length of its outline over ``OUTLINE``
     """
 
+    touched: NDArray[np.bool_]
     samples: Samples
     centroid: Array
     area: float
+    log_outline: float
 
     @classmethod
     def of(cls, mask: SoftMask, sensor: Sensor) -> ContactQuery:
         """From the observed ``mask`` (H, W), which shows contact."""
-        touched = cleaned(mask, sensor) > 0.5
+        return cls.showing(cleaned(mask, sensor) > 0.5, sensor)
+
+    @classmethod
+    def showing(cls, touched: NDArray[np.bool_], sensor: Sensor) -> ContactQuery:
+        """From the contact ``touched`` (H, W) without specks."""
         pitch = float(np.sqrt(sensor.pixel_area(touched.shape)))
         x, y = sensor.pixel_centres(touched.shape)
         count = touched.sum()
         centroid = np.array([touched.sum(0) @ x, touched.sum(1) @ y]) / count
         area = count * pitch**2 / sensor.pixel_area(sensor.along(SHAPE))
-        return cls(_samples(touched, pitch, sensor), centroid, float(area))
+        # a straight line at any angle crosses 4 / pi times as many pairs of neighbours as its length has pixels
+        crossed = (touched[:, 1:] != touched[:, :-1]).sum() + (touched[1:] != touched[:-1]).sum()
+        log_outline = float(np.log(max(0.25 * np.pi * pitch * crossed, pitch) / OUTLINE))
+        return cls(touched, _samples(touched, pitch, sensor), centroid, float(area), log_outline)
+
+    @property
+    def weights(self) -> Array:
+        """Weights (K,) of the posteriors by ``POWERS``."""
+        return np.asarray(softmax(np.array(INTERCEPT) + np.array(SLOPE) * self.log_outline))
 
     def log_likelihood(self, energy: NDArray[np.float32]) -> Array:
         """Log likelihood (n,) of the contact at poses whose contacts have ``energy`` (n, SHARES), up to a constant of the image;

@@ -1,4 +1,4 @@
-"""``python -m tools.training encoder|contact|likelihood``: train the bundled networks anew, fit the likelihood of contacts anew.
+"""``python -m tools.training encoder|contact|likelihood|mixture``: train the bundled networks, fit the likelihood of contacts.
 
 A stopped run goes on where it was.
 """
@@ -76,6 +76,25 @@ def likelihood(
 
     with progress_bar("fitting") as progress:
         found = fit_likelihood(out, folder_of(work, out), objects, touches, seed, progress)
+    to_stderr(f"{found.gain:.2f} nats at the true poses, {found.expected_gain:.2f} expected")
+
+
+@app.command()
+def mixture(
+    out: Annotated[Path, typer.Option(help="JSON file to write.")] = Path("mixture.json"),
+    objects: Annotated[int, typer.Option(min=2, help="Procedural objects to touch.")] = 24,
+    touches: Annotated[int, typer.Option(min=2, help="Touches of each.")] = 40,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    work: Work = None,
+) -> None:
+    """Fit how a posterior mixes the powers of a contact's likelihood, on simulated touches of procedural objects.
+
+    The package holds the fitted numbers in scoring/contact_likelihood.py.
+    """
+    from tools.training.mixture import fit_mixture
+
+    with progress_bar("fitting") as progress:
+        found = fit_mixture(out, folder_of(work, out), objects, touches, seed, progress)
     to_stderr(f"{found.gain:.2f} nats at the true poses, {found.expected_gain:.2f} expected")
 
 

@@ -1,4 +1,4 @@
-"""Fits what the likelihood of a contact depends on: the rate of its energy, elastic shares, and the weights of its powers.
+"""Fits what the likelihood of a contact depends on: the rate of its energy and elastic shares.
 
 Touches of procedural objects are explored by the sampler as it is. The poses that it leaves, of all powers, serve to compute
 the evidence of other settings by importance sampling, so that the mean log density at the true poses can be climbed. Where the
@@ -18,14 +18,14 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from geomtact.contact_space.contact_maps import ContactMaps
+from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.touches import Touch, random_touches
 from geomtact.files import write_text, write_whole
 from geomtact.inference.sampler import Explored, Particles, explore, log_target
 from geomtact.kernels.contact_energy import SHARES
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
-from geomtact.scoring.contact_likelihood import POWERS, RATE, RIGID, SHARE, WEIGHTS, ContactQuery, share_cells
+from geomtact.scoring.contact_likelihood import POWERS, RATE, RIGID, SHARE, ContactQuery, share_cells
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 from geomtact.versions import versions
@@ -111,7 +111,7 @@ def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
     localizer = Localizer.prepare(
         random_object(int(rng.integers(1 << 31)), float(size)), sensor=sensor, max_poses=MAX_POSES
     )
-    maps = ContactMaps.cast(localizer.index)
+    maps = ContactMaps.of(localizer.index)
     for touch in random_touches(localizer.space, touches, int(rng.integers(1 << 31))):
         yield _example(localizer, maps, touch, rng)
 
@@ -119,7 +119,7 @@ def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
 def _example(localizer: Localizer, maps: ContactMaps, touch: Touch, rng: np.random.Generator) -> Example:
     query = ContactQuery.of(touch.mask, localizer.sensor)
     coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
-    explored = explore(maps, query, coarse, CONTACTS, rng)
+    explored = explore(localizer.index, query, coarse, CONTACTS, rng)
     mixed = [p.take(rng.permutation(len(p))[:KEPT]) for p in explored.particles[1:]]
     energy = np.concatenate([_energy(maps, query, p) for p in mixed])
     at_truth, place = _at_truth(maps, query, touch)
@@ -144,7 +144,7 @@ def _energy(maps: ContactMaps, query: ContactQuery, particles: Particles) -> NDA
 
 
 def _at_truth(maps: ContactMaps, query: ContactQuery, touch: Touch) -> tuple[NDArray[np.float32], int]:
-    poses, membrane = maps.locate(touch.T_sensor_object[None])
+    poses, membrane = located(maps.index, touch.T_sensor_object[None])
     return maps.compare(query.samples, query.area, poses, membrane).energy, int(poses.place[0])
 
 
@@ -201,7 +201,7 @@ class _Model(torch.nn.Module):
         super().__init__()
         self.rate = torch.nn.Parameter(torch.tensor(RATE * _UNIT).log())
         self.share = torch.nn.Parameter(torch.tensor(SHARE).log())
-        self.weight = torch.nn.Parameter(torch.tensor(WEIGHTS).log())
+        self.weight = torch.nn.Parameter(torch.zeros(len(POWERS)))
 
     def log_likelihood(self, energy: torch.Tensor) -> torch.Tensor:
         """Of energies (..., SHARES): (...)."""

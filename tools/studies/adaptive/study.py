@@ -16,7 +16,7 @@ from geomtact.contact_space.touches import Touch
 from geomtact.inference.sampler import explore, log_likelihood_at
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
-from geomtact.scoring.contact_likelihood import POWERS, WEIGHTS, ContactQuery
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
 ROOTS = (75_000, 300_000, 1_200_000)  # poses of the grids whose cells are opened
@@ -59,7 +59,7 @@ class Outcome:
 
 def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int, first: int) -> Iterator[Outcome]:
     """The outcome of each touch from the ``first`` on; ``localizers`` are on the grids of ``ROOTS``."""
-    maps = [ContactMaps.cast(localizer.index) for localizer in localizers]
+    maps = [ContactMaps.of(localizer.index) for localizer in localizers]
     for number, touch in enumerate(touches[first:], first):
         rng = np.random.default_rng([seed, number])
         query = ContactQuery.of(touch.mask, localizers[-1].sensor)
@@ -70,7 +70,7 @@ def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int,
         ]
         rank, coarse, in_cell, touching = zip(*roots, strict=True)
         mass = np.exp(log_masses[-1]).sum(0)
-        found = [explore(maps[-1], query, mass, contacts, rng) for contacts in CONTACTS]
+        found = [explore(maps[-1].index, query, mass, contacts, rng) for contacts in CONTACTS]
         true = [float(each.log_density(touch.T_sensor_object[None])[0]) for each in found]
         most = [float(each.particle_log_density.max()) for each in found]
         yield Outcome(
@@ -103,17 +103,17 @@ def _root(
     return (
         int((log_mass > log_mass[true]).sum()),
         float(log_mass[true] - index.log_weight[true]),
-        _gain(at_truth, inside),
+        _gain(at_truth, inside, query.weights),
         float(index.touching[true % index.places]),
     )
 
 
-def _gain(at_truth: float, inside: Array) -> float:
+def _gain(at_truth: float, inside: Array, weights: Array) -> float:
     """Log density at the true pose relative to the cell's mean, by the mixture of powers of the likelihood, of which the log is
     ``at_truth`` there and ``inside`` (n,) at others. The true pose counts for the mean."""
     together = np.append(inside, at_truth)
     each = [power * np.array([at_truth]) - log_mean_exp(power * together[None]) for power in POWERS[1:]]
-    return float(logsumexp([0.0, *np.concatenate(each)], b=WEIGHTS))
+    return float(logsumexp([0.0, *np.concatenate(each)], b=weights))
 
 
 def _in_cell(index: Index, maps: ContactMaps, query: ContactQuery, cell: int, rng: np.random.Generator) -> Array:

@@ -121,7 +121,7 @@ def _judged(
         log_measure = index.log_weight[posterior.cells]
     else:
         log_measure = np.log(index.mass(posterior.cells, posterior.runs))
-    density, probability = posterior.log_prob - log_measure, np.exp(posterior.log_prob)
+    density, probability = posterior.cell_log_prob - log_measure, np.exp(posterior.cell_log_prob)
     held = probability > 0
     claimed = float(probability[held] @ density[held])
     above, tied = density > gain + 1e-4, np.abs(density - gain) <= 1e-4

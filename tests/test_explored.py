@@ -1,0 +1,169 @@
+"""Laws of a posterior that is resolved within its cells: one density, whatever is asked of it."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from geomtact import Posterior
+from geomtact.contact_space.touches import random_touches
+from geomtact.evaluation import simultaneous_touches
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.inference import sampler
+from geomtact.inference.effort import Effort
+from geomtact.inference.sampler import prior_at
+from geomtact.scoring.contact_likelihood import ContactQuery
+
+EFFORT = Effort("cells", 3, contacts=6000)
+
+
+@pytest.fixture(scope="module")
+def localizer(make_localizer):
+    return make_localizer("bracket", "gelslim", max_poses=20_000)
+
+
+@pytest.fixture(scope="module")
+def touch(localizer):
+    return random_touches(localizer.space, 1, 3)[0]
+
+
+@pytest.fixture(scope="module")
+def posterior(localizer, touch):
+    return localizer.localize(touch.mask, "mask", effort=EFFORT)
+
+
+def test_it_says_more_than_its_cells(localizer, touch, posterior):
+    assert posterior.explored is not None
+    cells = localizer.localize(touch.mask, "mask", effort=replace(EFFORT, contacts=0, modes=0))
+    assert posterior.information_gain_nats > cells.information_gain_nats + 1
+    assert len(posterior.poses) == len(posterior.log_prob) < len(posterior.cells)
+    assert np.array_equal(posterior.cell_log_prob, cells.cell_log_prob)
+
+
+def test_runs_that_do_not_agree_are_not_believed(localizer, touch, monkeypatch):
+    monkeypatch.setattr(sampler, "_AGREE", 0.0)
+    found = localizer.localize(touch.mask, "mask", effort=EFFORT)
+    assert found.explored is None and "not resolved within the grid's cells" in found.warnings[-1]
+    cells = localizer.localize(touch.mask, "mask", effort=replace(EFFORT, contacts=0))
+    assert found.information_gain_nats == cells.information_gain_nats
+
+
+def test_two_runs_pool_what_they_found(localizer, touch, monkeypatch):
+    """The evidence is their mean, and each posterior has as many particles as both had."""
+    monkeypatch.setattr(sampler, "_AGREE", np.inf)
+    coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
+    query = ContactQuery.of(touch.mask, localizer.sensor)
+    both = sampler.explore_twice(localizer.index, query, coarse, 6000, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    one, other = (sampler.explore(localizer.index, query, coarse, 3000, rng) for _ in range(2))
+    mean = np.log(np.exp(np.array([one.log_evidence, other.log_evidence])).mean(0))
+    np.testing.assert_allclose(both.log_evidence, mean, atol=1e-9)
+    assert [len(p) for p in both.particles] == [
+        len(p) + len(q) for p, q in zip(one.particles, other.particles, strict=True)
+    ]
+    assert both.contacts == one.contacts + other.contacts
+
+
+def test_its_particles_and_its_cells_have_all_mass(posterior):
+    assert np.exp(posterior.log_prob).sum() == pytest.approx(1)
+    assert np.exp(posterior.cell_log_prob).sum() == pytest.approx(1)
+
+
+def test_the_density_is_1_in_the_mean_of_uniform_poses(localizer, posterior):
+    """Within four standard errors and a fifth, of which a budget of 6,000 contacts may err."""
+    poses = localizer.space.sample(2_000, np.random.default_rng(0))[0]
+    density = np.exp(posterior.log_density(poses))
+    assert abs(density.mean() - 1) < 4 * density.std() / np.sqrt(len(density)) + 0.2
+
+
+def test_the_entropy_is_minus_the_mean_log_density_of_samples(posterior):
+    log_density = posterior.log_density(posterior.sample(2000, 0))
+    log_density = log_density[np.isfinite(log_density)]
+    assert len(log_density) > 1980  # all but a few, which touch between the height maps' pixels alone
+    error = 4 * log_density.std() / np.sqrt(len(log_density))
+    assert -log_density.mean() == pytest.approx(posterior.entropy_nats, abs=error + 0.05)
+
+
+def test_credible_levels_of_samples_are_uniform(posterior):
+    assert kstest(posterior.credible_level(posterior.sample(1000, 1)), "uniform").statistic < 0.06
+
+
+def test_a_saved_one_is_the_same(tmp_path, posterior, touch, localizer):
+    posterior.save(tmp_path / "posterior.npz")
+    poses = localizer.space.sample(50, np.random.default_rng(0))[0]
+    for again in (Posterior.load(tmp_path, localizer.cache_dir), pickle.loads(pickle.dumps(posterior))):
+        np.testing.assert_allclose(again.log_density(poses), posterior.log_density(poses), atol=1e-5)
+        assert again.entropy_nats == pytest.approx(posterior.entropy_nats, abs=1e-6)
+        np.testing.assert_allclose(again.modes(1)[0].T, posterior.modes(1)[0].T)
+        np.testing.assert_allclose(again.modes(1)[0].covariance, posterior.modes(1)[0].covariance, rtol=1e-6)
+
+
+def test_a_mode_holds_the_particles_near_it(posterior):
+    first = posterior.modes(1)[0]
+    plain = replace(posterior, refined={}).modes(1)[0]
+    near = PoseDistance(posterior.mesh, 128).within(plain.T, posterior.poses, mode_radius(posterior.mesh))
+    assert plain.probability == pytest.approx(np.exp(posterior.log_prob)[near].sum(), rel=1e-6)
+    assert posterior.log_density(first.T) >= posterior.log_density(plain.T) - 1e-3
+    assert PoseDistance(posterior.mesh).mean(plain.T, first.T[None])[0] <= mode_radius(posterior.mesh)
+    assert (np.linalg.eigvalsh(first.covariance) > 0).all()
+
+
+def test_modes_share_the_mass_out(posterior):
+    modes = posterior.modes(8)
+    each = [mode.probability for mode in modes]
+    assert sum(each) <= 1 + 1e-9 and each == sorted(each, reverse=True)
+
+
+def test_the_likeliest_poses_are_the_densest(posterior):
+    log_density = posterior.log_density(posterior.likeliest(5))
+    assert (np.diff(log_density) < 1e-3).all()
+    assert log_density[0] == pytest.approx(posterior.explored.particle_log_density.max(), abs=1e-2)
+
+
+def test_a_prior_counts_once(localizer, touch, posterior):
+    """What is made e times as probable is so after it: by the densities of the same poses, whatever the sampler found."""
+    left = localizer.index.poses()[:, 0, 3] < 0
+    known = localizer.localize(touch.mask, "mask", effort=EFFORT, prior=lambda T: np.where(T[:, 0, 3] < 0, 1.0, 0.0))
+    poses = localizer.space.sample(400, np.random.default_rng(0))[0]
+    cell = localizer.index.lookup(poses, localizer.space.penetration(poses))
+    change = known.log_density(poses) - posterior.log_density(poses)
+    assert np.ptp(change[left[cell]]) < 2 and np.median(change[left[cell]]) - np.median(
+        change[~left[cell]]
+    ) == pytest.approx(1, abs=0.35)
+
+
+def test_what_a_prior_rules_out_stays_so(localizer, touch):
+    known = localizer.localize(
+        touch.mask, "mask", effort=EFFORT, prior=lambda T: np.where(T[:, 0, 3] < 0, 0.0, -np.inf)
+    )
+    ruled_out = localizer.index.poses()[:, 0, 3] >= 0
+    assert not np.exp(known.cell_log_prob)[ruled_out[known.cells]].any()
+    explored = known.explored
+    assert all(
+        np.isfinite(prior_at(localizer.index, explored.log_prior, p.poses.place, p.depth)).all()
+        for p in explored.particles
+    )
+
+
+def test_the_same_seed_gives_the_same(localizer, touch, posterior):
+    again = localizer.localize(touch.mask, "mask", effort=EFFORT)
+    np.testing.assert_array_equal(again.poses, posterior.poses)
+    other = localizer.localize(touch.mask, "mask", effort=EFFORT, seed=1)
+    assert other.information_gain_nats == pytest.approx(posterior.information_gain_nats, abs=1.5)
+
+
+def test_it_serves_as_a_prior(localizer, touch, posterior):
+    """As its cells do."""
+    cells = replace(posterior, explored=None, refined={})
+    one, other = (localizer.localize(touch.mask, "mask", effort="fast", prior=each) for each in (posterior, cells))
+    np.testing.assert_allclose(one.log_prob, other.log_prob, atol=1e-5)
+
+
+def test_depth_maps_and_several_sensors_stay_on_the_cells(localizer, touch):
+    depth = np.where(touch.mask, np.float32(5e-4), np.float32(0))
+    assert localizer.localize(depth, "height", effort=EFFORT).explored is None
+    scene = next(simultaneous_touches(localizer.space, 1, 2, seed=0))
+    masks = [each.mask for each in scene.touches]
+    assert localizer.localize(masks, "mask", None, scene.T_world_sensor, effort=EFFORT).explored is None

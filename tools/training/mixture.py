@@ -1,0 +1,200 @@
+"""Fits the weights of the powers of the likelihood that a posterior mixes, as functions of how long the contact's outline is.
+
+Touches of procedural objects, on any side or a known face, on rigid and elastic gels, with noise of any strength up to heavy, are
+explored by the sampler as it is. What each power makes of the true pose says how to weigh it: the weights maximise the mean log
+density at the true poses ("covariate-dependent stacking", Yao et al. 2022).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import log_softmax, logsumexp
+
+from geomtact.contact_space.contact_maps import ContactMaps, located
+from geomtact.contact_space.touch import CALIBRATION_NOISE, draw_noise, simulate_mask, spoilt
+from geomtact.contact_space.touches import Touch, counts, each_touch
+from geomtact.files import write_text, write_whole
+from geomtact.inference.sampler import Explored, explore, log_target
+from geomtact.localizer import Localizer
+from geomtact.progress import Progress
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.se3 import Array
+from geomtact.sensing.noise import CLEAN
+from geomtact.sensing.sensor import Sensor
+from geomtact.versions import versions
+from tools.training.procedural import random_object
+
+SENSORS = ("gelslim", "gelsight-mini", "gelslim", "digit")  # one after the other
+SIZES = (0.5, 5.0)  # longest side of an object, in long sides of the window
+FACES = 3  # every so manieth object is touched on a known face
+MAX_POSES = 400_000  # of the grid
+CONTACTS = 10_000  # of the sampler
+LONGEST = 0.3  # m: outlines beyond are as this long
+_PENALTY = 1e-3  # of the square of a slope, beside a mean log density
+_LEAST = -60.0  # nats: a lower log density at a true pose is as bad as this
+
+SCHEMA = "geomtact/mixture/1"
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One touch, explored.
+
+    Attributes
+    ----------
+    at_truth : (K,) log density at the true pose by each of ``POWERS``
+    at_particles : (n, K) at the particles of all powers
+    sizes : (K,) how many particles each has
+    log_outline : log of the outline's length over ``OUTLINE``
+    elastic : whether the gel was
+    """
+
+    at_truth: Array
+    at_particles: Array
+    sizes: Array
+    log_outline: float
+    elastic: bool
+
+
+def make_examples(
+    folder: Path, objects: int, touches: int, seed: int, progress: Progress | None = None
+) -> list[Example]:
+    """``touches`` of each of so many ``objects``, in files of ``folder``, so that a stopped run goes on."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for i in range(objects):
+        path = folder / f"mixture-{i}.npz"
+        if not path.exists():
+            made = list(_examples_of(i, touches, seed))
+            write_whole(path, lambda temporary, made=made: _save(temporary, made))
+        found += _load(path)
+        if progress:
+            progress((i + 1) / objects, "exploring touches")
+    return found
+
+
+def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
+    rng = np.random.default_rng([seed, i])
+    sensor = Sensor.load(SENSORS[i % len(SENSORS)])
+    size = 2 * sensor.half_window.max() * np.exp(rng.uniform(*np.log(SIZES)))
+    mesh = random_object(int(rng.integers(1 << 31)), float(size))
+    face = [(np.eye(3)[rng.integers(3)] * rng.choice([-1, 1]), 0.0)] if i % FACES == FACES - 1 else None
+    localizer = Localizer.prepare(mesh, sensor=sensor, approach=face, max_poses=MAX_POSES)
+    for touch in _touches(localizer, touches, rng):
+        query = ContactQuery.of(touch.mask, sensor)
+        coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
+        yield _example(explore(localizer.index, query, coarse, CONTACTS, rng), touch)
+
+
+def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator[Touch]:
+    """``n`` touches with noise of any strength up to heavy, that still show 1 mm^2 of contact."""
+    space = localizer.space
+    for touch in each_touch(space, n, int(rng.integers(1 << 31)), noise=CLEAN):
+        clean = simulate_mask(space, touch.T_sensor_object, touch.elastic)
+        mask = spoilt(clean, space, draw_noise(CALIBRATION_NOISE, rng), rng)
+        if counts(space, mask):
+            yield replace(touch, mask=mask)
+
+
+def _example(explored: Explored, touch: Touch) -> Example:
+    index, query = explored.index, explored.query
+    poses, membrane = located(index, touch.T_sensor_object[None])
+    cut = ContactMaps.of(index).compare(query.samples, query.area, poses, membrane)
+    at, coarse = query.log_likelihood(cut.energy), explored.log_coarse[poses.place]
+    each = [np.concatenate([getattr(p, name) for p in explored.particles]) for name in ("log_likelihood", "log_coarse")]
+    evidence = np.array(explored.log_evidence)
+
+    def by_power(log_likelihood: Array, log_coarse: Array) -> Array:
+        return np.stack([log_target(log_likelihood, log_coarse, power) for power in POWERS], 1) - evidence
+
+    sizes = np.array([len(p) for p in explored.particles])
+    return Example(by_power(at, coarse)[0], by_power(*each), sizes, query.log_outline, touch.elastic)
+
+
+def _save(path: Path, examples: Sequence[Example]) -> None:
+    n = max(len(e.at_particles) for e in examples)
+    padded = [np.pad(e.at_particles, ((0, n - len(e.at_particles)), (0, 0))) for e in examples]
+    columns = {name: np.stack([getattr(e, name) for e in examples]) for name in ("at_truth", "sizes")}
+    single = {name: np.array([getattr(e, name) for e in examples]) for name in ("log_outline", "elastic")}
+    with open(path, "wb") as file:
+        np.savez(file, allow_pickle=False, at_particles=np.stack(padded).astype(np.float32), **columns, **single)
+
+
+def _load(path: Path) -> list[Example]:
+    with np.load(path, allow_pickle=False) as data:
+        rows = zip(*(data[name] for name in Example.__dataclass_fields__), strict=True)
+        return [Example(t, p[: s.sum()].astype(float), s, float(o), bool(e)) for t, p, s, o, e in rows]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fitted weights, and how well they do on the touches they are fitted to.
+
+    Attributes
+    ----------
+    intercept, slope : (K,) the weights are the softmax of intercept + slope log(outline / OUTLINE)
+    n : touches
+    gain, expected_gain : means [nats], at the true poses and under the posteriors themselves
+    coverage : share of the touches whose true pose is in the regions of ``LEVELS``: of all, rigid, elastic ones
+    """
+
+    intercept: tuple[float, ...]
+    slope: tuple[float, ...]
+    n: int
+    gain: float
+    expected_gain: float
+    coverage: tuple[tuple[float, ...], ...]
+
+
+def fit(examples: Sequence[Example]) -> Fit:
+    """The weights that maximise the mean log density at the true poses."""
+    truth = np.maximum(np.stack([e.at_truth for e in examples]), _LEAST)
+    outline = np.array([e.log_outline for e in examples])
+    k = truth.shape[1]
+
+    def log_weights(z: Array) -> Array:
+        """(t, K) of every touch."""
+        intercept, slope = np.append(z[: k - 1], 0), np.append(z[k - 1 :], 0)
+        return np.asarray(log_softmax(intercept + slope * outline[:, None], axis=1))
+
+    def loss(z: Array) -> float:
+        return float(_PENALTY * (z[k - 1 :] ** 2).sum() - logsumexp(truth + log_weights(z), axis=1).mean())
+
+    z = minimize(loss, np.zeros(2 * (k - 1)), method="L-BFGS-B").x
+    gain, expected, level = [], [], []
+    for e, log_weight in zip(examples, log_weights(z), strict=True):
+        density = logsumexp(e.at_particles + log_weight, axis=1)
+        mass = np.repeat(np.exp(log_weight) / e.sizes, e.sizes)
+        gain.append(float(logsumexp(e.at_truth + log_weight)))
+        expected.append(float(mass @ density))
+        level.append(float(mass @ (density > gain[-1])))
+    elastic = np.array([e.elastic for e in examples])
+    return Fit(
+        tuple(np.append(z[: k - 1], 0).tolist()),
+        tuple(np.append(z[k - 1 :], 0).tolist()),
+        len(examples),
+        float(np.mean(gain)),
+        float(np.mean(expected)),
+        tuple(
+            tuple(float((np.array(level)[some] <= q).mean()) for q in LEVELS)
+            for some in (np.ones_like(elastic), ~elastic, elastic)
+        ),
+    )
+
+
+def fit_mixture(
+    out: Path, folder: Path, objects: int, touches: int, seed: int, progress: Progress | None = None
+) -> Fit:
+    """Make examples in ``folder``, fit the weights to them and write these to ``out``."""
+    found = fit(make_examples(folder, objects, touches, seed, progress))
+    settings = {"objects": objects, "touches": touches, "seed": seed, "contacts": CONTACTS, "max_poses": MAX_POSES}
+    content = {"schema": SCHEMA, "settings": settings, "sensors": SENSORS, "powers": POWERS, **asdict(found)}
+    write_text(out, json.dumps(content | {"versions": versions()}, indent=1) + "\n")
+    return found
