@@ -25,7 +25,7 @@ from geomtact.inference.sampler import Explored, Particles, explore, log_target
 from geomtact.kernels.contact_energy import SHARES
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
-from geomtact.scoring.contact_likelihood import POWERS, RATE, RIGID, SHARE, ContactQuery, share_cells
+from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, RATE, RIGID, SHARE, ContactQuery, share_cells
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 from geomtact.versions import versions
@@ -201,7 +201,7 @@ class _Model(torch.nn.Module):
         super().__init__()
         self.rate = torch.nn.Parameter(torch.tensor(RATE * _UNIT).log())
         self.share = torch.nn.Parameter(torch.tensor(SHARE).log())
-        self.weight = torch.nn.Parameter(torch.zeros(len(POWERS)))
+        self.weight = torch.nn.Parameter(torch.tensor(INTERCEPT))
 
     def log_likelihood(self, energy: torch.Tensor) -> torch.Tensor:
         """Of energies (..., SHARES): (...)."""
