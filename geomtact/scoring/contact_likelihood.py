@@ -11,7 +11,7 @@ several features press. Neither the gel nor the share is known, so both are marg
 
 How far a contact is from any simulated one is not known either: by the noise alone, or by a gel that differs from the model. So
 the posterior is a mixture of posteriors, each by a power of the likelihood: 0 gives the coarse one, 1 that of the whole
-likelihood. Errors go together along an outline, so a long one tells less than its length says: the weights depend on it. They
+likelihood. Errors are correlated along an outline, so a long one tells less than its length says: the weights depend on it. They
 are fitted like all else by the log score ("covariate-dependent stacking", Yao et al. 2022).
 """
 
