@@ -13,7 +13,7 @@ from geomtact.evaluation import simultaneous_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import sampler
 from geomtact.inference.effort import Effort
-from geomtact.inference.sampler import prior_at
+from geomtact.inference.explored import prior_at
 from geomtact.scoring.contact_likelihood import ContactQuery
 
 EFFORT = Effort("cells", 3, contacts=6000)

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.index import Index, expand_runs
+from geomtact.inference.explored import Explored
 from geomtact.inference.facts import Diagnostics, Provenance
 from geomtact.inference.reference import Reference
-from geomtact.inference.sampler import Explored
 from geomtact.se3 import Array
 from geomtact.sensing.reading import Observation
 

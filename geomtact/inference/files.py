@@ -20,9 +20,9 @@ from geomtact.geometry.approach import to_json
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.distribution import CellDistribution, Refined, row_log_prob, row_poses
+from geomtact.inference.explored import Explored
 from geomtact.inference.facts import Diagnostics, Provenance
 from geomtact.inference.reference import Reference
-from geomtact.inference.sampler import Explored
 from geomtact.se3 import check_pose, check_transforms
 from geomtact.sensing.sensor import Sensor
 

@@ -20,8 +20,9 @@ from scipy.special import logsumexp
 
 from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.touches import Touch, random_touches
-from geomtact.files import write_text, write_whole
-from geomtact.inference.sampler import Explored, Particles, explore, log_target
+from geomtact.files import write_text
+from geomtact.inference.explored import Explored, Particles, log_target
+from geomtact.inference.sampler import explore
 from geomtact.kernels.contact_energy import SHARES
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
@@ -29,6 +30,7 @@ from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, RATE, RIGID, 
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 from geomtact.versions import versions
+from tools.training.examples import resumed
 from tools.training.procedural import random_object
 
 SENSORS = ("gelslim", "gelsight-mini", "gelslim", "digit")  # one after the other
@@ -91,17 +93,8 @@ def make_examples(
     folder: Path, objects: int, touches: int, seed: int, progress: Progress | None = None
 ) -> list[Example]:
     """``touches`` of each of so many ``objects``, in files of ``folder``, so that a stopped run goes on."""
-    folder.mkdir(parents=True, exist_ok=True)
-    found = []
-    for i in range(objects):
-        path = folder / f"{i}.npz"
-        if not path.exists():
-            made = list(_examples_of(i, touches, seed))
-            write_whole(path, lambda temporary, made=made: _save(temporary, made))
-        found += _load(path)
-        if progress:
-            progress((i + 1) / objects, "exploring touches")
-    return found
+    paths = [folder / f"{i}.npz" for i in range(objects)]
+    return resumed(paths, lambda i: _examples_of(i, touches, seed), _save, _load, progress)
 
 
 def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:

@@ -13,7 +13,8 @@ from geomtact.contact_space.contact_class import contact_class
 from geomtact.contact_space.contact_maps import ContactMaps
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touches import Touch
-from geomtact.inference.sampler import explore, log_likelihood_at
+from geomtact.inference.explored import log_likelihood_at
+from geomtact.inference.sampler import explore
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
