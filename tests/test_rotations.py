@@ -452,3 +452,39 @@ def test_images_of_an_exact_face_are_all_faces_alike(name, rng):
     a = approach_of(directions.any_image(T, rng)[:, :3, :3])
     assert allowed(a, directions.cones).all()
     assert binomtest(int((a[:, 0] > 0.5).sum()), 2000).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("approach", APPROACHES)
+@pytest.mark.parametrize("symmetry", [name for name in SYMMETRIES if name != "sphere"])
+def test_the_density_times_the_volume_is_the_share_of_rotations_there(symmetry, approach, rng):
+    """Within 4.5 standard errors: about one rotation, modulo the symmetry, of all that are allowed."""
+    sym, cones = SYMMETRIES[symmetry], check_approach(APPROACHES[approach])
+    directions = Directions.make(sym, APPROACHES[approach], 1)
+    R = random_rotations(200_000, rng)
+    R = R[allowed(approach_of(R), cones)]
+    middle = facing(np.array([0.1, 0.2, 1.0]) / np.linalg.norm([0.1, 0.2, 1.0]) if cones is None else cones[0][0])
+    angle = 0.3
+    if sym.axis is not None:
+        flips = sym.elements[:, :3, :3] @ sym.axis
+        near = ((R @ flips.T).transpose(0, 2, 1) @ middle @ sym.axis).max(1) > np.cos(angle)
+        volume = 2 * np.pi * (1 - np.cos(angle))
+    else:
+        trace = np.einsum("ij,njk,eki->ne", middle.T, R, sym.elements[:, :3, :3]).max(1)
+        near = trace > 1 + 2 * np.cos(angle)
+        volume = 8 * np.pi * (angle - np.sin(angle))
+    # draws come with the density: the mean of its inverse over them is the volume over their share
+    found = np.sum(1 / directions.density(transform(R[near], np.zeros(3)))) / len(R)
+    assert found == pytest.approx(volume, rel=4.5 / np.sqrt(near.sum()))
+
+
+@pytest.mark.parametrize("symmetry", SYMMETRIES)
+def test_motions_are_all_but_the_symmetries(symmetry):
+    """A motion moves points of the object to where no symmetry brings them, each as far as the others."""
+    sym = SYMMETRIES[symmetry]
+    motions = sym.motions
+    assert motions.shape == ({"axis": 5, "sphere": 3}.get(sym.kind, 6), 6)
+    turns = motions[motions[:, :3].any(1)]
+    np.testing.assert_allclose(turns[:, :3] @ turns[:, :3].T, np.eye(len(turns)), atol=1e-12)
+    if sym.axis is not None:
+        np.testing.assert_allclose(turns[:, :3] @ sym.axis, 0, atol=1e-12)
+        np.testing.assert_allclose(np.cross(turns[:, :3], CENTRE) + turns[:, 3:], 0, atol=1e-12)

@@ -4,14 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 from speed import slow_but
 
 from geomtact import Sensor
 from geomtact.contact_space.contact_maps import SHAPE, ContactMaps, located
 from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.inference import sampler
+from geomtact.inference.particles import Target
 from geomtact.inference.sampler import explore
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.se3 import random_rotations, transform
 from geomtact.sensing.noise import CLEAN
 
 SCENES = {"gelslim": None, "digit": None, "gelslim from above": [((0.0, 0.0, 1.0), 1.0)]}
@@ -94,6 +98,23 @@ def test_the_evidence_does_not_depend_on_the_budget(localizer, maps):
 
     ratio = np.exp(np.array([evidence(4000, 1 + i) for i in range(12)]) - evidence(60_000, 0))
     assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(len(ratio)) + 0.1
+
+
+def test_the_uniform_density_has_the_measure_of_the_cells(localizer, maps):
+    """Poses in a box about all touches: their mean density times its volume is the share of the cells' measure that touches."""
+    index, rng, n = localizer.index, np.random.default_rng(0), 60_000
+    half = np.array(localizer.sensor.half_window) + localizer.mesh.diameter / 2
+    R = random_rotations(n, rng)
+    T = transform(R, np.column_stack([rng.uniform(-half, half, (n, 2)), np.zeros(n)]) - R @ localizer.mesh.centre)
+    T = T[index.space.approaches(T)]
+    depth = localizer.sensor.max_penetration
+    target = Target(index, ContactQuery.of(np.ones((48, 64)), localizer.sensor), np.zeros(index.places), None)
+    touches = np.isfinite(target.evaluated(located(index, T)[0], depth=depth * rng.random(len(T))).log_likelihood)
+    density = index.uniform_density(T) / index.directions.symmetry.density * touches * 4 * half.prod() * depth
+    share = index.cell_measure / index.cell_measure.sum()
+    drawn, log_weight, _ = sampler._draw(target, share, 20_000, rng)
+    of_cells = np.exp(logsumexp(log_weight + drawn.log_target(0)))
+    assert density.sum() / n == pytest.approx(of_cells, rel=5 * density.std() / density.sum() * np.sqrt(len(T)) + 0.02)
 
 
 def test_particles_stay_in_the_contact_pose_space(localizer, maps):

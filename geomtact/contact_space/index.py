@@ -253,9 +253,18 @@ class Index:
     @cached_property
     def cell_measure(self) -> Array:
         """Uniform measure (n,) of the whole lattice cell of each place at all depths, whether it touches or not."""
-        of_rotation = self._of_rotation[self.rotation]
-        largest = (self.weight.max(0) / of_rotation).max() * len(self.weight)
-        return np.asarray(of_rotation * largest / self.weight.sum(dtype=float), float)
+        return np.asarray(self._of_rotation[self.rotation] * self._of_lattice_cell, float)
+
+    def uniform_density(self, T: ArrayLike) -> Array:
+        """Density (n,) of :attr:`cell_measure` at ``T`` (n, 4, 4), per rad and metre of each of ``symmetry.motions``."""
+        volume = self.resolution.step**2 * self.sensor.max_penetration
+        return self.directions.density(T) * self._of_lattice_cell / volume
+
+    @cached_property
+    def _of_lattice_cell(self) -> float:
+        """Measure of one lattice cell at all depths where the object touches, if it had the only rotation."""
+        largest = (self.weight.max(0) / self._of_rotation[self.rotation]).max() * len(self.weight)
+        return float(largest / self.weight.sum(dtype=float))
 
     @cached_property
     def _of_rotation(self) -> Array:

@@ -28,6 +28,7 @@ from geomtact.geometry.approach import (
     facing,
     in_cone,
     in_cones,
+    sunflower,
 )
 from geomtact.geometry.cells import SphereCells
 from geomtact.geometry.orbits import (
@@ -228,6 +229,20 @@ class Directions:
         if self.symmetry.axis is not None:
             new = at_polar(new @ self.symmetry.axis, a[: len(new)], self.symmetry.axis)
         return np.concatenate([new, a[len(new) :]])
+
+    def density(self, T: ArrayLike) -> Array:
+        """Density (n,) of the uniform distribution of allowed rotations at poses ``T`` (n, 4, 4), modulo the symmetry, per rad of
+        each direction that changes how the object is turned."""
+        T, cones = np.asarray(T, float), self.cones
+        if cones is None or self.symmetry.kind == "sphere":
+            return np.full(len(T), self.symmetry.density)
+        images = self.symmetry.sampled(360)[:, :3, :3]
+        share = allowed(-np.einsum("nj,kji->nki", T[:, 2, :3], images), cones).mean(1)
+        # of the sphere; what lies in m cones is counted m times
+        of_each = [sunflower(v, half, 2000) for v, half in cones]
+        once = [np.mean(1 / sum(allowed(a, [cone]).astype(int) for cone in cones)) for a in of_each]
+        sphere = sum(np.sin(half / 2) ** 2 * share for (_, half), share in zip(cones, once, strict=True))
+        return np.asarray(self.symmetry.density * share / sphere)
 
     def any_image(self, T: ArrayLike, rng: np.random.Generator) -> Array:
         """``T`` (n, 4, 4) replaced by its images under the object's symmetry, drawn uniformly among those allowed."""

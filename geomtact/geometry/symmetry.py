@@ -50,6 +50,24 @@ class Symmetry:
             return about(_even_rotations(n * n), self.centre)
         return self.elements
 
+    @property
+    def motions(self) -> Array:
+        """Directions (d, 6) of xi, in T exp(xi^), that change where an object is: all but turns that are symmetries."""
+        shifts = np.eye(6)[3:]
+        if self.kind == "sphere":
+            return shifts
+        if self.axis is None:
+            return np.eye(6)
+        across = np.linalg.svd(self.axis[None])[2][1:]
+        return np.concatenate([np.hstack([across, np.cross(self.centre, across)]), shifts])
+
+    @property
+    def density(self) -> float:
+        """Of the uniform distribution of rotations, per rad of each direction that changes how the object is turned."""
+        if self.kind == "sphere":
+            return 1.0
+        return len(self.elements) / (8 * np.pi**2 if self.axis is None else 4 * np.pi)
+
 
 def about(R: ArrayLike, centre: ArrayLike) -> Array:
     """Rotations ``R`` (..., 3, 3) about ``centre`` (3,) [m] as (..., 4, 4)."""

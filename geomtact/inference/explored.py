@@ -6,8 +6,8 @@ that its density is known wherever the likelihood is made.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,105 +15,69 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
-from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
+from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.index import Index
+from geomtact.inference.particles import Particles, Target, log_target, poses_of, prior_at
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
-from geomtact.se3 import Array, check_transforms, transform
-
-
-@dataclass(frozen=True, eq=False)
-class Particles:
-    """n poses with what decides about them.
-
-    Attributes
-    ----------
-    poses : n of them, their ``reach`` as it was found
-    depth : (n,) penetration [m]
-    log_likelihood : (n,)
-    log_coarse : (n,) log density of the coarse posterior, without the prior
-    log_prior : (n,) log density of the prior
-    """
-
-    poses: Placements
-    depth: Array
-    log_likelihood: Array
-    log_coarse: Array
-    log_prior: Array
-
-    def __len__(self) -> int:
-        return len(self.depth)
-
-    def log_target(self, power: float) -> Array:
-        """Log (n,) of the density of the posterior by a power of the likelihood, up to a constant; -inf where nothing is
-        touched."""
-        touches = np.isfinite(self.log_likelihood)
-        return np.where(touches, self.log_prior + log_target(self.log_likelihood, self.log_coarse, power), -np.inf)
-
-    def take(self, rows: NDArray[np.int64]) -> Particles:
-        """Those of ``rows`` (m,)."""
-        return self._each(lambda a, _: a[rows], self)
-
-    def put(self, rows: NDArray[np.int64], other: Particles) -> Particles:
-        """These with ``other`` (m,) at ``rows`` (m,)."""
-
-        def replaced(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-            a = a.copy()
-            a[rows] = b
-            return a
-
-        return self._each(replaced, other)
-
-    def joined(self, other: Particles) -> Particles:
-        """These and ``other`` (m,)."""
-        return self._each(lambda a, b: np.concatenate([a, b]), other)
-
-    def _each(self, of: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]], other: Particles) -> Particles:
-        poses = Placements(*map(of, vars(self.poses).values(), vars(other.poses).values()))
-        mine, others = (list(vars(each).values())[1:] for each in (self, other))
-        return Particles(poses, *map(of, mine, others))
+from geomtact.se3 import Array, check_transforms
 
 
 @dataclass(frozen=True, eq=False)
 class Explored:
-    """The distribution of the pose after one touch: a mixture of the posteriors by powers of the likelihood, ``POWERS``.
+    """The distribution of the pose after one touch: a mixture of the posteriors by powers of the likelihood, ``POWERS`` or the
+    smallest of them.
 
     Attributes
     ----------
-    index, query : all touches of the object, and the observed contact
-    log_coarse : (n,) log density of the coarse posterior at the places of the index, without the prior
-    log_prior : (N,) log density of the prior in the cells of the index; None for the uniform
+    target : what poses are judged by
     particles : of each posterior, poses drawn from it, equally probable
     log_evidence : of each, the log of the mean of the power of the likelihood over the coarse posterior
     exponents : of the likelihood, step by step
     contacts : that were cut
+    log_measure : log of the uniform measure of poses that touch over that of the cells that hold them
+    hearts : (m,) rows of ``poses``, the densest of each leading mode, the most probable mode first
+    masses : (m,) of these modes
     """
 
-    index: Index
-    query: ContactQuery
-    log_coarse: Array
-    log_prior: NDArray[np.floating] | None
+    target: Target
     particles: tuple[Particles, ...]
     log_evidence: tuple[float, ...]
     exponents: tuple[float, ...]
     contacts: int
+    log_measure: float = 0.0
+    hearts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    masses: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def index(self) -> Index:
+        """All touches of the object."""
+        return self.target.index
+
+    @cached_property
+    def weights(self) -> Array:
+        """Weight of each posterior; the last one has those of the powers that are left out too."""
+        weights, last = self.target.query.weights, len(self.particles) - 1
+        return np.append(weights[:last], weights[last:].sum())
 
     @cached_property
     def weight(self) -> Array:
         """Mass of each particle of all posteriors."""
-        return np.concatenate(
-            [np.full(len(p), w / len(p)) for p, w in zip(self.particles, self.query.weights, strict=True)]
-        )
+        return np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(self.particles, self.weights, strict=True)])
 
     @cached_property
     def particle_log_density(self) -> Array:
         """Log density at each particle of all posteriors."""
-        return np.concatenate([p.log_prior + self._posteriors(p.log_likelihood, p.log_coarse) for p in self.particles])
+        return np.concatenate([self.log_density_of(p) for p in self.particles])
+
+    def log_density_of(self, particles: Particles) -> Array:
+        """Log density (n,) at ``particles`` (n,)."""
+        return particles.log_prior + self._posteriors(particles.log_likelihood, particles.log_coarse)
 
     def _posteriors(self, log_likelihood: Array, log_coarse: Array) -> Array:
         """Log density (n,) over the prior."""
         each = [
             np.log(weight) + log_target(log_likelihood, log_coarse, power) - log_evidence
-            for power, weight, log_evidence in zip(POWERS, self.query.weights, self.log_evidence, strict=True)
+            for power, weight, log_evidence in zip(POWERS, self.weights, self.log_evidence, strict=False)
         ]
         return np.asarray(logsumexp(each, 0))
 
@@ -134,10 +98,11 @@ class Explored:
 
     def log_density(self, T: ArrayLike) -> Array:
         """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4) of the contact pose space."""
+        query, log_prior = self.target.query, self.target.log_prior
         poses, membrane = located(self.index, np.asarray(T, float))
-        cut = ContactMaps.of(self.index).compare(self.query.samples, self.query.area, poses, membrane)
-        density = self._posteriors(self.query.log_likelihood(cut.energy), self.log_coarse[poses.place])
-        return density + prior_at(self.index, self.log_prior, poses.place, cut.reach - membrane)
+        cut = ContactMaps.of(self.index).compare(query.samples, query.area, poses, membrane)
+        density = self._posteriors(query.log_likelihood(cut.energy), self.target.log_coarse[poses.place])
+        return density + prior_at(self.index, log_prior, poses.place, cut.reach - membrane)
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """``n`` poses T_sensor_object (n, 4, 4) drawn by ``rng`` among the particles, at any image under the symmetry."""
@@ -164,11 +129,14 @@ class Explored:
             "depth": self.depth,
             "counts": np.array([len(p) for p in self.particles]),
             "log_evidence": np.array(self.log_evidence),
-            "log_coarse": self.log_coarse.astype(np.float32),
-            "log_prior": np.zeros(0) if self.log_prior is None else self.log_prior,
+            "log_coarse": self.target.log_coarse.astype(np.float32),
+            "log_prior": np.zeros(0) if self.target.log_prior is None else self.target.log_prior,
             "exponents": np.array(self.exponents),
             "contacts": np.array(self.contacts),
-            "touched": self.query.touched,
+            "log_measure": np.array(self.log_measure),
+            "hearts": self.hearts,
+            "masses": self.masses,
+            "touched": self.target.query.touched,
         }
 
     @classmethod
@@ -183,8 +151,13 @@ class Explored:
         T, depth, counts = check_transforms(arrays["T"]), arrays["depth"], arrays["counts"]
         log_coarse = arrays["log_coarse"].astype(float)
         log_prior = arrays["log_prior"] if len(arrays["log_prior"]) else None
-        if len(counts) != len(POWERS) or not len(T) == len(depth) == len(arrays["log_likelihood"]) == counts.sum():
+        if (
+            not 1 < len(counts) <= len(POWERS)
+            or not len(T) == len(depth) == len(arrays["log_likelihood"]) == counts.sum()
+        ):
             raise ValueError("particles of different number")
+        if len(arrays["hearts"]) != len(arrays["masses"]) or not (arrays["hearts"] < len(T)).all():
+            raise ValueError("modes that are not of its particles")
         if len(log_coarse) != index.places or (log_prior is not None and len(log_prior) != len(index)):
             raise ValueError("densities that are not of its grid")
         poses, membrane = located(index, T)
@@ -192,46 +165,18 @@ class Explored:
         whole = Particles(
             replace(poses, reach=membrane + depth), depth, arrays["log_likelihood"], log_coarse[poses.place], prior
         )
+        query = ContactQuery.showing(arrays["touched"].astype(bool), index.sensor)
         return cls(
-            index,
-            ContactQuery.showing(arrays["touched"].astype(bool), index.sensor),
-            log_coarse,
-            log_prior,
+            Target(index, query, log_coarse, log_prior),
             tuple(whole.take(rows) for rows in np.split(np.arange(len(T)), np.cumsum(counts)[:-1])),
             tuple(arrays["log_evidence"].tolist()),
             tuple(arrays["exponents"].tolist()),
             int(arrays["contacts"]),
+            float(arrays["log_measure"]),
+            arrays["hearts"],
+            arrays["masses"],
         )
 
     def credible_level(self, log_density: float) -> float:
         """Mass of the poses that are denser than ``log_density``."""
         return float(self.weight @ (self.particle_log_density > log_density))
-
-
-def poses_of(poses: Placements, depth: Array, middle: Array) -> Array:
-    """T_sensor_object (n, 4, 4) of an object with its centre at ``middle`` (3,), that presses ``depth`` (n,) [m] deep."""
-    height = np.where(np.isfinite(poses.reach), poses.reach, depth) - depth
-    return transform(poses.rotation, np.column_stack([poses.centre, height]) - poses.rotation @ middle)
-
-
-def log_target(log_likelihood: Array, log_coarse: Array, power: float) -> Array:
-    """Log density (n,) of the posterior by a power of the likelihood, up to a constant."""
-    out = (1 - power) * log_coarse
-    if power > 0:
-        out = out + power * log_likelihood
-    return out
-
-
-def log_likelihood_at(maps: ContactMaps, query: ContactQuery, T: ArrayLike, depth: Array | None = None) -> Array:
-    """Log likelihood (n,) of the observed contact at ``T_sensor_object`` (n, 4, 4), where the object is moved along z to press
-    ``depth`` (n,) [m] deep if that is given."""
-    poses, membrane = located(maps.index, np.asarray(T, float))
-    where = {"membrane": membrane} if depth is None else {"depth": depth}
-    return query.log_likelihood(maps.compare(query.samples, query.area, poses, **where).energy)
-
-
-def prior_at(index: Index, log_prior: NDArray[np.floating] | None, place: NDArray[np.int64], depth: Array) -> Array:
-    """Log density (n,) of the prior, known in the cells of ``index``, at places (n,) and penetrations (n,) [m]."""
-    if log_prior is None:
-        return np.zeros(len(place))
-    return log_prior[index.level_of(place, depth) * index.places + place].astype(float)

@@ -13,7 +13,7 @@ from geomtact.contact_space.index import Index
 from geomtact.contact_space.space import ContactSpace
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.distribution import Refined
-from geomtact.inference.modes import leading_cells, leading_particles
+from geomtact.inference.modes import leading_cells
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.reweight import reweight_cells
 from geomtact.registration.contact_problem import make_problem
@@ -83,9 +83,9 @@ class ModeRefiner:
         """An explored ``posterior`` with the hearts of its ``k`` leading modes moved to where registration against ``contact``
         finds a denser pose."""
         explored = posterior.explored
-        rows = leading_particles(posterior, k)
-        if explored is None or not len(rows):
+        if explored is None or not len(explored.hearts) or not k:
             return posterior
+        rows = explored.hearts[:k]
         hearts = explored.settled(rows)
         problem = make_problem(cleaned(contact.soft_mask, self.space.sensor), self.space.sensor)
         found = [refiner.refine(problem, hearts) for refiner in self.refiners(posterior.index, True)]

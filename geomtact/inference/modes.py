@@ -83,7 +83,11 @@ def modes_within(posterior: CellDistribution, k: int) -> list[Mode]:
     explored = posterior.explored
     assert explored is not None
     out, distance = [], PoseDistance(posterior.index.mesh, _POINTS)
-    for row, members, mass in _grown_within(posterior, k):
+    radius, free = mode_radius(posterior.index.mesh), np.ones(len(explored.poses), bool)
+    for row, mass in zip(explored.hearts[:k].tolist(), explored.masses[:k].tolist(), strict=True):
+        members = np.flatnonzero(free & distance.within(explored.poses[row], explored.poses, radius))
+        members = np.union1d(members, [row])
+        free[members] = False
         heart = explored.settled(np.array([row]))[0]
         found = posterior.refined.get(row)
         if found is None:
@@ -100,36 +104,6 @@ def modes_within(posterior: CellDistribution, k: int) -> list[Mode]:
         T = posterior.T_frame_sensor @ found.T
         out.append(Mode(T, mass, found.covariance, found.observable, found.length, found.moved))
     return out
-
-
-def leading_particles(posterior: CellDistribution, k: int) -> NDArray[np.int64]:
-    """Rows (m,) of the particles at the hearts of the ``k`` leading modes of an explored posterior."""
-    return np.array([row for row, _, _ in _grown_within(posterior, k)], np.int64)
-
-
-def _grown_within(posterior: CellDistribution, k: int) -> list[tuple[int, NDArray[np.int64], float]]:
-    """The densest particle of each of the ``k`` leading modes, the particles in it, and their mass."""
-    explored = posterior.explored
-    assert explored is not None
-    distance, radius = PoseDistance(posterior.index.mesh, _POINTS), mode_radius(posterior.index.mesh)
-    covered = np.zeros(len(explored.poses), bool)
-    left: list[tuple[int, NDArray[np.int64]]] = []
-    for row in np.argsort(-explored.particle_log_density, kind="stable").tolist():
-        if len(left) == max(k, _LEAST) + _SPARE:
-            break
-        if not covered[row]:
-            inside = distance.within(explored.poses[row], explored.poses, radius)
-            covered |= inside
-            left.append((row, np.flatnonzero(inside)))
-    out: list[tuple[int, NDArray[np.int64], float]] = []
-    free = np.ones(len(explored.poses), bool)
-    while left and len(out) < k:
-        mass = [float(explored.weight[inside[free[inside]]].sum()) for _, inside in left]
-        best = int(np.argmax(mass))
-        row, members = left.pop(best)
-        out.append((row, members[free[members]], mass[best]))
-        free[members] = False
-    return [each for each in out if each[2] > 0]
 
 
 def leading_cells(posterior: CellDistribution, k: int) -> NDArray[np.int64]:

@@ -12,7 +12,8 @@ observed one, and moves turn the object about that point of the membrane.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import itertools
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,9 @@ from scipy.special import logsumexp, ndtr, ndtri
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located, sample_pitch
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
-from geomtact.inference.explored import Explored, Particles, poses_of, prior_at
+from geomtact.inference.explored import Explored
+from geomtact.inference.mode_mass import weighed
+from geomtact.inference.particles import Particles, Target, poses_of
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array, exp, inverse, log, transform
 
@@ -42,9 +45,9 @@ _ALONG = 1.0  # largest multiple of a difference
 _TURN = 0.1  # rad, standard deviation of the first moves; they differ by a factor of ten from pose to pose
 _EXPONENTS = np.geomspace(2e-4, 1, 40)  # of the likelihood, that the first step may have
 _HALVINGS = 30
-# Mean difference of two log evidences, by the weights of the powers, above which neither is believed [nats], and by how much more
-# contacts are cut then; hand-set.
-_AGREE, _MORE = 2.0, 4
+# Mean difference of two log evidences, by the weights of the powers, or log of the sum of all masses, above which no run is
+# believed [nats], and by how much more contacts are cut then; hand-set.
+_AGREE, _MORE = 1.0, 4
 
 
 def explore_twice(
@@ -55,36 +58,45 @@ def explore_twice(
     rng: np.random.Generator,
     log_prior: NDArray[np.floating] | None = None,
 ) -> Explored:
-    """As :func:`explore`, by two runs that share the ``contacts`` and have to agree on the evidence. Where they do not, one has
-    missed what the other found, and both are repeated with more contacts.
+    """As :func:`explore`, with its modes, by two runs that share the ``contacts`` and have to agree on the evidence.
+
+    Where they do not, one has missed what the other found; where the modes hold more than everything, both have. Then both are
+    repeated with more contacts. If that does not help, the largest powers of the likelihood are left out, until they agree.
 
     Raises
     ------
     InputError
-        No pose that was drawn touches the sensor, or the runs do not agree even so.
+        No pose that was drawn touches the sensor, or the runs agree on nothing.
     """
-    cut = 0
+    cut, all_powers = 0, len(POWERS)
     for more in (1, _MORE):
         one, other = (explore(index, query, coarse, more * contacts // 2, rng, log_prior) for _ in range(2))
         cut += one.contacts + other.contacts
-        apart = query.weights @ np.abs(np.array(one.log_evidence) - other.log_evidence)
-        if apart < _AGREE:
-            return replace(_pooled(one, other, rng), contacts=cut)
+        for powers in range(all_powers, 1 if more == _MORE else all_powers - 1, -1):
+            found = _pooled(one, other, powers, rng)
+            apart = float(found.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
+            if apart < _AGREE:
+                found, log_sum = weighed(found, rng)
+                if log_sum < _AGREE:
+                    return replace(found, contacts=cut)
     raise InputError(
-        f"{index.mesh.name}: two runs differ by {apart:.0f} nats in how likely the contact is; allow more contacts"
+        f"{index.mesh.name}: {cut:,} contacts do not settle how likely the observed one is; allow more contacts"
     )
 
 
-def _pooled(one: Explored, other: Explored, rng: np.random.Generator) -> Explored:
-    """Two runs as one: of each posterior the particles of both, by how likely each run makes the contact."""
+def _pooled(one: Explored, other: Explored, powers: int, rng: np.random.Generator) -> Explored:
+    """Two runs as one: of each posterior by the smallest ``powers`` the particles of both, by how likely each run makes the
+    contact."""
     particles, evidence = [], []
-    for first, second, a, b in zip(one.particles, other.particles, one.log_evidence, other.log_evidence, strict=True):
+    each = zip(one.particles, other.particles, one.log_evidence, other.log_evidence, strict=True)
+    for first, second, a, b in itertools.islice(each, powers):
         evidence.append(float(np.logaddexp(a, b) - np.log(2)))
         share, n = float(np.exp(a - np.logaddexp(a, b))), len(first) + len(second)
         of_first = _systematic(np.ones(len(first)), round(share * n), rng)
         of_second = _systematic(np.ones(len(second)), n - round(share * n), rng)
         particles.append(first.take(of_first).joined(second.take(of_second)))
-    return replace(one, particles=tuple(particles), log_evidence=tuple(evidence))
+    measure = float(np.logaddexp(one.log_measure, other.log_measure) - np.log(2))
+    return replace(one, particles=tuple(particles), log_evidence=tuple(evidence), log_measure=measure)
 
 
 def explore(
@@ -110,13 +122,13 @@ def explore(
     cells = index.weight.astype(float) / index.weight.sum(dtype=float)
     measure = cells.sum(0)
     share = (1 - _UNIFORM) * coarse / coarse.sum() + _UNIFORM * measure
-    sampler = _Sampler(ContactMaps.of(index), query, np.log(share / measure), log_prior)
+    target = Target(index, query, np.log(share / measure), log_prior)
     known = 0.0  # log of the mean of the coarse density under the prior
     if log_prior is not None:
         share = share / measure * (cells * np.exp(log_prior.reshape(cells.shape))).sum(0)
         known = float(np.log(share.sum()))
     n = max(contacts // (_DRAWS * _CUTS + _MOVES * _STEPS), 20)
-    drawn, log_weight, cut = sampler.draw(share, _DRAWS * n, rng)
+    drawn, log_weight, cut = _draw(target, share, _DRAWS * n, rng)
     # the evidence of the coarse posterior is known: what is left is an error of the measure, which all share
     whole = float(logsumexp(log_weight + drawn.log_target(0)))
     if not np.isfinite(whole):
@@ -134,7 +146,7 @@ def explore(
     particles, log_evidence, exponents, size = found[-1], evidence[-1], [power], 1.0
     while True:
         for _ in range(_MOVES):
-            particles, accepted = sampler.move(particles, power, size, rng)
+            particles, accepted = _moved(target, particles, power, size, rng)
             size = float(np.clip(size * np.exp(accepted - _ACCEPTED), 1e-3, 1))
             cut += n
         if power in POWERS:
@@ -149,7 +161,7 @@ def explore(
         particles = particles.take(_resampled(step * change, n, rng))
         power = after if step == after - power else power + step
         exponents.append(power)
-    return Explored(index, query, sampler.log_coarse, log_prior, tuple(found), tuple(evidence), tuple(exponents), cut)
+    return Explored(target, tuple(found), tuple(evidence), tuple(exponents), cut, known - whole)
 
 
 def _effective(log_weight: Array) -> float:
@@ -182,99 +194,78 @@ def _next_step(change: Array, most: float) -> float:
     return max(low, 1e-4)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sampler:
-    """Draws and moves of poses for one touch; densities are as of :class:`Explored`."""
+def _moved(
+    target: Target, particles: Particles, power: float, size: float, rng: np.random.Generator
+) -> tuple[Particles, float]:
+    """Every pose after one Metropolis step, and the share of small motions that was accepted.
 
-    maps: ContactMaps
-    query: ContactQuery
-    log_coarse: Array
-    log_prior: NDArray[np.floating] | None
+    Half of the poses move at a time: some by small motions, some by multiples of the motion from one pose of the other half
+    to another near it (ter Braak 2006), which follow the directions that the contact leaves open. Both keep the uniform
+    measure.
+    """
+    small = rng.random(len(particles)) < _SMALL
+    accepted = np.zeros(len(particles), bool)
+    half = rng.random(len(particles)) < 0.5
+    for some in (np.flatnonzero(half), np.flatnonzero(~half)):
+        others = np.setdiff1d(np.arange(len(particles)), some)
+        if not len(some) or len(others) < 2:
+            continue
+        T = poses_of(particles.poses, particles.depth, target.index.mesh.centre)
+        moved = np.where(
+            small[some, None, None],
+            _nudged(target, T[some], size, rng),
+            _differences(T[others], particles.poses.place[others], len(some), rng) @ T[some],
+        )
+        now = particles.take(some)
+        poses, membrane = located(target.index, moved)
+        new = target.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane)
+        gain = new.log_target(power) - now.log_target(power) + _log_images(target, moved) - _log_images(target, T[some])
+        accepted[some] = np.log(rng.random(len(some))) < gain
+        particles = particles.put(some[accepted[some]], new.take(np.flatnonzero(accepted[some])))
+    return particles, float(accepted[small].mean()) if small.any() else _ACCEPTED
 
-    def _admitted(self, poses: Placements, depth: Array, some: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        space = self.maps.index.space
-        if space.cones is None and space.sensor.housing_depth is None:
-            return np.ones(int(some.sum()), bool)
-        return space.admits(poses_of(poses, depth, self.maps.index.mesh.centre)[some])
 
-    def move(
-        self, particles: Particles, power: float, size: float, rng: np.random.Generator
-    ) -> tuple[Particles, float]:
-        """Every pose after one Metropolis step, and the share of small motions that was accepted.
+def _log_images(target: Target, T: Array) -> Array:
+    """Log (n,) of how many images of ``T`` (n, 4, 4) the approach allows, up to a constant: a placement with more of them has
+    the larger measure."""
+    return np.asarray(np.log(np.maximum(target.index.directions.density(T), 1e-300)))
 
-        Half of the poses move at a time: some by small motions, some by multiples of the motion from one pose of the other half
-        to another near it (ter Braak 2006), which follow the directions that the contact leaves open. Both keep the uniform
-        measure.
-        """
-        small = rng.random(len(particles)) < _SMALL
-        accepted = np.zeros(len(particles), bool)
-        half = rng.random(len(particles)) < 0.5
-        for some in (np.flatnonzero(half), np.flatnonzero(~half)):
-            others = np.setdiff1d(np.arange(len(particles)), some)
-            if not len(some) or len(others) < 2:
-                continue
-            T = poses_of(particles.poses, particles.depth, self.maps.index.mesh.centre)
-            moved = np.where(
-                small[some, None, None],
-                self._nudged(T[some], size, rng),
-                _differences(T[others], particles.poses.place[others], len(some), rng) @ T[some],
-            )
-            now = particles.take(some)
-            poses, membrane = located(self.maps.index, moved)
-            new = self.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane)
-            accepted[some] = np.log(rng.random(len(some))) < new.log_target(power) - now.log_target(power)
-            particles = particles.put(some[accepted[some]], new.take(np.flatnonzero(accepted[some])))
-        return particles, float(accepted[small].mean()) if small.any() else _ACCEPTED
 
-    def _nudged(self, T: Array, size: float, rng: np.random.Generator) -> Array:
-        """``T`` (n, 4, 4) turned about the observed contact's centroid and shifted."""
-        n = len(T)
-        scale = size * 10 ** -rng.random((n, 1))
-        rotvec = scale * _TURN * rng.normal(size=(n, 3))
-        if self.maps.index.space.on_known_faces:
-            rotvec[:, :2] = 0
-        turn = Rotation.from_rotvec(rotvec).as_matrix()
-        shift = scale * _WIDTH * sample_pitch(self.maps.index.sensor) * rng.normal(size=(n, 3))
-        about = np.array([*self.query.centroid, 0.0])
-        where = np.einsum("nij,nj->ni", turn, T[:, :3, 3] - about) + about + shift
-        return transform(turn @ T[:, :3, :3], where)
+def _nudged(target: Target, T: Array, size: float, rng: np.random.Generator) -> Array:
+    """``T`` (n, 4, 4) turned about the observed contact's centroid and shifted."""
+    n = len(T)
+    scale = size * 10 ** -rng.random((n, 1))
+    rotvec = scale * _TURN * rng.normal(size=(n, 3))
+    if target.index.space.on_known_faces:
+        rotvec[:, :2] = 0
+    turn = Rotation.from_rotvec(rotvec).as_matrix()
+    shift = scale * _WIDTH * sample_pitch(target.index.sensor) * rng.normal(size=(n, 3))
+    about = np.array([*target.query.centroid, 0.0])
+    where = np.einsum("nij,nj->ni", turn, T[:, :3, 3] - about) + about + shift
+    return transform(turn @ T[:, :3, :3], where)
 
-    def evaluated(self, poses: Placements, membrane: Array | None = None, depth: Array | None = None) -> Particles:
-        """n poses as particles, the membrane's apex ``membrane`` (n,) beyond their centre or ``depth`` (n,) deep."""
-        cut = self.maps.compare(self.query.samples, self.query.area, poses, membrane, depth)
-        found = replace(poses, reach=cut.reach.astype(float))
-        if depth is None:
-            assert membrane is not None
-            depth = found.reach - membrane
-        ok = np.isfinite(cut.energy[:, 0]) & (depth <= self.maps.index.sensor.max_penetration)
-        depth = np.where(ok, depth, 0.0)
-        ok[ok] = self._admitted(found, depth, ok)
-        log_likelihood = np.full(len(depth), -np.inf)
-        log_likelihood[ok] = self.query.log_likelihood(cut.energy[ok])
-        log_prior = prior_at(self.maps.index, self.log_prior, poses.place, depth)
-        return Particles(found, depth, log_likelihood, self.log_coarse[poses.place], log_prior)
 
-    def draw(self, share: Array, n: int, rng: np.random.Generator) -> tuple[Particles, Array, int]:
-        """``n`` poses, their log weights (n,), and how many contacts were cut.
+def _draw(target: Target, share: Array, n: int, rng: np.random.Generator) -> tuple[Particles, Array, int]:
+    """``n`` poses, their log weights (n,), and how many contacts were cut.
 
-        A place is drawn in proportion to ``share`` (m,), a rotation uniformly in its cell, a centre in its lattice cell. A weight
-        is the uniform density over that of the draw, over n.
-        """
-        index = self.maps.index
-        place, share = _systematic(share, n, rng), share / share.sum()
-        drawn = transform(index.directions.draw(index.rotation[place], rng), np.zeros(3))
-        rotation = index.directions.canonical(drawn)[:, :3, :3]
-        direction = index.directions.direction_of_rotation(index.rotation[place]).astype(np.int32)
-        step = index.resolution.step
-        middle = np.rint(index.shift[place] / step) * step
-        reach = index.height[0, place].astype(float) + index.resolution.penetrations[0]
-        poses = Placements(place, direction, rotation, middle, reach)
-        target, cut = _aligned(self.maps, self.query, poses, step)
-        centre, density = _centres(target, middle, step, _WIDTH * sample_pitch(index.sensor), rng)
-        depth = index.sensor.max_penetration * rng.random(n)
-        particles = self.evaluated(replace(poses, centre=centre), depth=depth)
-        log_weight = np.log(index.cell_measure[place]) - np.log(share[place]) - np.log(density * n)
-        return particles, log_weight, cut + n
+    A place is drawn in proportion to ``share`` (m,), a rotation uniformly in its cell, a centre in its lattice cell. A weight
+    is the uniform density over that of the draw, over n.
+    """
+    index = target.index
+    place, share = _systematic(share, n, rng), share / share.sum()
+    drawn = transform(index.directions.draw(index.rotation[place], rng), np.zeros(3))
+    rotation = index.directions.canonical(drawn)[:, :3, :3]
+    direction = index.directions.direction_of_rotation(index.rotation[place]).astype(np.int32)
+    step = index.resolution.step
+    middle = np.rint(index.shift[place] / step) * step
+    reach = index.height[0, place].astype(float) + index.resolution.penetrations[0]
+    poses = Placements(place, direction, rotation, middle, reach)
+    about, cut = _aligned(target, poses, step)
+    centre, density = _centres(about, middle, step, _WIDTH * sample_pitch(index.sensor), rng)
+    depth = index.sensor.max_penetration * rng.random(n)
+    particles = target.evaluated(replace(poses, centre=centre), depth=depth)
+    log_weight = np.log(index.cell_measure[place]) - np.log(share[place]) - np.log(density * n)
+    return particles, log_weight, cut + n
 
 
 def _differences(T: Array, place: NDArray[np.int64], n: int, rng: np.random.Generator) -> Array:
@@ -289,9 +280,10 @@ def _differences(T: Array, place: NDArray[np.int64], n: int, rng: np.random.Gene
     return exp(share[:, None] * log(T[order[second]] @ inverse(T[order[first]])))
 
 
-def _aligned(maps: ContactMaps, query: ContactQuery, poses: Placements, step: float) -> tuple[Array, int]:
+def _aligned(target: Target, poses: Placements, step: float) -> tuple[Array, int]:
     """The object's centre (n, 2) at which the contact's centroid is about the observed one, NaN where none within the cell is;
     and how many contacts were cut."""
+    query, maps = target.query, ContactMaps.of(target.index)
     centre, cut, near = poses.centre.copy(), 0, np.arange(len(poses.reach))
     reach = poses.reach.copy()
     for _ in range(_CUTS - 1):
@@ -302,7 +294,7 @@ def _aligned(maps: ContactMaps, query: ContactQuery, poses: Placements, step: fl
         centre[near] += np.where(touches, query.centroid - found.centroid, np.nan)
         reach[near] = found.reach
         off = np.abs(centre - poses.centre).max(1)
-        inside = off <= 0.5 * step + 2 * _WIDTH * sample_pitch(maps.index.sensor)
+        inside = off <= 0.5 * step + 2 * _WIDTH * sample_pitch(target.index.sensor)
         centre[~inside] = np.nan
         near = np.flatnonzero(inside)
     return centre, cut

@@ -24,7 +24,7 @@ from geomtact.inference.repeated_images import digest
 from geomtact.inference.sampler import explore_twice
 from geomtact.inference.search import SensorView
 from geomtact.inference.views import Placed
-from geomtact.scoring.contact_likelihood import ContactQuery
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.scoring.fitted import FittedScorer
 from geomtact.sensing.contact import Contact, SoftMask
 
@@ -124,10 +124,17 @@ def explore_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer
             density = np.where(index.log_weight > -np.inf, log_prior - np.maximum(index.log_weight, -1e3), -np.inf)
         query, rng = ContactQuery.of(mask, posterior.sensor), np.random.default_rng(posterior.seed)
         try:
-            return replace(posterior, explored=explore_twice(index, query, coarse, effort.contacts, rng, density))
+            explored = explore_twice(index, query, coarse, effort.contacts, rng, density)
         except InputError as error:
             warning = f"the pose is not resolved within the grid's cells: {error}"
             return replace(posterior, warnings=[*posterior.warnings, warning])
+    warnings = list(posterior.warnings)
+    if len(explored.particles) < len(POWERS):
+        warnings.append(
+            f"the pose is resolved less finely than the contact allows: {explored.contacts:,} contacts do not settle how likely "
+            "it is; allow more"
+        )
+    return replace(posterior, explored=explored, warnings=warnings)
 
 
 def drop_lost_contact_prior(posterior: Posterior, prior: Any) -> tuple[Posterior, Any]:

@@ -21,7 +21,8 @@ from scipy.special import logsumexp
 from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.touches import Touch, random_touches
 from geomtact.files import write_text
-from geomtact.inference.explored import Explored, Particles, log_target
+from geomtact.inference.explored import Explored
+from geomtact.inference.particles import Particles, log_target
 from geomtact.inference.sampler import explore
 from geomtact.kernels.contact_energy import SHARES
 from geomtact.localizer import Localizer
@@ -118,7 +119,7 @@ def _example(localizer: Localizer, maps: ContactMaps, touch: Touch, rng: np.rand
     at_truth, place = _at_truth(maps, query, touch)
     lc = np.concatenate([p.log_coarse for p in mixed])
     ll = np.concatenate([p.log_likelihood for p in mixed])
-    true_lc = float(explored.log_coarse[place])
+    true_lc = float(explored.target.log_coarse[place])
     true_ll = float(query.log_likelihood(at_truth)[0])
     return Example(
         _in_units(energy),

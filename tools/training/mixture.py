@@ -20,7 +20,8 @@ from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.touch import CALIBRATION_NOISE, draw_noise, simulate_mask, spoilt
 from geomtact.contact_space.touches import Touch, counts, each_touch
 from geomtact.files import write_text
-from geomtact.inference.explored import Explored, log_target
+from geomtact.inference.explored import Explored
+from geomtact.inference.particles import log_target
 from geomtact.inference.sampler import explore
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
@@ -97,10 +98,10 @@ def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator
 
 
 def _example(explored: Explored, touch: Touch) -> Example:
-    index, query = explored.index, explored.query
+    index, query = explored.index, explored.target.query
     poses, membrane = located(index, touch.T_sensor_object[None])
     cut = ContactMaps.of(index).compare(query.samples, query.area, poses, membrane)
-    at, coarse = query.log_likelihood(cut.energy), explored.log_coarse[poses.place]
+    at, coarse = query.log_likelihood(cut.energy), explored.target.log_coarse[poses.place]
     each = [np.concatenate([getattr(p, name) for p in explored.particles]) for name in ("log_likelihood", "log_coarse")]
     evidence = np.array(explored.log_evidence)
 

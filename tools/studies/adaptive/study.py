@@ -10,10 +10,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from geomtact.contact_space.contact_class import contact_class
-from geomtact.contact_space.contact_maps import ContactMaps
+from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touches import Touch
-from geomtact.inference.explored import log_likelihood_at
 from geomtact.inference.sampler import explore
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
@@ -100,7 +99,7 @@ def _root(
     """Rank of the true cell, coarse gain and gain within the cell, and the share of the cell that touches."""
     true = int(index.lookup(touch.T_sensor_object[None], np.array([touch.penetration]))[0])
     inside = _in_cell(index, maps, query, true, rng)
-    at_truth = float(log_likelihood_at(maps, query, touch.T_sensor_object[None])[0])
+    at_truth = float(_log_likelihood(maps, query, touch.T_sensor_object[None])[0])
     return (
         int((log_mass > log_mass[true]).sum()),
         float(log_mass[true] - index.log_weight[true]),
@@ -120,8 +119,16 @@ def _gain(at_truth: float, inside: Array, weights: Array) -> float:
 def _in_cell(index: Index, maps: ContactMaps, query: ContactQuery, cell: int, rng: np.random.Generator) -> Array:
     """Log likelihoods (n,) of poses drawn evenly in a cell, of those that touch."""
     T, depth = index.draw(np.full(_IN_CELL, cell), rng)
-    found = log_likelihood_at(maps, query, T, depth)
+    found = _log_likelihood(maps, query, T, depth)
     return found[np.isfinite(found)]
+
+
+def _log_likelihood(maps: ContactMaps, query: ContactQuery, T: Array, depth: Array | None = None) -> Array:
+    """Log likelihood (n,) of the observed contact at ``T_sensor_object`` (n, 4, 4), where the object is moved along z to press
+    ``depth`` (n,) [m] deep if that is given."""
+    poses, membrane = located(maps.index, np.asarray(T, float))
+    where = {"membrane": membrane} if depth is None else {"depth": depth}
+    return query.log_likelihood(maps.compare(query.samples, query.area, poses, **where).energy)
 
 
 def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:

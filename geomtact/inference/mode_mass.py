@@ -1,0 +1,171 @@
+"""The masses of the leading modes of an explored posterior, by importance sampling.
+
+A touch may fit hundreds of places, of which particles find some. Those that are found hold all particles, so that a count says
+how often a place was found, not how probable it is. But the density is known: so its integral about a mode is made instead, from
+poses that are drawn round by round as the poses before them say (Cappe et al. 2008).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp
+
+from geomtact.contact_space.contact_maps import sample_pitch
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.inference.explored import Explored
+from geomtact.se3 import Array, exp, inverse, log
+
+# These choose where the density is looked at: they change how precise a mass is, not what is estimated.
+_MODES = 20  # that are weighed
+_ROUNDS, _DRAWS = 3, 150  # of poses, for each mode
+_WIDER = 1.6  # standard deviations of the draws over those of the poses before
+_TAIL = 5  # degrees of freedom of the draws, which are of Student's distribution
+_EFFECTIVE = 20  # draws that decide about the next round's, at least
+_KNOWN, _SAMPLES = 3, 0.5  # a covariance counts as much as so many draws, of that many samples of the window
+_POINTS = 128  # of the surface, for distances
+
+
+def weighed(explored: Explored, rng: np.random.Generator) -> tuple[Explored, float]:
+    """``explored`` with its leading modes, and the log of the sum of their masses as it was found.
+
+    Each is the poses within the mode radius of its densest particle. If they have more than everything, then the evidence misses
+    what they hold, and their masses are those of shares of them.
+    """
+    mesh = explored.index.mesh
+    distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
+    hearts, members = _grown(explored, distance, radius)
+    basis = explored.index.directions.symmetry.motions
+    pitch = _SAMPLES * sample_pitch(explored.index.sensor)
+    least = np.where(basis[:, :3].any(1), pitch / mesh.radius_rms, pitch)
+    modes = []
+    for heart, near in zip(explored.poses[hearts], members, strict=True):
+        motions = log(inverse(heart) @ distance.aligned(heart, explored.poses[near])) @ np.linalg.pinv(basis)
+        modes.append(_Mode(heart, least, [_Student.of(motions, explored.weight[near], least)]))
+    for _ in range(_ROUNDS):
+        motions = np.stack([mode.students[-1].draw(_DRAWS, rng) for mode in modes])
+        T = np.stack([mode.heart @ exp(each @ basis) for mode, each in zip(modes, motions, strict=True)])
+        near = np.stack([distance.within(mode.heart, each, radius) for mode, each in zip(modes, T, strict=True)])
+        found = np.full(near.shape, -np.inf)
+        particles = explored.target.at(T[near])
+        density = explored.log_density_of(particles) + np.log(explored.index.uniform_density(T[near]))
+        found[near] = np.where(np.isfinite(particles.log_likelihood), density, -np.inf)
+        for mode, each, log_density in zip(modes, motions, found, strict=True):
+            mode.add(each, log_density)
+    log_mass = np.array([mode.log_integral + explored.log_measure for mode in modes])
+    log_sum = float(logsumexp(log_mass))
+    mass = _shared_out(explored, members, np.exp(log_mass - max(log_sum, 0)))
+    order = np.argsort(-mass, kind="stable")
+    return replace(explored, hearts=hearts[order], masses=mass[order]), log_sum
+
+
+def _grown(
+    explored: Explored, distance: PoseDistance, radius: float
+) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
+    """The densest particle of each mode, densest first, and the particles near it."""
+    covered = np.zeros(len(explored.poses), bool)
+    hearts: list[int] = []
+    members: list[NDArray[np.int64]] = []
+    for row in np.argsort(-explored.particle_log_density, kind="stable").tolist():
+        if len(hearts) == _MODES:
+            break
+        if not covered[row]:
+            near = distance.within(explored.poses[row], explored.poses, radius)
+            near[row] = True
+            covered |= near
+            hearts.append(row)
+            members.append(np.flatnonzero(near))
+    return np.array(hearts, np.int64), members
+
+
+def _shared_out(explored: Explored, members: list[NDArray[np.int64]], mass: Array) -> Array:
+    """``mass`` (m,) of modes that may overlap: a pose counts for the most probable of its modes."""
+    out, free = mass.copy(), np.ones(len(explored.poses), bool)
+    for i in np.argsort(-mass, kind="stable"):
+        weight = explored.weight[members[i]]
+        out[i] *= weight[free[members[i]]].sum() / weight.sum()
+        free[members[i]] = False
+    return out
+
+
+@dataclass(eq=False)
+class _Mode:
+    """Draws about one mode.
+
+    Attributes
+    ----------
+    heart : (4, 4), from which motions are
+    least : (d,) standard deviations [rad, m] of the covariance that is known before
+    students : that were drawn from, and the next one
+    motions, log_density : of all draws
+    """
+
+    heart: Array
+    least: Array
+    students: list[_Student]
+    motions: list[Array] = field(default_factory=list)
+    log_density: list[Array] = field(default_factory=list)
+    log_integral: float = -np.inf
+
+    def add(self, motions: Array, log_density: Array) -> None:
+        """A round of draws from the last of the distributions."""
+        self.motions.append(motions)
+        self.log_density.append(log_density)
+        drawn = np.concatenate(self.motions)
+        # all rounds are drawn from the mean of their distributions
+        density = logsumexp([each.log_density(drawn) for each in self.students], 0) - np.log(len(self.students))
+        log_weight = np.concatenate(self.log_density) - density
+        self.log_integral = _log_mean(log_weight)
+        weight = _flattened(log_weight)
+        self.students.append(_Student.of(drawn, weight, self.least) if weight.any() else self.students[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Student:
+    """Student's distribution about ``mean`` (d,) with a triangular ``root`` (d, d) of its scale matrix."""
+
+    mean: Array
+    root: Array
+
+    @classmethod
+    def of(cls, motions: Array, weight: Array, least: Array) -> _Student:
+        """That of ``motions`` (n, d) of some ``weight`` (n,), and wider."""
+        weight = weight / weight.sum()
+        mean = weight @ motions
+        n = 1 / float(weight @ weight)
+        spread = ((motions - mean) * weight[:, None]).T @ (motions - mean)
+        root = np.linalg.cholesky((n * spread + _KNOWN * np.diag(least**2)) / (n + _KNOWN))
+        return cls(mean, np.asarray(_WIDER * root, float))
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        stretch = np.sqrt(_TAIL / rng.chisquare(_TAIL, (n, 1)))
+        return np.asarray(self.mean + stretch * (rng.normal(size=(n, len(self.mean))) @ self.root.T))
+
+    def log_density(self, motions: Array) -> Array:
+        d = len(self.mean)
+        off = np.square(np.linalg.solve(self.root, (motions - self.mean).T)).sum(0)
+        scale = gammaln((_TAIL + d) / 2) - gammaln(_TAIL / 2) - 0.5 * d * np.log(_TAIL * np.pi)
+        return np.asarray(scale - np.log(np.diag(self.root)).sum() - 0.5 * (_TAIL + d) * np.log1p(off / _TAIL), float)
+
+
+def _log_mean(log_weight: Array) -> float:
+    """Log of the mean weight, where none counts more than sqrt(n) mean ones (Ionides 2008): a draw where hardly any was to be
+    expected would else decide alone."""
+    n = len(log_weight)
+    most = logsumexp(log_weight) - 0.5 * np.log(n)
+    return float(logsumexp(np.minimum(log_weight, most)) - np.log(n))
+
+
+def _flattened(log_weight: Array) -> Array:
+    """Weights (n,) raised to the largest power at which enough draws are effective; all 0 where no draw has any."""
+    out, finite = np.zeros(len(log_weight)), np.isfinite(log_weight)
+    if not finite.any():
+        return out
+    for power in np.linspace(1, 0, 21):
+        weight = np.exp(power * log_weight[finite] - power * log_weight.max())
+        if weight.sum() ** 2 >= _EFFECTIVE * np.square(weight).sum():
+            break
+    out[finite] = weight
+    return out

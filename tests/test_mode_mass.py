@@ -1,0 +1,83 @@
+"""The masses of modes: integrals of the density, whatever number of particles was found there."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from geomtact.geometry.distance import PoseDistance
+from geomtact.inference import mode_mass
+from geomtact.se3 import exp, inverse, log
+
+WIDTH = np.array([0.02, 0.015, 0.03, 2e-4, 4e-4, 1e-4])  # rad and metres along xi
+MASS = np.array([0.3, 0.6, 0.05])
+COUNT = np.array([500, 40, 90])  # particles: not as the masses are
+
+
+@pytest.fixture(scope="module", params=["bracket", "hex_nut", "damping_pin"])
+def normal_modes(request, make_localizer):
+    """Three places with normal densities, of which particles were drawn in other numbers, and half as wide."""
+    index, rng = make_localizer(request.param, "gelslim", max_poses=20_000).index, np.random.default_rng(0)
+    basis = index.directions.symmetry.motions
+    width = WIDTH[-len(basis) :] if len(basis) == 6 else np.append(WIDTH[:2], WIDTH[3:])
+    hearts = index.poses()[[100, len(index) // 2, len(index) - 100]]
+    distance = PoseDistance(index.mesh, 128)
+    assert min(distance.mean(hearts[i], hearts[[i - 1]])[0] for i in range(3)) > 20e-3
+
+    def log_normal(T):
+        """Log density (n,) over the uniform one."""
+        each = []
+        for heart, mass in zip(hearts, MASS, strict=True):
+            off = log(inverse(heart) @ distance.aligned(heart, T)) @ np.linalg.pinv(basis) / width
+            each.append(np.log(mass / np.prod(width)) - 0.5 * (np.square(off) + np.log(2 * np.pi)).sum(1))
+        return np.logaddexp.reduce(each) - np.log(index.uniform_density(T))
+
+    drawn = [
+        heart @ exp(0.5 * width * rng.normal(size=(n, len(width))) @ basis)
+        for heart, n in zip(hearts, COUNT, strict=True)
+    ]
+    poses = np.concatenate(drawn)
+    return hearts, SimpleNamespace(
+        index=index,
+        poses=poses,
+        weight=np.full(len(poses), 1 / len(poses)),
+        particle_log_density=log_normal(poses),
+        log_measure=0.0,
+        target=SimpleNamespace(at=lambda T: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T)))),
+        log_density_of=lambda particles: log_normal(particles.T),
+    )
+
+
+@pytest.fixture
+def weighed(normal_modes, monkeypatch):
+    """Hearts and masses of the modes, and the log of their sum; of modes that are wide enough to hold all."""
+    monkeypatch.setattr(mode_mass, "mode_radius", lambda _: 10e-3)
+    monkeypatch.setattr(
+        mode_mass, "replace", lambda explored, **changes: SimpleNamespace(**{**vars(explored), **changes})
+    )
+    return mode_mass.weighed(normal_modes[1], np.random.default_rng(1))
+
+
+def test_a_mass_is_the_integral_of_the_density(normal_modes, weighed):
+    found, log_sum = weighed
+    hearts, distance = normal_modes[0], PoseDistance(found.index.mesh, 128)
+    near = np.array([distance.mean(found.poses[heart], hearts) for heart in found.hearts]).argmin(1)
+    assert near.tolist() == [1, 0, 2]  # the most probable first
+    np.testing.assert_allclose(found.masses, MASS[near], rtol=0.1)
+    assert np.exp(log_sum) == pytest.approx(MASS.sum(), rel=0.1)
+
+
+def test_modes_that_overlap_share_their_poses(normal_modes, weighed, monkeypatch):
+    """Of narrower modes there are several about one place, and each pose counts once."""
+    monkeypatch.setattr(mode_mass, "mode_radius", lambda _: 0.6e-3)
+    found, _ = mode_mass.weighed(normal_modes[1], np.random.default_rng(1))
+    assert len(found.hearts) > 3 and found.masses.sum() <= 1
+    assert (np.diff(found.masses) <= 0).all()
+
+
+def test_no_draw_decides_alone():
+    log_weight = np.zeros(400)
+    log_weight[7] = 50.0
+    assert mode_mass._log_mean(log_weight) == pytest.approx(50 - 1.5 * np.log(400), abs=1e-6)
+    assert mode_mass._log_mean(np.zeros(400)) == pytest.approx(0)
+    assert mode_mass._log_mean(np.full(400, -np.inf)) == -np.inf
