@@ -115,8 +115,11 @@ class ContactMaps:
             asked = Poses(poses.direction[part], *(each[part] for each in numbers))
             return contact_energy(self.maps, samples, asked, deepest, area)
 
+        starts = range(0, max(n, 1), _PART)
+        if len(starts) == 1:
+            return some(0)
         with ThreadPoolExecutor(_THREADS) as pool:
-            found = list(pool.map(some, range(0, max(n, 1), _PART)))
+            found = list(pool.map(some, starts))
         return Cut(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
 

@@ -78,8 +78,8 @@ class ContactSpace:
         T = np.asarray(T, float).reshape(-1, 4, 4)
         allowed = self.approaches(T)
         if self.sensor.housing_depth is not None and allowed.any():
-            lowest = self.caster.lowest_outside(self.sensor, T[allowed])
-            allowed[allowed] = lowest >= -self.sensor.housing_depth - _SETTLED
+            lowest = self.caster.lowest_outside(self.sensor, T[allowed], -self.sensor.housing_depth - _SETTLED)
+            allowed[allowed] = lowest == np.inf
         return allowed
 
     def settle(self, T: ArrayLike, depth: ArrayLike, steps: int = 30) -> tuple[Array, NDArray[np.bool_]]:

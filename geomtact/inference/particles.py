@@ -85,7 +85,7 @@ class Target:
 
     def evaluated(self, poses: Placements, membrane: Array | None = None, depth: Array | None = None) -> Particles:
         """n poses as particles, the membrane's apex ``membrane`` (n,) beyond their centre or ``depth`` (n,) deep. Those that do
-        not touch, press too deep or are not allowed have no likelihood."""
+        not touch or press too deep have no likelihood; see :meth:`admits`."""
         cut = ContactMaps.of(self.index).compare(self.query.samples, self.query.area, poses, membrane, depth)
         found = replace(poses, reach=cut.reach.astype(float))
         if depth is None:
@@ -93,22 +93,30 @@ class Target:
             depth = found.reach - membrane
         ok = np.isfinite(cut.energy[:, 0]) & (depth <= self.index.sensor.max_penetration)
         depth = np.where(ok, depth, 0.0)
-        ok[ok] = self._admitted(found, depth, ok)
         log_likelihood = np.full(len(depth), -np.inf)
         log_likelihood[ok] = self.query.log_likelihood(cut.energy[ok])
         log_prior = prior_at(self.index, self.log_prior, poses.place, depth)
         return Particles(found, depth, log_likelihood, self.log_coarse[poses.place], log_prior)
 
     def at(self, T: ArrayLike) -> Particles:
-        """Poses ``T_sensor_object`` (n, 4, 4) as particles."""
+        """Poses ``T_sensor_object`` (n, 4, 4) as particles; those that are forbidden have no likelihood."""
         poses, membrane = located(self.index, np.asarray(T, float))
-        return self.evaluated(poses, membrane)
+        return self.admitted(self.evaluated(poses, membrane))
 
-    def _admitted(self, poses: Placements, depth: Array, some: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def admitted(self, particles: Particles) -> Particles:
+        """``particles`` (n,), without a likelihood where the approach or the sensor's housing forbids them."""
+        touches = np.flatnonzero(np.isfinite(particles.log_likelihood))
+        forbidden = touches[~self.admits(particles.take(touches))]
+        log_likelihood = particles.log_likelihood.copy()
+        log_likelihood[forbidden] = -np.inf
+        return replace(particles, log_likelihood=log_likelihood)
+
+    def admits(self, particles: Particles) -> NDArray[np.bool_]:
+        """Whether the approach and the sensor's housing allow ``particles`` (n,)."""
         space = self.index.space
         if space.cones is None and space.sensor.housing_depth is None:
-            return np.ones(int(some.sum()), bool)
-        return space.admits(poses_of(poses, depth, self.index.mesh.centre)[some])
+            return np.ones(len(particles), bool)
+        return space.admits(poses_of(particles.poses, particles.depth, self.index.mesh.centre))
 
 
 def poses_of(poses: Placements, depth: Array, middle: Array) -> Array:

@@ -13,6 +13,7 @@ observed one, and moves turn the object about that point of the membrane.
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -70,7 +71,12 @@ def explore_twice(
     """
     cut, all_powers = 0, len(POWERS)
     for more in (1, _MORE):
-        one, other = (explore(index, query, coarse, more * contacts // 2, rng, log_prior) for _ in range(2))
+        with ThreadPoolExecutor(2) as pool:
+            runs = [
+                pool.submit(explore, index, query, coarse, more * contacts // 2, each, log_prior)
+                for each in rng.spawn(2)
+            ]
+            one, other = (run.result() for run in runs)
         cut += one.contacts + other.contacts
         for powers in range(all_powers, 1 if more == _MORE else all_powers - 1, -1):
             found = _pooled(one, other, powers, rng)
@@ -166,9 +172,11 @@ def explore(
 
 def _effective(log_weight: Array) -> float:
     """How many draws of equal weight would do as well."""
-    if not np.isfinite(log_weight).any():
+    most = log_weight.max()
+    if not np.isfinite(most):
         return 0.0
-    return float(np.exp(2 * logsumexp(log_weight) - logsumexp(2 * log_weight)))
+    weight = np.exp(log_weight - most)
+    return float(weight.sum() ** 2 / np.square(weight).sum())
 
 
 def _resampled(log_weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -220,8 +228,11 @@ def _moved(
         poses, membrane = located(target.index, moved)
         new = target.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane)
         gain = new.log_target(power) - now.log_target(power) + _log_images(target, moved) - _log_images(target, T[some])
-        accepted[some] = np.log(rng.random(len(some))) < gain
-        particles = particles.put(some[accepted[some]], new.take(np.flatnonzero(accepted[some])))
+        taken = np.flatnonzero(np.log(rng.random(len(some))) < gain)
+        new = new.take(taken)
+        allowed = target.admits(new)  # of those alone, because it takes as long as a contact
+        accepted[some[taken[allowed]]] = True
+        particles = particles.put(some[taken[allowed]], new.take(np.flatnonzero(allowed)))
     return particles, float(accepted[small].mean()) if small.any() else _ACCEPTED
 
 
@@ -263,7 +274,7 @@ def _draw(target: Target, share: Array, n: int, rng: np.random.Generator) -> tup
     about, cut = _aligned(target, poses, step)
     centre, density = _centres(about, middle, step, _WIDTH * sample_pitch(index.sensor), rng)
     depth = index.sensor.max_penetration * rng.random(n)
-    particles = target.evaluated(replace(poses, centre=centre), depth=depth)
+    particles = target.admitted(target.evaluated(replace(poses, centre=centre), depth=depth))
     log_weight = np.log(index.cell_measure[place]) - np.log(share[place]) - np.log(density * n)
     return particles, log_weight, cut + n
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geomtact.geometry.mesh import outermost
 from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.scene import MISSED, scene_of
@@ -120,15 +122,22 @@ class Caster:
         far = self.scene.distances(*(np.ascontiguousarray(each, np.float32) for each in rows))
         return np.where(far > MISSED, np.inf, far.astype(float))
 
-    def lowest_outside(self, sensor: Sensor, T: ArrayLike) -> Array:
-        """Lowest z (n,) [m] of the object's vertices outside the window, in the sensor frame; +inf if none is below 0."""
+    def lowest_outside(self, sensor: Sensor, T: ArrayLike, below: float = 0.0) -> Array:
+        """Lowest z (n,) [m] of the object's vertices outside the window, in the sensor frame; +inf if none is
+        lower than ``below`` [m]."""
         T = np.asarray(T, float).reshape(-1, 4, 4)
         out = np.full(len(T), np.inf)
-        for part in _slices(len(T), 256):
-            pose, p = self._below(T[part], np.zeros(len(T[part])))
+        # most poses are known to have none by the few vertices of the hull
+        low = np.flatnonzero(((T[:, 2, :3] @ self._corners.T).min(1) + T[:, 2, 3]) < below)
+        for rows in np.split(low, range(256, len(low), 256)):
+            pose, p = self._below(T[rows], np.full(len(rows), below))
             outside = (np.abs(sensor.project(p)) > sensor.half_window).any(-1)
-            np.minimum.at(out[part], pose[outside], p[outside, 2])
+            np.minimum.at(out, rows[pose[outside]], p[outside, 2])
         return out
+
+    @cached_property
+    def _corners(self) -> Array:
+        return outermost(self.vertices)
 
     def _below(self, T: Array, z: Array) -> tuple[NDArray[np.int64], Array]:
         """Vertices that lie below ``z`` (n,) [m] at poses ``T``: which pose (m,), and where (m, 3) in the sensor frame."""
