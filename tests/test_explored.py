@@ -83,7 +83,7 @@ def test_powers_on_which_runs_disagree_are_left_out(localizer, touch, monkeypatc
     monkeypatch.setattr(sampler, "explore", apart)
     found = localizer.localize(touch.mask, "mask", effort=EFFORT)
     assert len(seen) == 4 and len(found.explored.particles) == 3
-    assert found.explored.contacts == sum(each.contacts for each in seen)
+    assert found.explored.contacts > sum(each.contacts for each in seen)  # of modes too
     assert "do not settle how likely it is" in found.warnings[-1]
 
 

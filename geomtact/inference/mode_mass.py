@@ -58,7 +58,8 @@ def weighed(explored: Explored, rng: np.random.Generator) -> tuple[Explored, flo
     log_sum = float(logsumexp(log_mass))
     mass = _shared_out(explored, members, np.exp(log_mass - max(log_sum, 0)))
     order = np.argsort(-mass, kind="stable")
-    return replace(explored, hearts=hearts[order], masses=mass[order]), log_sum
+    contacts = explored.contacts + _ROUNDS * _DRAWS * len(modes)
+    return replace(explored, hearts=hearts[order], masses=mass[order], contacts=contacts), log_sum
 
 
 def _grown(

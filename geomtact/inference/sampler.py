@@ -48,7 +48,7 @@ _EXPONENTS = np.geomspace(2e-4, 1, 40)  # of the likelihood, that the first step
 _HALVINGS = 30
 # Mean difference of two log evidences, by the weights of the powers, or log of the sum of all masses, above which no run is
 # believed [nats], and by how much more contacts are cut then; hand-set.
-_AGREE, _MORE = 1.0, 4
+_AGREE, MORE = 1.0, 4
 
 
 def explore_twice(
@@ -70,7 +70,7 @@ def explore_twice(
         No pose that was drawn touches the sensor, or the runs agree on nothing.
     """
     cut, all_powers = 0, len(POWERS)
-    for more in (1, _MORE):
+    for more in (1, MORE):
         with ThreadPoolExecutor(2) as pool:
             runs = [
                 pool.submit(explore, index, query, coarse, more * contacts // 2, each, log_prior)
@@ -78,13 +78,14 @@ def explore_twice(
             ]
             one, other = (run.result() for run in runs)
         cut += one.contacts + other.contacts
-        for powers in range(all_powers, 1 if more == _MORE else all_powers - 1, -1):
-            found = _pooled(one, other, powers, rng)
+        for powers in range(all_powers, 1 if more == MORE else all_powers - 1, -1):
+            found = replace(_pooled(one, other, powers, rng), contacts=cut)
             apart = float(found.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
             if apart < _AGREE:
                 found, log_sum = weighed(found, rng)
                 if log_sum < _AGREE:
-                    return replace(found, contacts=cut)
+                    return found
+                cut = found.contacts
     raise InputError(
         f"{index.mesh.name}: {cut:,} contacts do not settle how likely the observed one is; allow more contacts"
     )

@@ -11,7 +11,7 @@ from geomtact.cli.shell import print_table
 from geomtact.cli.simulate import NoiseName
 from tools.studies.common import study_file, study_options
 
-SCHEMA = "geomtact/adaptive/2"
+SCHEMA = "geomtact/adaptive/3"
 
 
 def judge_adaptive(
@@ -72,7 +72,15 @@ def _print(parts: Mapping[str, Any]) -> None:
             off, half = s["expected_less_gain"]
             coverage = " ".join(f"{100 * each:.0f}" for each in s["coverage"])
             missed = f"{100 * s['missed']:.1f}"
-            figures = [f"{s['contacts']:,.0f}", f"{s['gain']:.2f}", f"{off:+.2f} +- {half:.2f}", coverage, missed]
+            first = f"{100 * s['first']:.1f} {100 * s['held']:.1f}"
+            figures = [
+                f"{s['contacts']:,.0f}",
+                f"{s['gain']:.2f}",
+                f"{off:+.2f} +- {half:.2f}",
+                coverage,
+                missed,
+                first,
+            ]
             rows.append([name, *figures])
     headings = [
         "object",
@@ -81,5 +89,6 @@ def _print(parts: Mapping[str, Any]) -> None:
         "expected less measured",
         "coverage [%] at 50 80 90 95",
         "missed [%]",
+        "first mode, right [%]",
     ]
     print_table(headings, rows, headings[1:])

@@ -13,14 +13,16 @@ from geomtact.contact_space.contact_class import contact_class
 from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touches import Touch
-from geomtact.inference.sampler import explore
+from geomtact.errors import InputError
+from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.inference.sampler import MORE, explore_twice
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
 ROOTS = (75_000, 300_000, 1_200_000)  # poses of the grids whose cells are opened
-CONTACTS = (3_000, 10_000, 30_000)  # budgets of the sampler
+CONTACTS = (1_000, 3_000, 10_000, 30_000, 100_000)  # budgets of the sampler, as ``Effort.contacts``
 CHILDREN = 32  # contacts that open a cell: two parts of each tilt, turn, x and y
 _IN_CELL = 400  # poses drawn in the true cell
 BUDGETS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)  # of opening, for the chart
@@ -39,9 +41,11 @@ class Outcome:
     in_cell_gain : log density at the true pose within its cell, by the sampler's mixture; at most log 401
     touching : share of the true cell in which the object can touch
     gain, expected_gain, level : of the sampler: at the true pose, at most that of the densest particle; by its own particles;
-        credible level of the true pose
+        credible level of the true pose. Where its runs agree on nothing, of the cells.
     missed : whether the true pose is denser than every particle of the sampler
     cut : contacts that the sampler cut
+    powers : of the likelihood that are kept; 1 where its runs agree on nothing
+    first, held : mass of the first mode, and whether it holds the true pose
     """
 
     elastic: bool
@@ -55,6 +59,23 @@ class Outcome:
     level: list[float]
     missed: list[bool]
     cut: list[int]
+    powers: list[int]
+    first: list[float]
+    held: list[bool]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What the sampler finds by one budget, as in :class:`Outcome`."""
+
+    gain: float
+    expected_gain: float
+    level: float
+    missed: bool
+    cut: int
+    powers: int
+    first: float
+    held: bool
 
 
 def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int, first: int) -> Iterator[Outcome]:
@@ -70,9 +91,7 @@ def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int,
         ]
         rank, coarse, in_cell, touching = zip(*roots, strict=True)
         mass = np.exp(log_masses[-1]).sum(0)
-        found = [explore(maps[-1].index, query, mass, contacts, rng) for contacts in CONTACTS]
-        true = [float(each.log_density(touch.T_sensor_object[None])[0]) for each in found]
-        most = [float(each.particle_log_density.max()) for each in found]
+        found = [_found(maps[-1].index, query, mass, contacts, touch, rng) for contacts in CONTACTS]
         yield Outcome(
             touch.elastic,
             contact_class(localizers[-1].space, touch.T_sensor_object),
@@ -80,12 +99,34 @@ def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int,
             [float(each) for each in coarse],
             [float(each) for each in in_cell],
             [float(each) for each in touching],
-            [min(pair) for pair in zip(true, most, strict=True)],
-            [each.expected_gain for each in found],
-            [each.credible_level(at) for each, at in zip(found, true, strict=True)],
-            [at > top for at, top in zip(true, most, strict=True)],
-            [each.contacts for each in found],
+            **{name: [getattr(each, name) for each in found] for name in _Found.__dataclass_fields__},
         )
+
+
+def _found(
+    index: Index, query: ContactQuery, mass: Array, contacts: int, touch: Touch, rng: np.random.Generator
+) -> _Found:
+    T = touch.T_sensor_object[None]
+    try:
+        explored = explore_twice(index, query, mass, contacts, rng)
+    except InputError:
+        density = np.log(mass / index.weight.sum(0, dtype=float))
+        at = float(density[located(index, T)[0].place[0]])
+        level = float(mass[density > at].sum())
+        return _Found(at, float(mass @ density), level, False, (1 + MORE) * contacts, 1, 0.0, False)
+    at, most = float(explored.log_density(T)[0]), float(explored.particle_log_density.max())
+    first = explored.poses[explored.hearts[0]]
+    held = bool(PoseDistance(index.mesh).within(first, T, mode_radius(index.mesh))[0])
+    return _Found(
+        min(at, most),
+        explored.expected_gain,
+        explored.credible_level(at),
+        at > most,
+        explored.contacts,
+        len(explored.particles),
+        float(explored.masses[0]),
+        held,
+    )
 
 
 def _root(
@@ -173,7 +214,7 @@ def _sampled(column: dict[str, Any], some: Any) -> list[dict[str, Any]]:
     out = []
     for k in range(len(CONTACTS)):
         gain, expected, level = (column[name][some, k] for name in ("gain", "expected_gain", "level"))
-        off = expected - gain
+        off, sure = expected - gain, column["first"][some, k] > 0.5
         out.append(
             {
                 "contacts": float(column["cut"][some, k].mean()),
@@ -182,6 +223,11 @@ def _sampled(column: dict[str, Any], some: Any) -> list[dict[str, Any]]:
                 "expected_gain": float(expected.mean()),
                 "expected_less_gain": [float(off.mean()), float(1.96 * off.std() / np.sqrt(len(off)))],
                 "coverage": [float((level <= q).mean()) for q in LEVELS],
+                "settled": float((column["powers"][some, k] == len(POWERS)).mean()),
+                "of_cells": float((column["powers"][some, k] == 1).mean()),
+                "first": float(column["first"][some, k].mean()),
+                "held": float(column["held"][some, k].mean()),
+                "sure": [int(each.sum()) for each in (sure, sure & column["held"][some, k])],
             }
         )
     return out
