@@ -43,6 +43,7 @@ def normal_modes(request, make_localizer):
         weight=np.full(len(poses), 1 / len(poses)),
         particle_log_density=log_normal(poses),
         log_measure=0.0,
+        contacts=0,
         target=SimpleNamespace(at=lambda T: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T)))),
         log_density_of=lambda particles: log_normal(particles.T),
     )

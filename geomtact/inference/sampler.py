@@ -252,7 +252,7 @@ def _nudged(target: Target, T: Array, size: float, rng: np.random.Generator) -> 
         rotvec[:, :2] = 0
     turn = Rotation.from_rotvec(rotvec).as_matrix()
     shift = scale * _WIDTH * sample_pitch(target.index.sensor) * rng.normal(size=(n, 3))
-    about = np.array([*target.query.centroid, 0.0])
+    about = target.query.centroid
     where = np.einsum("nij,nj->ni", turn, T[:, :3, 3] - about) + about + shift
     return transform(turn @ T[:, :3, :3], where)
 
@@ -303,7 +303,7 @@ def _aligned(target: Target, poses: Placements, step: float) -> tuple[Array, int
         found = maps.compare(query.samples, query.area, some)
         cut += len(near)
         touches = np.isfinite(found.reach)[:, None]
-        centre[near] += np.where(touches, query.centroid - found.centroid, np.nan)
+        centre[near] += np.where(touches, query.centroid[:2] - found.centroid, np.nan)
         reach[near] = found.reach
         off = np.abs(centre - poses.centre).max(1)
         inside = off <= 0.5 * step + 2 * _WIDTH * sample_pitch(target.index.sensor)

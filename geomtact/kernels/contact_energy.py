@@ -43,7 +43,7 @@ class Samples(NamedTuple):
     ----------
     rows, columns : of blocks, B together
     block : (B, 2) centre of each block on the membrane [m]
-    within : (BLOCK^2, 2) each sample from its block's centre [m], row by row
+    within : (B, S, 2) each of its S samples from there [m], row by row
     sag : (B, S) by how much the membrane lies below its apex there [m]
     weight : (B, S) energy of a sample in contact less that of one that is not
     least : [m^3] sum of the negative weights, which the observed contact itself would have
@@ -134,7 +134,7 @@ def _contact_energy(  # type: ignore[no-untyped-def]
     centroid,
 ):
     """The loop of :func:`contact_energy`, which writes ``energy``, ``found`` and ``centroid``."""
-    n, blocks, samples = len(direction), len(block), len(within)
+    n, blocks, samples = len(direction), len(block), within.shape[1]
     size = heights.shape[1]
     half = np.float32(size // 2 + 0.5)
     one, nothing, empty = np.float32(1), np.float32(-1e3), np.float32(_NOTHING)
@@ -145,7 +145,7 @@ def _contact_energy(  # type: ignore[no-untyped-def]
     sums = np.empty((SHARES, 3), np.float32)
     deep, wide_deep = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
     # how much higher than at its centre a tilted block may be
-    beside = max(np.abs(within[:, 0]).max(), np.abs(within[:, 1]).max()) + np.float32(0.5) / per_pixel
+    beside = max(np.abs(within[:, :, 0]).max(), np.abs(within[:, :, 1]).max()) + np.float32(0.5) / per_pixel
     for i in range(n):
         height, wide, r = heights[direction[i]], widest[direction[i]], tilt[i]
         tx, ty, lean_x, lean_y, up = r[0, 2], r[1, 2], r[2, 0], r[2, 1], r[2, 2]
@@ -181,7 +181,7 @@ def _contact_energy(  # type: ignore[no-untyped-def]
                     cut[k] = 1
                     x, y = block[k, 0] - off_x, block[k, 1] - off_y
                     for j in range(samples):
-                        xj, yj = x + within[j, 0], y + within[j, 1]
+                        xj, yj = x + within[k, j, 0], y + within[k, j, 1]
                         u, v = a * xj + b * yj, c * xj + d * yj
                         column, row = int(u * per_pixel + half), int(v * per_pixel + half)
                         h = nothing
@@ -217,8 +217,8 @@ def _contact_energy(  # type: ignore[no-untyped-def]
                     e = int(np.sqrt(max(one - pressed / about, np.float32(0))) * SHARES)
                     energy[i, e] += weight[k, j]
                     sums[e, 0] += one
-                    sums[e, 1] += block[k, 0] + within[j, 0]
-                    sums[e, 2] += block[k, 1] + within[j, 1]
+                    sums[e, 1] += block[k, 0] + within[k, j, 0]
+                    sums[e, 2] += block[k, 1] + within[k, j, 1]
         energy[i, 0] -= least
         count, sum_x, sum_y = sums[0]
         for e in range(1, SHARES):

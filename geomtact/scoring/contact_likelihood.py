@@ -60,7 +60,7 @@ class ContactQuery:
     ----------
     touched : (H, W) bool, the contact without specks
     samples : where and how contacts are compared
-    centroid : (2,) of the contact [m]
+    centroid : (3,) of the contact, on the membrane [m]
     area : of the contact, in samples
     log_outline : log of the length of its outline over ``OUTLINE``
     """
@@ -80,9 +80,8 @@ class ContactQuery:
     def showing(cls, touched: NDArray[np.bool_], sensor: Sensor) -> ContactQuery:
         """From the contact ``touched`` (H, W) without specks."""
         pitch = float(np.sqrt(sensor.pixel_area(touched.shape)))
-        x, y = sensor.pixel_centres(touched.shape)
         count = touched.sum()
-        centroid = np.array([touched.sum(0) @ x, touched.sum(1) @ y]) / count
+        centroid = sensor.lift(np.stack(np.meshgrid(*sensor.pixel_centres(touched.shape)), -1)[touched]).mean(0)
         area = count * pitch**2 / sensor.pixel_area(sensor.along(SHAPE))
         # a straight line at any angle crosses 4 / pi times as many pairs of neighbours as its length has pixels
         crossed = (touched[:, 1:] != touched[:, :-1]).sum() + (touched[1:] != touched[:-1]).sum()
@@ -125,16 +124,15 @@ def _samples(touched: NDArray[np.bool_], pitch: float, sensor: Sensor) -> Sample
     beside = np.clip(from_outline(touched, pitch), -_LIMIT, _LIMIT)
     weight = cv2.resize(beside, shape[::-1], interpolation=cv2.INTER_AREA) * sensor.pixel_area(shape)
     blocks = (shape[0] // BLOCK, shape[1] // BLOCK)
-    x, y = sensor.pixel_centres(shape)
-    X, Y = sensor.pixel_centres(blocks)
-    middle = np.stack(np.meshgrid(X, Y), -1).reshape(-1, 2)
-    within = np.stack(np.meshgrid(x[:BLOCK] - X[0], y[:BLOCK] - Y[0]), -1).reshape(-1, 2)
-    sag = sensor.sag(*np.meshgrid(x, y))
+    points = sensor.lift(np.stack(np.meshgrid(*sensor.pixel_centres(shape)), -1))
 
     def blockwise(image: NDArray[np.floating]) -> NDArray[np.float32]:
         parts = image.reshape(blocks[0], BLOCK, blocks[1], BLOCK).swapaxes(1, 2)
         return np.ascontiguousarray(parts.reshape(-1, BLOCK**2), np.float32)
 
+    x, y, z = (blockwise(points[..., k]) for k in range(3))
     weight = blockwise(weight)
     least = float(np.minimum(weight, 0).sum())
-    return Samples(*blocks, middle.astype(np.float32), within.astype(np.float32), blockwise(sag), weight, least)
+    block = np.stack([x.mean(1), y.mean(1)], -1)
+    within = np.stack([x, y], -1) - block[:, None]
+    return Samples(*blocks, block, np.ascontiguousarray(within), -z, weight, least)

@@ -55,6 +55,7 @@ class Example:
     at_truth : (K,) log density at the true pose by each of ``POWERS``
     at_particles : (n, K) at the particles of all powers
     sizes : (K,) how many particles each has
+    log_evidence : (K,) of each
     log_outline : log of the outline's length over ``OUTLINE``
     elastic : whether the gel was
     """
@@ -62,6 +63,7 @@ class Example:
     at_truth: Array
     at_particles: Array
     sizes: Array
+    log_evidence: Array
     log_outline: float
     elastic: bool
 
@@ -109,13 +111,13 @@ def _example(explored: Explored, touch: Touch) -> Example:
         return np.stack([log_target(log_likelihood, log_coarse, power) for power in POWERS], 1) - evidence
 
     sizes = np.array([len(p) for p in explored.particles])
-    return Example(by_power(at, coarse)[0], by_power(*each), sizes, query.log_outline, touch.elastic)
+    return Example(by_power(at, coarse)[0], by_power(*each), sizes, evidence, query.log_outline, touch.elastic)
 
 
 def _save(path: Path, examples: Sequence[Example]) -> None:
     n = max(len(e.at_particles) for e in examples)
     padded = [np.pad(e.at_particles, ((0, n - len(e.at_particles)), (0, 0))) for e in examples]
-    columns = {name: np.stack([getattr(e, name) for e in examples]) for name in ("at_truth", "sizes")}
+    columns = {name: np.stack([getattr(e, name) for e in examples]) for name in ("at_truth", "sizes", "log_evidence")}
     single = {name: np.array([getattr(e, name) for e in examples]) for name in ("log_outline", "elastic")}
     with open(path, "wb") as file:
         np.savez(file, allow_pickle=False, at_particles=np.stack(padded).astype(np.float32), **columns, **single)
@@ -124,7 +126,7 @@ def _save(path: Path, examples: Sequence[Example]) -> None:
 def _load(path: Path) -> list[Example]:
     with np.load(path, allow_pickle=False) as data:
         rows = zip(*(data[name] for name in Example.__dataclass_fields__), strict=True)
-        return [Example(t, p[: s.sum()].astype(float), s, float(o), bool(e)) for t, p, s, o, e in rows]
+        return [Example(t, p[: s.sum()].astype(float), s, v, float(o), bool(e)) for t, p, s, v, o, e in rows]
 
 
 @dataclass(frozen=True)
