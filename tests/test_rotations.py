@@ -488,3 +488,8 @@ def test_motions_are_all_but_the_symmetries(symmetry):
     if sym.axis is not None:
         np.testing.assert_allclose(turns[:, :3] @ sym.axis, 0, atol=1e-12)
         np.testing.assert_allclose(np.cross(turns[:, :3], CENTRE) + turns[:, 3:], 0, atol=1e-12)
+
+
+def test_the_density_is_finite_on_exact_faces(rng):
+    directions = Directions.make(SYMMETRIES["nut"], [((0, 0, 1), 0.0)])
+    assert np.isfinite(directions.density(transform(random_rotations(5, rng), np.zeros(3)))).all()

@@ -232,9 +232,9 @@ class Directions:
 
     def density(self, T: ArrayLike) -> Array:
         """Density (n,) of the uniform distribution of allowed rotations at poses ``T`` (n, 4, 4), modulo the symmetry, per rad of
-        each direction that changes how the object is turned."""
+        each direction that changes how the object is turned; on exact faces it is as of all rotations."""
         T, cones = np.asarray(T, float), self.cones
-        if cones is None or self.symmetry.kind == "sphere":
+        if cones is None or cones[0][1] == 0 or self.symmetry.kind == "sphere":
             return np.full(len(T), self.symmetry.density)
         images = self.symmetry.sampled(360)[:, :3, :3]
         share = allowed(-np.einsum("nj,kji->nki", T[:, 2, :3], images), cones).mean(1)
