@@ -39,14 +39,9 @@ from geomtact.sensing.sensor import Sensor
 RATE = 34.1e9  # nats for each m^3 of energy
 SHARE = (5.9, 11.1)  # of the beta distribution of an elastic contact's share of the depth
 POWERS = (0.0, 0.03, 0.1, 0.3, 1.0)  # of the likelihood, by the posteriors that are mixed; hand-set
-INTERCEPT = (
-    -3.73,
-    -1.22,
-    -0.10,
-    0.36,
-    0.0,
-)  # their weights are the softmax of intercept + slope log(outline / OUTLINE)
-SLOPE = (0.59, -0.04, 1.25, -0.10, 0.0)
+# Their weights are the softmax of intercept + slope log(outline / OUTLINE).
+INTERCEPT = (-1.97, 0.07, 0.41, 0.60, 0.0)
+SLOPE = (0.69, 1.27, 0.82, 0.41, 0.0)
 OUTLINE = 15e-3  # m, the length of a usual outline
 RIGID = 0.5  # share of touches on a rigid gel
 _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more is added
