@@ -19,7 +19,13 @@ from geomtact.inference.preparation import PreparedObject, prepare_each
 from geomtact.inference.prior import opened, reference_of
 from geomtact.inference.repeated_images import counted_once
 from geomtact.inference.sequence import track
-from geomtact.inference.single_touch import drop_lost_contact_prior, explore_touch, refine_modes, touch_posterior
+from geomtact.inference.single_touch import (
+    drop_lost_contact_prior,
+    explore_touch,
+    is_explored,
+    refine_modes,
+    touch_posterior,
+)
 from geomtact.inference.views import read_views
 from geomtact.planning.next_touch import Action, next_touch
 from geomtact.progress import Progress
@@ -100,12 +106,16 @@ class Localizer(PreparedObject):
         views = read_views(image, T_world_sensor, self.sensors, kind, background)
         prior = opened(prior, self.cache_dir)
         each = self.by_sensor if self.others else [self] * len(views)
+        # what is explored needs no more of the cells than where the mass is
+        alone = len(views) == 1 and is_explored(self.index, views[0].observation, resolved)
+        cells = "cells" if alone and resolved.resolved == "all" else resolved.resolved
         touches = [
             touch_posterior(
                 one.index,
                 one.scorer,
                 view,
                 prior if len(views) == 1 else None,
+                cells,
                 Provenance(effort, one.scorer.name, one.max_poses),
                 seed,
             )

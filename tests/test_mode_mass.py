@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from speed import slow_but
 
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference import mode_mass
@@ -14,7 +15,7 @@ MASS = np.array([0.3, 0.6, 0.05])
 COUNT = np.array([500, 40, 90])  # particles: not as the masses are
 
 
-@pytest.fixture(scope="module", params=["bracket", "hex_nut", "damping_pin"])
+@pytest.fixture(scope="module", params=slow_but(["bracket", "hex_nut", "damping_pin"], "bracket"))
 def normal_modes(request, make_localizer):
     """Three places with normal densities, of which particles were drawn in other numbers, and half as wide."""
     index, rng = make_localizer(request.param, "gelslim", max_poses=20_000).index, np.random.default_rng(0)

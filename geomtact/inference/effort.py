@@ -19,10 +19,11 @@ class Effort:
         cells, their pixels counted too
     modes : that are refined
     thorough : whether each is refined by all registrations or by one
-    outlines : whether, of one mask, the outline refines the modes where few enough cells are left (see
-        ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by FilterReg
+    outlines : whether, of one mask that is not resolved by contacts, the outline refines the modes where few enough cells are
+        left (see ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by
+        FilterReg
     contacts : that are cut, of one mask that is not of a known face, to resolve the pose within the cells (see
-        ``inference.sampler``)
+        ``inference.sampler``); all cells are not scored then
     """
 
     resolved: str
@@ -45,7 +46,7 @@ class Effort:
 EFFORTS = {
     "fast": Effort("coarse", 0),
     "balanced": Effort("cells", 5, thorough=False),
-    "exact": Effort("all", 25, outlines=True),
+    "exact": Effort("all", 25, outlines=True, contacts=100_000),
 }
 
 

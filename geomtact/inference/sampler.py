@@ -70,6 +70,7 @@ def explore_twice(
         No pose that was drawn touches the sensor, or the runs agree on nothing.
     """
     cut, all_powers = 0, len(POWERS)
+    ContactMaps.of(index)  # made or read here, before both runs ask for them
     for more in (1, MORE):
         with ThreadPoolExecutor(2) as pool:
             runs = [

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
-from geomtact.inference.effort import Effort, effort_of
+from geomtact.inference.effort import Effort
 from geomtact.inference.facts import Diagnostics, Provenance, ViewRecord
 from geomtact.inference.joint_refinement import refine_jointly
 from geomtact.inference.mode_refiner import ModeRefiner
@@ -27,6 +27,7 @@ from geomtact.inference.views import Placed
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.scoring.fitted import FittedScorer
 from geomtact.sensing.contact import Contact, SoftMask
+from geomtact.sensing.reading import Observation
 
 LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
 
@@ -37,7 +38,7 @@ _CONTRADICTION_NATS = 5.0
 
 
 def touch_posterior(
-    index: Index, scorer: FittedScorer, placed: Placed, prior: Any, provenance: Provenance, seed: int
+    index: Index, scorer: FittedScorer, placed: Placed, prior: Any, resolved: str, provenance: Provenance, seed: int
 ) -> tuple[Posterior, LogMass]:
     """The posterior of one image on the cells of ``index``, not refined, and the log prior mass of every cell (M,).
 
@@ -46,7 +47,7 @@ def touch_posterior(
     Parameters
     ----------
     prior : as of ``Localizer.localize``, opened
-    provenance : its effort says which cells are scored
+    resolved : which cells are scored, as ``Effort.resolved``
     """
     observation, T_frame_sensor, frame = placed.observation, placed.T_frame_sensor, placed.frame
     contact, warnings = observation.contact, [*index.mesh.warnings, *observation.warnings]
@@ -67,7 +68,6 @@ def touch_posterior(
     if not posterior.contact:
         return replace(posterior, off_contact_log_density=prior_log_density(index, prior, frame)), None
     timing, log_prior = posterior.timing_ms, None
-    resolved = effort_of(provenance.effort).resolved
     with timed(timing, "score"):
         if prior is not None:
             log_prior = prior_log_mass(index, prior, T_frame_sensor, frame)
@@ -105,16 +105,19 @@ def touch_posterior(
     return posterior, log_prior
 
 
+def is_explored(index: Index, observation: Observation, effort: Effort) -> bool:
+    """Whether the posterior of this image alone is resolved within the cells: of a mask, and not on known faces. There an elastic
+    gel's contacts err too much for single poses, and outlines are compared with those of solved gels instead."""
+    return effort.contacts > 0 and observation.contact.height is None and not index.space.on_known_faces
+
+
 def explore_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer, effort: Effort) -> Posterior:
     """The ``posterior`` of one mask, resolved within the cells by the contacts of ``effort``.
 
-    It is as it was for none, for depth maps, and on known faces: there an elastic gel's contacts err too much for single poses,
-    and outlines are compared with those of solved gels instead. ``log_prior`` is as of :func:`touch_posterior`.
+    It is as it was where :func:`is_explored` says no. ``log_prior`` is as of :func:`touch_posterior`.
     """
     observation, index = posterior.observation, posterior.index
-    if not effort.contacts or not posterior.contact or observation is None or observation.contact.height is not None:
-        return posterior
-    if index.space.on_known_faces:
+    if observation is None or not posterior.contact or not is_explored(index, observation, effort):
         return posterior
     with timed(posterior.timing_ms, "explore"):
         mask = observation.contact.soft_mask
