@@ -258,7 +258,7 @@ class Index:
     def uniform_density(self, T: ArrayLike) -> Array:
         """Density (n,) of :attr:`cell_measure` at ``T`` (n, 4, 4), per rad and metre of each of ``symmetry.motions``."""
         volume = self.resolution.step**2 * self.sensor.max_penetration
-        return self.directions.density(T) * self._of_lattice_cell / volume
+        return self.directions.density(np.asarray(T, float)[:, :3, :3]) * self._of_lattice_cell / volume
 
     @cached_property
     def _of_lattice_cell(self) -> float:

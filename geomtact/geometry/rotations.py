@@ -230,14 +230,14 @@ class Directions:
             new = at_polar(new @ self.symmetry.axis, a[: len(new)], self.symmetry.axis)
         return np.concatenate([new, a[len(new) :]])
 
-    def density(self, T: ArrayLike) -> Array:
-        """Density (n,) of the uniform distribution of allowed rotations at poses ``T`` (n, 4, 4), modulo the symmetry, per rad of
+    def density(self, R: ArrayLike) -> Array:
+        """Density (n,) of the uniform distribution of allowed rotations at ``R`` (n, 3, 3), modulo the symmetry, per rad of
         each direction that changes how the object is turned; on exact faces it is as of all rotations."""
-        T, cones = np.asarray(T, float), self.cones
+        R, cones = np.asarray(R, float), self.cones
         if cones is None or cones[0][1] == 0 or self.symmetry.kind == "sphere":
-            return np.full(len(T), self.symmetry.density)
-        images = self.symmetry.sampled(360)[:, :3, :3]
-        share = allowed(-np.einsum("nj,kji->nki", T[:, 2, :3], images), cones).mean(1)
+            return np.full(len(R), self.symmetry.density)
+        images = self.symmetry.sampled(1440)[:, :3, :3]
+        share = allowed(-np.einsum("nj,kji->nki", R[:, 2], images), cones).mean(1)
         # of the sphere; what lies in m cones is counted m times
         of_each = [sunflower(v, half, 2000) for v, half in cones]
         once = [np.mean(1 / sum(allowed(a, [cone]).astype(int) for cone in cones)) for a in of_each]

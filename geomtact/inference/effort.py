@@ -46,7 +46,7 @@ class Effort:
 EFFORTS = {
     "fast": Effort("coarse", 0),
     "balanced": Effort("cells", 5, thorough=False),
-    "exact": Effort("all", 25, outlines=True, contacts=100_000),
+    "exact": Effort("all", 25, outlines=True, contacts=30_000),
 }
 
 

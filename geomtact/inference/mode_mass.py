@@ -15,6 +15,7 @@ from scipy.special import gammaln, logsumexp
 
 from geomtact.contact_space.contact_maps import sample_pitch
 from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.explored import Explored
 from geomtact.se3 import Array, exp, inverse, log
 
@@ -48,18 +49,42 @@ def weighed(explored: Explored, rng: np.random.Generator) -> tuple[Explored, flo
         motions = np.stack([mode.students[-1].draw(_DRAWS, rng) for mode in modes])
         T = np.stack([mode.heart @ exp(each @ basis) for mode, each in zip(modes, motions, strict=True)])
         near = np.stack([distance.within(mode.heart, each, radius) for mode, each in zip(modes, T, strict=True)])
+        turn = np.linalg.norm(motions @ basis[:, :3], axis=-1)
+        # beyond these turns a placement is met again
+        near &= (turn < np.pi) & np.stack(
+            [_is_nearest(distance, mode.heart, each) for mode, each in zip(modes, T, strict=True)]
+        )
         found = np.full(near.shape, -np.inf)
         particles = explored.target.at(T[near])
         density = explored.log_density_of(particles) + np.log(explored.index.uniform_density(T[near]))
+        density += _log_volume(turn[near], explored.index.directions.symmetry)
         found[near] = np.where(np.isfinite(particles.log_likelihood), density, -np.inf)
         for mode, each, log_density in zip(modes, motions, found, strict=True):
             mode.add(each, log_density)
     log_mass = np.array([mode.log_integral + explored.log_measure for mode in modes])
-    log_sum = float(logsumexp(log_mass))
-    mass = _shared_out(explored, members, np.exp(log_mass - max(log_sum, 0)))
+    most = max(float(log_mass.max()), 0.0)
+    mass = _shared_out(explored, members, np.exp(log_mass - most))
+    log_sum = most + float(np.log(max(mass.sum(), 1e-300)))
+    mass *= np.exp(most - max(log_sum, 0.0))
     order = np.argsort(-mass, kind="stable")
     contacts = explored.contacts + _ROUNDS * _DRAWS * len(modes)
     return replace(explored, hearts=hearts[order], masses=mass[order], contacts=contacts), log_sum
+
+
+def _is_nearest(distance: PoseDistance, heart: Array, T: Array) -> NDArray[np.bool_]:
+    """Whether each of ``T`` (n, 4, 4) is the nearest to ``heart`` of its images under the symmetry; turns about an axis are not
+    looked at, because no motion makes them."""
+    symmetry = distance.mesh.symmetry
+    if symmetry is None or symmetry.kind != "discrete":
+        return np.ones(len(T), bool)
+    return np.asarray(np.abs(distance.aligned(heart, T) - T).max((1, 2)) < 1e-9)
+
+
+def _log_volume(turn: Array, symmetry: Symmetry) -> Array:
+    """Log (n,) of the uniform measure of a small volume of motions that turn by ``turn`` (n,) [rad], over that at no turn."""
+    half = np.sinc(turn / (2 * np.pi)) ** 2  # of the shifts, and of turns about three axes
+    of_turns = np.sinc(turn / np.pi) if symmetry.axis is not None else half
+    return np.asarray(np.log(np.maximum(half * of_turns, 1e-300)))
 
 
 def _grown(

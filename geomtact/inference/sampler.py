@@ -229,7 +229,8 @@ def _moved(
         now = particles.take(some)
         poses, membrane = located(target.index, moved)
         new = target.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane)
-        gain = new.log_target(power) - now.log_target(power) + _log_images(target, moved) - _log_images(target, T[some])
+        images = _log_images(target, poses.rotation) - _log_images(target, now.poses.rotation)
+        gain = new.log_target(power) - now.log_target(power) + images
         taken = np.flatnonzero(np.log(rng.random(len(some))) < gain)
         new = new.take(taken)
         allowed = target.admits(new)  # of those alone, because it takes as long as a contact
@@ -238,10 +239,10 @@ def _moved(
     return particles, float(accepted[small].mean()) if small.any() else _ACCEPTED
 
 
-def _log_images(target: Target, T: Array) -> Array:
-    """Log (n,) of how many images of ``T`` (n, 4, 4) the approach allows, up to a constant: a placement with more of them has
+def _log_images(target: Target, R: Array) -> Array:
+    """Log (n,) of how many images of ``R`` (n, 3, 3) the approach allows, up to a constant: a placement with more of them has
     the larger measure."""
-    return np.asarray(np.log(np.maximum(target.index.directions.density(T), 1e-300)))
+    return np.asarray(np.log(np.maximum(target.index.directions.density(R), 1e-300)))
 
 
 def _nudged(target: Target, T: Array, size: float, rng: np.random.Generator) -> Array:
