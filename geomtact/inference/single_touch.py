@@ -135,7 +135,7 @@ def explore_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer
     if len(explored.particles) < len(POWERS):
         warnings.append(
             f"the pose is resolved less finely than the contact allows: {explored.contacts:,} contacts do not settle how likely "
-            "it is; allow more"
+            "it is; Effort(contacts=) allows more"
         )
     return replace(posterior, explored=explored, warnings=warnings)
 
