@@ -236,13 +236,22 @@ class Directions:
         R, cones = np.asarray(R, float), self.cones
         if cones is None or cones[0][1] == 0 or self.symmetry.kind == "sphere":
             return np.full(len(R), self.symmetry.density)
-        images = self.symmetry.sampled(1440)[:, :3, :3]
-        share = allowed(-np.einsum("nj,kji->nki", R[:, 2], images), cones).mean(1)
-        # of the sphere; what lies in m cones is counted m times
-        of_each = [sunflower(v, half, 2000) for v, half in cones]
-        once = [np.mean(1 / sum(allowed(a, [cone]).astype(int) for cone in cones)) for a in of_each]
-        sphere = sum(np.sin(half / 2) ** 2 * share for (_, half), share in zip(cones, once, strict=True))
-        return np.asarray(self.symmetry.density * share / sphere)
+        share = allowed(-np.einsum("nj,kji->nki", R[:, 2], self._images), cones).mean(1)
+        return np.asarray(self.symmetry.density * share / self._allowed_share)
+
+    @cached_property
+    def _images(self) -> Array:
+        """The symmetry's rotations (k, 3, 3), of a continuous one so many that their share in a cone is known."""
+        return self.symmetry.sampled(1440)[:, :3, :3]
+
+    @cached_property
+    def _allowed_share(self) -> float:
+        """Share of the sphere that the cones cover, each place once."""
+        total, cones = 0.0, self.cones or []
+        for v, half in cones:
+            held_by = sum(allowed(sunflower(v, half, 2000), [cone]).astype(int) for cone in cones)
+            total += float(np.sin(half / 2) ** 2 * np.mean(1 / held_by))
+        return total
 
     def any_image(self, T: ArrayLike, rng: np.random.Generator) -> Array:
         """``T`` (n, 4, 4) replaced by its images under the object's symmetry, drawn uniformly among those allowed."""

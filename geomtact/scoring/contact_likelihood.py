@@ -11,8 +11,8 @@ several features press. Neither the gel nor the share is known, so both are marg
 
 How far a contact is from any simulated one is not known either: by the noise alone, or by a gel that differs from the model. So
 the posterior is a mixture of posteriors, each by a power of the likelihood: 0 gives the coarse one, 1 that of the whole
-likelihood. Errors are correlated along an outline, so a long one tells less than its length says: the weights depend on it. They
-are fitted like all else by the log score ("covariate-dependent stacking", Yao et al. 2022).
+likelihood. Errors are correlated along an outline, so information grows more slowly than its length: the weights depend on it.
+They are fitted like all else by the log score ("covariate-dependent stacking", Yao et al. 2022).
 """
 
 from __future__ import annotations

@@ -29,12 +29,9 @@ from geomtact.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, RATE, RIGID, SHARE, ContactQuery, share_cells
 from geomtact.se3 import Array
-from geomtact.sensing.sensor import Sensor
 from geomtact.versions import versions
-from tools.training.examples import resumed
-from tools.training.procedural import random_object
+from tools.training.examples import SENSORS, drawn_object, resumed
 
-SENSORS = ("gelslim", "gelsight-mini", "gelslim", "digit")  # one after the other
 SIZES = (0.5, 3.5)  # longest side of an object, in long sides of the window
 MAX_POSES = 400_000  # of the grid
 CONTACTS = 60_000  # of the sampler
@@ -100,11 +97,8 @@ def make_examples(
 
 def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
     rng = np.random.default_rng([seed, i])
-    sensor = Sensor.load(SENSORS[i % len(SENSORS)])
-    size = 2 * sensor.half_window.max() * np.exp(rng.uniform(*np.log(SIZES)))
-    localizer = Localizer.prepare(
-        random_object(int(rng.integers(1 << 31)), float(size)), sensor=sensor, max_poses=MAX_POSES
-    )
+    sensor, mesh = drawn_object(i, SIZES, rng)
+    localizer = Localizer.prepare(mesh, sensor=sensor, max_poses=MAX_POSES)
     maps = ContactMaps.of(localizer.index)
     for touch in random_touches(localizer.space, touches, int(rng.integers(1 << 31))):
         yield _example(localizer, maps, touch, rng)

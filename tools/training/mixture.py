@@ -29,12 +29,9 @@ from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.scoring.outline import from_outline
 from geomtact.se3 import Array
 from geomtact.sensing.noise import CLEAN
-from geomtact.sensing.sensor import Sensor
 from geomtact.versions import versions
-from tools.training.examples import resumed
-from tools.training.procedural import random_object
+from tools.training.examples import SENSORS, drawn_object, resumed
 
-SENSORS = ("gelslim", "gelsight-mini", "gelslim", "digit")  # one after the other
 SIZES = (0.5, 5.0)  # longest side of an object, in long sides of the window
 FACES = 3  # every so manieth object is touched on a known face
 MAX_POSES = 400_000  # of the grid
@@ -79,9 +76,7 @@ def make_examples(
 
 def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
     rng = np.random.default_rng([seed, i])
-    sensor = Sensor.load(SENSORS[i % len(SENSORS)])
-    size = 2 * sensor.half_window.max() * np.exp(rng.uniform(*np.log(SIZES)))
-    mesh = random_object(int(rng.integers(1 << 31)), float(size))
+    sensor, mesh = drawn_object(i, SIZES, rng)
     face = [(np.eye(3)[rng.integers(3)] * rng.choice([-1, 1]), 0.0)] if i % FACES == FACES - 1 else None
     localizer = Localizer.prepare(mesh, sensor=sensor, approach=face, max_poses=MAX_POSES)
     for touch in _touches(localizer, touches, rng):
