@@ -106,16 +106,14 @@ class Localizer(PreparedObject):
         views = read_views(image, T_world_sensor, self.sensors, kind, background)
         prior = opened(prior, self.cache_dir)
         each = self.by_sensor if self.others else [self] * len(views)
-        # what is explored needs no more of the cells than where the mass is
         alone = len(views) == 1 and is_explored(self.index, views[0].observation, resolved)
-        cells = "cells" if alone and resolved.resolved == "all" else resolved.resolved
         touches = [
             touch_posterior(
                 one.index,
                 one.scorer,
                 view,
                 prior if len(views) == 1 else None,
-                cells,
+                resolved.pixels and not alone,  # what is explored needs no more than where the mass is
                 Provenance(effort, one.scorer.name, one.max_poses),
                 seed,
             )

@@ -112,14 +112,14 @@ def test_a_score_is_calibrated_and_ranks_the_true_cell(score, fit, index, touche
     assert found.calibration.temperature > 0 and FLOORS[0] <= found.calibration.floor <= FLOORS[-1]
     above, log_density = [], []
     for mask, true in zip(touches.masks, touches.ids, strict=True):
-        rows = found.cells(index, mask, None, exact=False)
-        assert rows.first.shape == rows.score.shape == rows.log_prior.shape
+        rows = found.rows(index, mask)
+        assert rows.cells.shape == rows.score.shape == rows.log_prior.shape
         flat = found.scorer.score(index, mask).ravel()
         above.append(w[flat > flat[true]].sum())
         joint = rows.score / found.calibration.temperature + rows.log_prior
         likelihood = np.exp(joint - np.logaddexp.reduce(joint) - rows.log_prior)
         floor = found.calibration.floor
-        log_density.append(np.log((1 - floor) * likelihood[rows.first == true][0] + floor))
+        log_density.append(np.log((1 - floor) * likelihood[rows.cells == true][0] + floor))
     # no score costs anything, trusted as far as it is: twice the standard error of 40 touches is left
     assert np.mean(log_density) > -2 * np.std(log_density) / np.sqrt(len(log_density))
     assert np.median(above) < (0.4 if score in POOR else 0.2)

@@ -14,9 +14,10 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import sampler
 from geomtact.inference.effort import Effort
 from geomtact.inference.particles import prior_at
-from geomtact.scoring.contact_likelihood import ContactQuery
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.sensing.reading import read_observation
 
-EFFORT = Effort("cells", 3, contacts=6000)
+EFFORT = Effort(3, contacts=6000)
 
 
 @pytest.fixture(scope="module")
@@ -81,10 +82,10 @@ def test_powers_on_which_runs_disagree_are_left_out(localizer, touch, monkeypatc
         )
 
     monkeypatch.setattr(sampler, "explore", apart)
-    found = localizer.localize(touch.mask, "mask", effort=EFFORT)
+    found = localizer.localize(touch.mask, "mask", effort=replace(EFFORT, contacts=24_000))
     assert len(seen) == 4 and len(found.explored.particles) == 3
     assert found.explored.contacts > sum(each.contacts for each in seen)  # of modes too
-    assert "do not settle how likely it is" in found.warnings[-1]
+    assert found.diagnostics.settled_power == POWERS[2] and not found.warnings
 
 
 def test_its_particles_and_its_cells_have_all_mass(posterior):
@@ -130,7 +131,7 @@ def test_registration_moves_a_mode_within_its_radius(posterior):
 
 
 def test_modes_that_hold_more_than_everything_are_not_believed(localizer, touch, monkeypatch):
-    monkeypatch.setattr(sampler, "weighed", lambda found, rng: (found, 5.0))
+    monkeypatch.setattr(sampler, "weighed", lambda found, contacts, rng: (found, 5.0))
     found = localizer.localize(touch.mask, "mask", effort=EFFORT)
     assert found.explored is None and "do not settle how likely" in found.warnings[-1]
 
@@ -182,8 +183,18 @@ def test_the_same_seed_gives_the_same(localizer, touch, posterior):
 def test_it_serves_as_a_prior(localizer, touch, posterior):
     """As its cells do."""
     cells = replace(posterior, explored=None, refined={})
-    one, other = (localizer.localize(touch.mask, "mask", effort="fast", prior=each) for each in (posterior, cells))
+    one, other = (localizer.localize(touch.mask, "mask", effort=Effort(0), prior=each) for each in (posterior, cells))
     np.testing.assert_allclose(one.log_prob, other.log_prob, atol=1e-5)
+
+
+def test_a_contact_found_in_an_image_is_trusted_less(localizer, touch, posterior, tmp_path):
+    """Than the same one given as a mask; also when it comes back from a file."""
+    read = read_observation(touch.mask, localizer.sensor, "mask")
+    found = localizer.localize(replace(read, kind="reading", method="network"), effort=EFFORT)
+    assert found.explored.target.query.source == "image" and posterior.explored.target.query.source == "mask"
+    assert found.information_gain_nats < posterior.information_gain_nats
+    found.save(tmp_path / "posterior.npz")
+    np.testing.assert_array_equal(Posterior.load(tmp_path, localizer.cache_dir).log_prob, found.log_prob)
 
 
 def test_depth_maps_and_several_sensors_stay_on_the_cells(localizer, touch):

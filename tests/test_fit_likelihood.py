@@ -44,6 +44,7 @@ def test_the_package_holds_what_was_fitted():
     assert pytest.approx(RATE / 1e9, rel=5e-3) == fitted["rate"]
     assert pytest.approx(SHARE, rel=1e-2) == fitted["share"]
     mixture = json.loads((folder / "mixture.json").read_text("utf-8"))
-    assert pytest.approx(INTERCEPT, abs=6e-3) == mixture["intercept"]
-    assert pytest.approx(SLOPE, abs=6e-3) == mixture["slope"]
+    for source in INTERCEPT:
+        assert pytest.approx(INTERCEPT[source], abs=6e-3) == mixture[source]["intercept"]
+        assert pytest.approx(SLOPE[source], abs=6e-3) == mixture[source]["slope"]
     assert list(POWERS) == mixture["powers"] == fitted["powers"]

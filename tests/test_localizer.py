@@ -17,6 +17,7 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.densities import GaussianPrior
+from geomtact.inference.effort import Effort
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_mass
 from geomtact.registration.contact_problem import SINK
@@ -85,18 +86,16 @@ def test_the_same_seed_gives_the_same_result(localizer, a_touch):
         assert np.abs(a.T - b.T).max() < 1e-12  # sums of products may be taken in another order
         assert a.probability == pytest.approx(b.probability, abs=1e-12)
     third = localizer.localize(mask, seed=4)
-    assert (third.log_prob == one.log_prob).all() and third.credible_level(T) != one.credible_level(T)
+    assert (third.cell_log_prob == one.cell_log_prob).all() and third.credible_level(T) != one.credible_level(T)
 
 
 def test_efforts_differ_in_resolution_and_in_refinement(curved, a_touch):
     T, mask = a_touch(curved)
     fast, balanced, exact = (curved.localize(mask, effort=e) for e in ("fast", "balanced", "exact"))
-    held = curved.index.mass(*curved.index.coarse_runs) > 0  # some blocks are ruled out as a whole
-    assert len(fast.cells) == held.sum() < len(balanced.cells) == len(exact.cells)
-    assert exact.explored is not None and exact.information_gain_nats > balanced.information_gain_nats
+    assert np.array_equal(fast.cell_log_prob, balanced.cell_log_prob) and fast.explored is None
+    assert fast.information_gain_nats < balanced.information_gain_nats
+    assert balanced.explored.contacts <= exact.explored.contacts
     assert len(fast.refined) == 0 < len(balanced.refined) <= 5 <= len(exact.refined) <= 25
-    likelihood = [curved.mode_refiner.log_likelihood(mask, p.modes(1)[0].T[None])[0] for p in (fast, balanced)]
-    assert likelihood[1] >= likelihood[0] - 1e-9, "a refinement that does not raise the likelihood is dropped"
     with pytest.raises(UsageError, match="no effort named 'quick'"):
         curved.localize(mask, effort="quick")
 
@@ -105,7 +104,7 @@ def test_settings_and_times_are_recorded(plug, a_touch):
     posterior = plug.localize(a_touch(plug)[1], seed=9)
     assert posterior.settings["seed"] == posterior.seed == 9
     assert posterior.settings["poses"] == len(plug.index) and posterior.settings["kind"] == "mask"
-    assert set(posterior.timing_ms) == {"read", "score", "posterior", "refine"}
+    assert set(posterior.timing_ms) == {"read", "score", "posterior", "explore", "refine"}
     assert posterior.observation.contact.mask.any() and posterior.warnings == []
 
 
@@ -185,8 +184,8 @@ def test_a_prior_multiplies_the_likelihood(plug, a_touch, rng):
 def test_a_posterior_as_prior_is_used_as_it_is(localizer, a_touch):
     """The same image again: the likelihood counts twice."""
     mask = a_touch(localizer)[1]
-    once = localizer.localize(mask)
-    twice = localizer.localize(mask, effort="fast", prior=once)
+    once = localizer.localize(mask, effort=Effort(5))
+    twice = localizer.localize(mask, effort=Effort(0), prior=once)
     log_likelihood = localizer.scorer.scorer.score(localizer.index, mask) / localizer.scorer.calibration.temperature
     p = np.exp(once.log_prob)
     joint = p * np.exp((log_likelihood - log_likelihood.max()).ravel().astype(float)[once.cells])
@@ -349,9 +348,8 @@ def test_a_prior_in_the_world_frame_is_the_same_prior(plug, a_touch):
     assert np.isfinite(only.log_density(T_WORLD @ T_true)) and len(only.cells) == 1
 
 
-def test_a_posterior_of_another_touch_in_the_world_is_a_prior(make_localizer):
+def test_a_posterior_of_another_touch_in_the_world_is_a_prior(ball):
     """Two sensors' poses, one ball: the first touch is a prior for the second on where the ball is."""
-    ball = make_localizer("ball", "gelsight-mini", max_poses=4000, touches=60)
     ball_in_world = transform(np.eye(3), [0.2, 0.1, 0.3])
     first = ball_in_world @ np.linalg.inv(transform(np.eye(3), [2 * MM, 1 * MM, 5 * MM]))
     second = ball_in_world @ np.linalg.inv(transform(np.eye(3), [-3 * MM, 2 * MM, 5.3 * MM]))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.special import softmax
 
-from geomtact.scoring import fitted
 from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
 from geomtact.scoring.probability import Calibration, posterior_log_prob
 from geomtact.sensing.patches import patches
@@ -16,9 +15,7 @@ MM = 1e-3
 
 @pytest.fixture(scope="module")
 def localizer(make_localizer):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitted, "_LARGE", 0)  # so that its cells are scored in some blocks only, too
-        return make_localizer("bracket", "gelslim", scorer="encoder")
+    return make_localizer("bracket", "gelslim", scorer="encoder")
 
 
 def two_patches(localizer):
@@ -112,48 +109,7 @@ def fit(request, localizer, contact):
     nearest = [-fit.scorer.score(localizer.index, each).max() for each in (mask, *parts)]
     encoder = replace(fit.scorer, usual=request.param * min(nearest))
     assert len({encoder.trust(-each) for each in nearest}) == 3
-    return replace(
-        fit,
-        scorer=encoder,
-        cascade=replace(fit.cascade, coarse_scorer=replace(fit.cascade.coarse_scorer, cells=encoder)),
-    )
-
-
-def test_coarse_cells_are_scored_by_the_mixture(localizer, fit, contact):
-    index, cascade = localizer.index, fit.cascade
-    mask, parts, shares = contact
-    rows = fit.rows(index, mask, "coarse")
-    said, weight = density(rows)
-    held = np.exp(index.log_coarse_weight) > 0
-    scores = [cascade.coarse_scorer.score(index, each)[held] for each in (mask, *parts)]
-    assert said == pytest.approx(mixture(shares, scores, weight, cascade.coarse.temperature), rel=1e-3)
-
-
-def test_coarse_cells_are_opened_and_their_cells_scored_by_the_mixture(localizer, fit, contact):
-    """Those that stay whole count in it as blocks."""
-    index, cascade = localizer.index, fit.cascade
-    mask, parts, shares = contact
-    rows = fit.rows(index, mask, "cells")
-    said, weight = density(rows)
-    first, counts = index.coarse_runs
-    blocks = [cascade.coarse_scorer.score(index, each) for each in (mask, *parts)]
-    by_block = mixture(shares, blocks, np.exp(index.log_coarse_weight.astype(float)), cascade.coarse.temperature)
-    whole = np.isin(first, rows.first[rows.runs > 1])
-    opened = ~whole & (counts > 1) & (index.mass(first, counts) > 0)
-    assert 0 < whole.sum() < len(first) and opened.any()
-    # the blocks that were opened are those with the most mass
-    mass = by_block * np.exp(index.log_coarse_weight)
-    assert mass[whole].max() <= mass[opened].min() * 1.03
-    block = np.searchsorted(first, rows.first, "right") - 1
-    scores = []
-    for each, whole_score in zip((mask, *parts), blocks, strict=True):
-        seen = fit.scorer.seen(index, each)
-        trust = cascade.coarse_scorer.trusted(index, seen)[1]
-        every = fit.scorer.of(np.arange(len(index)), seen)
-        # the best is looked for in some blocks only
-        assert trust == pytest.approx(fit.scorer.trust(every.max()), rel=0.05)
-        scores.append(np.where(whole[block], whole_score[block], trust * every[rows.first]))
-    assert said == pytest.approx(mixture(shares, scores, weight, cascade.partly.temperature), rel=2e-3)
+    return replace(fit, scorer=encoder)
 
 
 @pytest.mark.parametrize("above", [0.0, 0.7 * MM])
@@ -161,7 +117,7 @@ def test_cells_are_scored_by_the_mixture(localizer, fit, contact, above):
     """Of contour lines too: each patch belongs to as much deeper poses."""
     index = localizer.index
     mask, parts, shares = contact
-    said, weight = density(fit.cells(index, mask, None, exact=False, above=above))
+    said, weight = density(fit.rows(index, mask, above=above))
     deeper = round(above * len(index.height) / index.sensor.max_penetration)
     scores = []
     for each in (mask, *parts):
@@ -179,6 +135,6 @@ def test_a_prior_weighs_the_mixture_and_does_not_change_it(localizer, rng):
     prior = np.full(len(index), -np.inf)
     known = np.sort(rng.choice(index.possible, 300, replace=False))
     prior[known] = -np.log(300)
-    free, bound = (fit.cells(index, mask, each, exact=False) for each in (None, prior))
-    assert np.array_equal(bound.first, known)
-    assert np.array_equal(bound.score, free.score[np.searchsorted(free.first, known)])
+    free, bound = (fit.rows(index, mask, each) for each in (None, prior))
+    assert np.array_equal(bound.cells, known)
+    assert np.array_equal(bound.score, free.score[np.searchsorted(free.cells, known)])

@@ -57,7 +57,7 @@ def weighed(normal_modes, monkeypatch):
     monkeypatch.setattr(
         mode_mass, "replace", lambda explored, **changes: SimpleNamespace(**{**vars(explored), **changes})
     )
-    return mode_mass.weighed(normal_modes[1], np.random.default_rng(1))
+    return mode_mass.weighed(normal_modes[1], 9000, np.random.default_rng(1))
 
 
 def test_a_mass_is_the_integral_of_the_density(normal_modes, weighed):
@@ -72,18 +72,18 @@ def test_a_mass_is_the_integral_of_the_density(normal_modes, weighed):
 def test_modes_that_overlap_share_their_poses(normal_modes, weighed, monkeypatch):
     """Of narrower modes there are several about one place. Each pose counts once, and the leading mode has as much as alone."""
     monkeypatch.setattr(mode_mass, "mode_radius", lambda _: 0.6e-3)
-    found, log_sum = mode_mass.weighed(normal_modes[1], np.random.default_rng(1))
+    found, log_sum = mode_mass.weighed(normal_modes[1], 9000, np.random.default_rng(1))
     assert len(found.hearts) > 3 and (np.diff(found.masses) <= 0).all()
     assert found.masses.sum() < 1.1 and np.exp(log_sum) == pytest.approx(found.masses.sum(), rel=1e-6)
     leading = normal_modes[1].poses[found.hearts[0]]
     monkeypatch.setattr(
-        mode_mass, "_grown", lambda explored, distance, radius: (found.hearts[:1], [near(distance, radius)])
+        mode_mass, "_grown", lambda explored, distance, radius, count: (found.hearts[:1], [near(distance, radius)])
     )
 
     def near(distance, radius):
         return np.flatnonzero(distance.within(leading, normal_modes[1].poses, radius))
 
-    alone, _ = mode_mass.weighed(normal_modes[1], np.random.default_rng(1))
+    alone, _ = mode_mass.weighed(normal_modes[1], 9000, np.random.default_rng(1))
     assert alone.masses[0] == pytest.approx(found.masses[0], rel=0.25)
 
 

@@ -16,6 +16,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError, InputError, PoseError, UsageError
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.inference.effort import Effort
 from geomtact.planning.actions import Probe, Touch
 from geomtact.planning.draws import draw_cells
 from geomtact.planning.grid import grid_of_touches
@@ -296,7 +297,7 @@ def test_the_choice_does_not_depend_on_the_frame(plug, a_touch, posterior):
 
 
 def test_cells_are_drawn_by_their_probability(plug, posterior, rng):
-    sharp = replace(posterior, cells=posterior.cells[:3], cell_log_prob=np.log([0.5, 0.5, 1e-12]), runs=None)
+    sharp = replace(posterior, cells=posterior.cells[:3], cell_log_prob=np.log([0.5, 0.5, 1e-12]))
     T = draw_cells(sharp, 20, rng, 5)
     assert T.shape == (5, 20, 4, 4)
     held = plug.index.lookup(T.reshape(-1, 4, 4), plug.space.penetration(T.reshape(-1, 4, 4)))
@@ -306,11 +307,11 @@ def test_cells_are_drawn_by_their_probability(plug, posterior, rng):
 
 @pytest.mark.parametrize("n", slow_but((600, 4000), 600))
 def test_a_refined_cell_is_drawn_as_registration_left_it(plug, a_touch, n):
-    world = plug.localize(a_touch(plug)[1], T_world_sensor=T_MOVED)
+    world = plug.localize(a_touch(plug)[1], T_world_sensor=T_MOVED, effort=Effort(5))
     mode = next(mode for mode in world.modes() if mode.refined)
     cell = next(c for c, found in world.refined.items() if np.allclose(T_MOVED @ found.T, mode.T))
     row = np.flatnonzero(world.cells == cell)
-    known = replace(world, cells=world.cells[row], cell_log_prob=np.zeros(1), runs=None)
+    known = replace(world, cells=world.cells[row], cell_log_prob=np.zeros(1))
     T = draw_cells(known, 2, np.random.default_rng(0), n)
     white = np.linalg.solve(np.linalg.cholesky(mode.covariance), log(inverse(mode.T) @ T).reshape(-1, 6).T)
     error = 1 / np.sqrt(2 * n)  # of a mean; of a variance it is sqrt 2 of that

@@ -10,28 +10,28 @@ from scipy.stats import kstest
 from speed import slow_but
 
 from geomtact.contact_space.draw import draw_within
-from geomtact.contact_space.index import expand_runs
 from geomtact.errors import InputError, PoseError, UsageError
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.inference.distribution import cell_log_density, middle_cells, row_log_density, row_poses
+from geomtact.inference.distribution import cell_log_density, row_log_density, row_poses
+from geomtact.inference.effort import Effort
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.reweight import reweight_cells
-from geomtact.scoring.probability import posterior_log_prob
 from geomtact.se3 import exp, transform
 
 T_WORLD = exp([0.3, -1.2, 0.5, 0.4, -0.1, 0.7])
 MM = 1e-3
+PLAIN, CELLS = Effort(0), Effort(5, thorough=False)  # what is within the cells: test_explored.py
 
 
 @pytest.fixture(scope="module")
 def posteriors(a_touch):
-    """The posterior of one touch of a localizer, without refinement."""
+    """The posterior of one touch of a localizer, by its cells, without refinement."""
     found: dict[str, Posterior] = {}
 
     def of(localizer) -> Posterior:
         key = localizer.index.key
         if key not in found:
-            found[key] = replace(localizer.localize(a_touch(localizer)[1]), refined={})
+            found[key] = replace(localizer.localize(a_touch(localizer)[1], effort=CELLS), refined={})
         return found[key]
 
     return of
@@ -51,8 +51,9 @@ def samples(posteriors):
     return of
 
 
-def runs_of(posterior):
-    return np.ones(len(posterior.cells), int) if posterior.runs is None else posterior.runs
+def measure(posterior):
+    """Share (N,) of the uniform measure in each of its cells."""
+    return np.asarray(posterior.index.weight, float).ravel()[posterior.cells]
 
 
 def test_probabilities_are_a_distribution(localizer, posteriors):
@@ -67,7 +68,7 @@ def test_probabilities_are_a_distribution(localizer, posteriors):
 def test_entropy_is_minus_the_mean_log_density(localizer, posteriors, samples):
     """By its definition as a sum over cells, and over poses drawn from the posterior."""
     posterior = posteriors(localizer)
-    w = localizer.index.mass(posterior.cells, runs_of(posterior))
+    w = measure(posterior)
     p = np.exp(posterior.log_prob)
     assert posterior.entropy_nats == pytest.approx(-(p * (posterior.log_prob - np.log(w))).sum(), abs=1e-5)
     assert posterior.entropy_nats < 0
@@ -88,7 +89,7 @@ def test_the_density_integrates_to_one(localizer, posteriors, uniform_poses):
     """Its mean over poses drawn uniformly, without the index, is 1 within its standard error and the grid's coarseness."""
     posterior = posteriors(localizer)
     # flattened, so that two hundred poses are enough: a mixture with the uniform of the posterior's square root
-    w = localizer.index.mass(posterior.cells, runs_of(posterior))
+    w = measure(posterior)
     p = np.exp(0.25 * posterior.log_prob + 0.75 * np.log(w))
     flat = replace(posterior, cell_log_prob=np.log(p / p.sum()))
     density = np.exp(flat.log_density(uniform_poses(localizer)[0]))
@@ -100,7 +101,7 @@ def test_the_uniform_scores_0_everywhere(localizer, posteriors, uniform_poses):
     index = localizer.index
     w = np.asarray(index.weight, float).ravel()
     cells = np.flatnonzero(w)
-    uniform = replace(posteriors(localizer), cells=cells, runs=None, cell_log_prob=np.log(w[cells] / w.sum()))
+    uniform = replace(posteriors(localizer), cells=cells, cell_log_prob=np.log(w[cells] / w.sum()))
     assert np.abs(uniform.log_density(uniform_poses(localizer)[0])).max() < 1e-5
     assert uniform.entropy_nats == pytest.approx(0, abs=1e-5)
     assert uniform.effective_poses == pytest.approx(len(index), rel=1e-4)
@@ -145,12 +146,12 @@ def test_the_density_of_a_cell_is_its_mass_over_its_measure(localizer, posterior
     posterior, index = posteriors(localizer), localizer.index
     rows = rng.choice(len(posterior.cells), 40)
     rows[:10] = np.argsort(-posterior.log_prob)[:10]
-    T, _, found = draw_within(index, localizer.space, middle_cells(posterior, rows), rng)
-    w = index.mass(posterior.cells[rows], runs_of(posterior)[rows])
+    T, _, found = draw_within(index, localizer.space, posterior.cells[rows], rng)
+    w = measure(posterior)[rows]
     expected = posterior.log_prob[rows] - np.log(w)
     agree = np.abs(posterior.log_density(T[found]) - expected[found]) < 1e-5
     assert agree.mean() > 0.95
-    ids = np.setdiff1d(np.arange(len(index)), expand_runs(posterior.cells, runs_of(posterior)))[:5]
+    ids = np.setdiff1d(np.arange(len(index)), posterior.cells)[:5]
     assert (cell_log_density(posterior, ids) == -np.inf).all()
 
 
@@ -177,7 +178,7 @@ def test_levels_are_repeatable_and_depend_on_the_seed(plug, posteriors, samples)
 
 def test_the_credible_level_is_the_mass_of_denser_poses(localizer, posteriors, samples):
     posterior = posteriors(localizer)
-    w = localizer.index.mass(posterior.cells, runs_of(posterior))
+    w = measure(posterior)
     p = np.exp(posterior.log_prob)
     T = samples(localizer)[:40]
     for rho, level in zip(posterior.log_density(T), posterior.credible_level(T), strict=True):
@@ -205,7 +206,7 @@ def modes_by_brute_force(posterior, modes):
     return out
 
 
-@pytest.mark.parametrize("effort", ["fast", "balanced"])
+@pytest.mark.parametrize("effort", [PLAIN, CELLS], ids=["plain", "refined"])
 def test_a_mode_holds_the_mass_within_its_radius(localizer, a_touch, effort):
     posterior = localizer.localize(a_touch(localizer)[1], effort=effort)
     modes = posterior.modes(5)
@@ -220,7 +221,7 @@ def test_a_mode_holds_the_mass_within_its_radius(localizer, a_touch, effort):
         assert np.linalg.eigvalsh(mode.covariance).min() > -1e-12
         rows = mode.observable
         assert np.abs(rows @ rows.T - np.eye(len(rows))).max(initial=0) < 1e-6
-        if effort == "fast":
+        if effort == PLAIN:
             others = np.stack([m.T for m in modes[:i]]) if i else np.zeros((0, 4, 4))
             assert (distance.mean(mode.T, others) > radius).all()
     assert len(posterior.modes(2)) <= 2 and posterior.modes(0) == []
@@ -248,10 +249,10 @@ def test_modes_are_allowed_poses(localizer, posteriors):
     assert np.isfinite(localizer.space.caster.penetration(localizer.sensor, T)).all()
 
 
-@pytest.mark.parametrize("effort", ["fast", "balanced"])
+@pytest.mark.parametrize("effort", [PLAIN, CELLS], ids=["plain", "refined"])
 def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_touch, effort):
     posterior = localizer.localize(a_touch(localizer)[1], T_world_sensor=T_WORLD, effort=effort)
-    mass = posterior.log_prob - np.log(runs_of(posterior))
+    mass = posterior.log_prob
     poses = posterior.likeliest(10)
     row = [int(np.abs(posterior.poses - T).max((1, 2)).argmin()) for T in poses]
     assert poses == pytest.approx(posterior.poses[row], abs=1e-12) and len(set(row)) == len(row) == min(10, len(mass))
@@ -263,9 +264,7 @@ def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_
 def test_modes_returns_as_many_as_asked_for_in_any_order_of_cells(plug, posteriors):
     """Also where the very likeliest are every fiftieth, by which the rest is sifted."""
     posterior = posteriors(plug)
-    plain = replace(
-        posterior, cells=posterior.index.possible, cell_log_prob=np.zeros(len(posterior.index.possible)), runs=None
-    )
+    plain = replace(posterior, cells=posterior.index.possible, cell_log_prob=np.zeros(len(posterior.index.possible)))
     for seed in range(20):
         mass = np.random.default_rng(seed).normal(size=len(plain.cells))
         mass[::50] += 5 * (seed % 2)
@@ -291,7 +290,7 @@ def test_samples_follow_the_probabilities_of_the_cells(localizer, posteriors, sa
     for g, mass in zip(group, p, strict=True):
         groups[g] += mass
     group_of = np.zeros(len(index), int)
-    group_of[expand_runs(posterior.cells, runs_of(posterior))] = np.repeat(group, runs_of(posterior))
+    group_of[posterior.cells] = group
     n = inside.sum()
     for g, mass in groups.items():
         got = (group_of[cell] == g).sum()
@@ -468,13 +467,12 @@ def test_a_truncated_posterior_is_refused(plug, posteriors, tmp_path):
 @pytest.fixture(scope="module")
 def exact(ball, a_touch):
     """The posterior of one touch of a ball, every cell scored, without refinement."""
-    rows = ball.scorer.rows(ball.index, a_touch(ball)[1], "all")
-    log_prob = posterior_log_prob(rows.score, rows.log_prior, rows.calibration)
-    return Posterior(ball.index, rows.first, log_prob, runs=rows.runs)
+    rows = ball.scorer.rows(ball.index, a_touch(ball)[1], exact=True)
+    return Posterior(ball.index, rows.cells, rows.log_prob)
 
 
 def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_touch, exact):
-    """In cells and in blocks; all others keep what they have."""
+    """All other cells keep what they have."""
     for before in (ball.localize(a_touch(ball)[1], effort="fast"), exact):
         row = np.argsort(-before.log_prob)[:4]
         likelihood = np.array([3.0, 0.0, -2.0, 1.0])
@@ -496,7 +494,7 @@ def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(ball, a_
 
 
 def test_of_mass_shared_anew_the_images_count_by_a_power_and_a_prior_in_full(exact):
-    before = replace(exact, runs=None)
+    before = exact
     cells, index = before.cells[np.argsort(-before.log_prob)[:40]], before.index
     rng = np.random.default_rng(0)
     likelihood, nats = rng.normal(size=40), rng.normal(size=len(index))
@@ -509,7 +507,7 @@ def test_of_mass_shared_anew_the_images_count_by_a_power_and_a_prior_in_full(exa
 
 
 def test_a_cell_without_likelihood_keeps_its_mass(exact):
-    before = replace(exact, runs=None)
+    before = exact
     rows = np.argsort(-before.log_prob)[:3]
     after = reweight_cells(before, before.cells[rows], np.array([-np.inf, 0.0, 2.0]))
     assert after.log_prob[rows[0]] == before.log_prob[rows[0]]

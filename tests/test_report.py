@@ -60,9 +60,6 @@ class FakeIndex:
     def poses(self, cells):
         return self.stored[cells]
 
-    def within_runs(self, cells, runs, share):
-        return cells
-
     def __len__(self):
         return 4000
 
@@ -101,7 +98,6 @@ def touch():
         entropy_nats=-4.2,
         information_gain_nats=4.2,
         cells=np.arange(3000),
-        runs=None,
         refined={},
         explored=None,
         effective_poses=1234.5,

@@ -79,7 +79,7 @@ def cell_weights(directions):
 
 @each_symmetry
 def test_halfway_between_two_turns_the_first_is_taken_whatever_the_last_digit(symmetry):
-    """So that every processor sorts an index alike: rotations of a grid often lie halfway between turns of the coarser one."""
+    """So that every processor looks a pose up alike: rotations of a grid often lie halfway between turns of a coarser one."""
     directions = grid(symmetry)
     k = np.repeat(np.arange(len(directions.vectors)), directions.turns)
     j = np.arange(len(k)) - np.repeat(directions.first_turn, directions.turns)

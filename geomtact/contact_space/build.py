@@ -85,9 +85,7 @@ def build(
             f"{mesh.name}: no pose touches the sensor {sensor.name!r} as the approach and the housing allow; "
             "widen the approach or check the object's unit"
         )
-    return _join(
-        turns, directions, lattice, _coarse_cells(turns, directions.coarser_rotations(resolution.turn_step), lattice)
-    )
+    return _join(turns, directions, lattice)
 
 
 def choose_resolution(
@@ -145,14 +143,10 @@ def _touches(there: HeightMap, turn: float, lattice: Lattice, window: Window) ->
     return _Turn(cell, -centres, z, share, packed, masks.sum(2), np.moveaxis(summed, 2, 0))
 
 
-def _join(
-    turns: list[_Turn], directions: Directions, lattice: Lattice, coarse_cell: NDArray[np.int64]
-) -> dict[str, NDArray]:
-    """One array of each kind for all rotations, sorted by ``coarse_cell`` (n,); the weights made a share of the whole."""
+def _join(turns: list[_Turn], directions: Directions, lattice: Lattice) -> dict[str, NDArray]:
+    """One array of each kind for all rotations; the weights made a share of the whole."""
     first = np.concatenate([[0], np.cumsum([len(t.cell) for t in turns])])
     some, n = turns[0], int(first[-1])
-    rank = np.empty(n, np.int64)
-    rank[np.argsort(coarse_cell, kind="stable")] = np.arange(n)
     p, words = some.bits.shape[:2]
     out: dict[str, NDArray] = {
         "rotation": np.zeros(n, np.int32),
@@ -163,11 +157,10 @@ def _join(
         "area": np.zeros((p, n), np.uint16),
         "moments": np.zeros((some.moments.shape[0], p, n), np.float32),
         "table": np.zeros((len(turns), *lattice.cells), np.int32),
-        "blocks": np.concatenate([[0], np.cumsum(np.bincount(coarse_cell))]).astype(np.int32),
     }
     share = np.repeat(directions.weights / directions.turns, directions.turns)
     for r, turn in enumerate(turns):
-        part = rank[first[r] : first[r + 1]]
+        part = slice(first[r], first[r + 1])
         out["rotation"][part] = r
         out["shift"][part] = turn.shift
         out["height"][:, part] = turn.height
@@ -176,7 +169,7 @@ def _join(
         out["area"][:, part] = turn.area
         out["moments"][:, :, part] = turn.moments
         table = np.full(lattice.cells, -1)
-        table.flat[turn.cell] = part
+        table.flat[turn.cell] = np.arange(first[r], first[r + 1])
         out["table"][r] = _fill(table) if len(turn.cell) else -1
     out["weight"] /= out["weight"].sum(dtype=np.float64)
     out["moments"] = out["moments"].reshape(some.moments.shape[0], p * n)
@@ -184,17 +177,6 @@ def _join(
     for r in np.flatnonzero(out["table"][:, 0, 0] < 0).tolist():
         out["table"][r] = out["table"][r - 1] if r else 0
     return out
-
-
-def _coarse_cells(turns: list[_Turn], parent: NDArray[np.int64], lattice: Lattice) -> NDArray[np.int64]:
-    """The coarse cell, of the next coarser grid, that holds each place (n,), counted without gaps.
-
-    A coarse cell is 2 x 2 lattice cells of the rotations that have the same ``parent`` (M,) rotation.
-    """
-    y, x = np.divmod(np.concatenate([t.cell for t in turns]), lattice.cells[1])
-    owner = np.repeat(parent, [len(t.cell) for t in turns])
-    ny, nx = (n // 2 + 1 for n in lattice.cells)
-    return np.unique((owner * ny + y // 2) * nx + x // 2, return_inverse=True)[1]
 
 
 def _fill(table: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -10,7 +10,6 @@ import contextlib
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -57,10 +56,17 @@ class Placements:
 
 @dataclass(frozen=True, eq=False)
 class ContactMaps:
-    """The height maps of an index, one for each of its approach directions."""
+    """The height maps of an index, one for each of its approach directions.
+
+    Attributes
+    ----------
+    index, maps
+    from_maps : rotations (D, 3, 3) from the maps' frames into the object's
+    """
 
     index: Index
     maps: Maps
+    from_maps: Array
 
     @classmethod
     def of(cls, index: Index) -> ContactMaps:
@@ -74,17 +80,13 @@ class ContactMaps:
                 if path is not None:
                     with contextlib.suppress(OSError):  # a read-only cache costs the casts each time, no more
                         heights = _written(path, heights)
-            _OPENED[index] = _maps(heights, sample_pitch(index.sensor) / _PIXELS_PER_SAMPLE)
-        return cls(index, _OPENED[index])
+            maps = _maps(heights, sample_pitch(index.sensor) / _PIXELS_PER_SAMPLE)
+            _OPENED[index] = maps, np.swapaxes(facing(index.directions.vectors), 1, 2)
+        return cls(index, *_OPENED[index])
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled without what the index's folder holds."""
         return ContactMaps.of, (self.index,)
-
-    @cached_property
-    def _from_maps(self) -> Array:
-        """Rotations (D, 3, 3) from the maps' frames into the object's."""
-        return np.swapaxes(facing(self.index.directions.vectors), 1, 2)
 
     def compare(
         self,
@@ -104,7 +106,7 @@ class ContactMaps:
         depth : (n,) the penetration [m]; by default the deepest
         """
         # from the frame of each map into the sensor's
-        tilt = poses.rotation @ self._from_maps[poses.direction]
+        tilt = poses.rotation @ self.from_maps[poses.direction]
         n, deepest = len(poses.reach), self.index.sensor.max_penetration
         membrane = np.full(n, np.nan) if membrane is None else membrane
         depth = np.full(n, deepest) if depth is None else depth
@@ -133,7 +135,7 @@ def located(index: Index, T: Array) -> tuple[Placements, Array]:
     return Placements(place, direction.astype(np.int32), R, centre[:, :2], reach), centre[:, 2]
 
 
-_OPENED: WeakKeyDictionary[Index, Maps] = WeakKeyDictionary()
+_OPENED: WeakKeyDictionary[Index, tuple[Maps, Array]] = WeakKeyDictionary()
 
 
 def _cast(index: Index) -> NDArray[np.float32]:

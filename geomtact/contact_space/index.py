@@ -2,7 +2,7 @@
 
 A *place* is an approach direction, a turn, and a lattice cell of the object's centre over the window; a *pose* is a
 place at one penetration. Every array is laid out penetration by penetration, so pose ``i`` is penetration
-``i // places`` of place ``i % places``. Places that the next coarser grid holds in one cell, a *coarse cell*, stand together.
+``i // places`` of place ``i % places``.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ class Index:
     area : (P, n) number of contact pixels
     moments : (6, P n) moments of each mask (see ``sensing.moments``)
     table : (rotations, ny, nx) place of each lattice cell, the nearest one where the cell does not touch
-    blocks : (B + 1,) first place of each coarse cell, and the number of places
     folder : its entry in the cache; None where it is in none
     """
 
@@ -65,10 +64,9 @@ class Index:
     area: NDArray[np.uint16]
     moments: NDArray[np.float32]
     table: NDArray[np.int32]
-    blocks: NDArray[np.int32]
     folder: Path | None = None
 
-    ARRAYS = ("rotation", "shift", "height", "weight", "bits", "area", "moments", "table", "blocks")
+    ARRAYS = ("rotation", "shift", "height", "weight", "bits", "area", "moments", "table")
 
     def __len__(self) -> int:
         return self.height.size
@@ -293,31 +291,10 @@ class Index:
         """:attr:`log_weight` of :attr:`possible`."""
         return self.log_weight[self.possible]
 
-    @cached_property
-    def log_coarse_weight(self) -> NDArray[np.float32]:
-        """Log of the uniform measure (P B,) of :attr:`coarse_runs`."""
-        with np.errstate(divide="ignore"):
-            return np.log(np.maximum(self.mass(*self.coarse_runs), 0)).astype(np.float32)
-
-    def mass(self, first: ArrayLike, counts: ArrayLike) -> Array:
-        """Share of the uniform measure (n,) in runs of poses, each ``counts`` (n,) long from ``first`` (n,)."""
-        first = np.asarray(first, np.int64)
-        one = np.asarray(self.weight).reshape(-1)[first].astype(float)
-        # the difference of sums has an error of its own, which a single cell need not have
-        return np.where(counts == 1, one, self._mass_before[first + counts] - self._mass_before[first])
-
-    def within_runs(self, first: ArrayLike, counts: ArrayLike, share: ArrayLike) -> NDArray[np.int64]:
-        """The pose id (n,) up to which a run of poses holds ``share`` (n,), 0 to 1, of the run's measure."""
-        first = np.asarray(first, np.int64)
-        end = first + np.asarray(counts, np.int64)
-        low, high = self._mass_before[first], self._mass_before[end]
-        return np.clip(np.searchsorted(self._mass_before, low + share * (high - low), "right") - 1, first, end - 1)
-
-    @cached_property
-    def coarse_runs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First pose id and number of poses (P B,) of every coarse cell at every penetration."""
-        first = np.arange(len(self.height))[:, None] * self.places + self.blocks[:-1]
-        return first.ravel(), np.tile(np.diff(self.blocks), len(self.height)).astype(np.int64)
+    def at_share(self, share: ArrayLike) -> NDArray[np.int64]:
+        """The pose id (n,) up to which the poses hold ``share`` (n,), 0 to 1, of the uniform measure."""
+        total = self._mass_before[-1]
+        return np.clip(np.searchsorted(self._mass_before, np.asarray(share) * total, "right") - 1, 0, len(self) - 1)
 
     @cached_property
     def turned_within(self) -> Array:
@@ -338,32 +315,19 @@ class Index:
             area=self.area[:, places],
             moments=moments.reshape(len(moments), -1),
             table=np.zeros((0, 0, 0), np.int32),
-            blocks=np.array([0, len(places)], np.int32),
             folder=None,
         )
 
     @cached_property
     def drawn_moments(self) -> NDArray[np.float32]:
         """Moments (6, m) of poses drawn by their measure; always the same ones."""
-        found = self.within_runs(0, len(self), (np.arange(_DRAWN) + np.random.default_rng(0).random(_DRAWN)) / _DRAWN)
+        found = self.at_share((np.arange(_DRAWN) + np.random.default_rng(0).random(_DRAWN)) / _DRAWN)
         return np.ascontiguousarray(self.moments[:, found])
-
-    def coarse_cell_of(self, ids: ArrayLike) -> NDArray[np.int64]:
-        """Which of :attr:`coarse_runs` (n,) holds each pose id (n,)."""
-        level, place = np.divmod(np.asarray(ids, np.int64), self.places)
-        return level * (len(self.blocks) - 1) + np.searchsorted(self.blocks, place, "right") - 1
 
     def masks(self, ids: ArrayLike) -> NDArray[np.bool_]:
         """The stored contact masks (m, h, w) of poses ``ids`` (m,)."""
         level, place = np.divmod(np.asarray(ids), self.places)
         return unpack(self.bits[level, :, place], self.resolution.mask_shape)
-
-
-def expand_runs(first: ArrayLike, counts: ArrayLike) -> NDArray[np.int64]:
-    """The pose ids (sum of counts,) of runs that begin at ``first`` (n,) and are ``counts`` (n,) long."""
-    first, counts = np.asarray(first, np.int64), np.asarray(counts, np.int64)
-    begins = np.cumsum(counts) - counts
-    return np.repeat(first - begins, counts) + np.arange(counts.sum())
 
 
 def pack(masks: NDArray[np.bool_]) -> NDArray[np.uint64]:

@@ -32,7 +32,7 @@ from geomtact.sensing.sensor import Sensor
 if TYPE_CHECKING:
     import filelock
 
-FORMAT = 9  # raise whenever a built index would differ
+FORMAT = 10  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
 _KEPT = 4  # indexes that a process has read for pickles and keeps
 _CHOOSING = 0.1  # share of the time that choosing the grid takes, about

@@ -156,17 +156,6 @@ class Directions:
         """The direction (n,) of rotations (n,), counted as :meth:`rotations` does."""
         return np.searchsorted(self.first_turn, np.asarray(rotations), side="right") - 1
 
-    def coarser_rotations(self, turn_step: float) -> NDArray[np.int64]:
-        """The rotation of the next coarser grid that holds each of :meth:`rotations` (M,); disks are cut alike on both.
-
-        ``turn_step`` [rad] spaces the turns of exact faces here.
-        """
-        level = max(self.level - 1, 0) if self.level is not None else 0
-        disks = self.cells.disks if self.cells else None
-        coarse = Directions.make(self.symmetry, self.cones, level, 2 * turn_step, disks)
-        _, direction, turn = coarse.lookup(transform(self.rotations()[0], np.zeros(3)))
-        return coarse.first_turn[direction] + turn
-
     def rotations(self) -> tuple[Array, NDArray[np.int64], Array]:
         """R_sensor_object (M, 3, 3) of all cells, direction by direction, their direction (M,) and turn [rad] (M,)."""
         direction = np.repeat(np.arange(len(self.vectors)), self.turns)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geomtact.contact_space.index import Index, expand_runs
+from geomtact.contact_space.index import Index
 from geomtact.inference.explored import Explored
 from geomtact.inference.facts import Diagnostics, Provenance
 from geomtact.inference.reference import Reference
@@ -36,7 +36,7 @@ class CellDistribution:
     Attributes
     ----------
     index : the discretised contact pose space it lives on
-    cells : (N,) pose ids of the index, ascending; cells that are not among them, nor in their runs, have no mass
+    cells : (N,) pose ids of the index, ascending; cells that are not among them have no mass
     cell_log_prob : (N,) log probability of each, normalised
     frame : "sensor" or "world"
     T_frame_sensor : (4, 4)
@@ -44,8 +44,6 @@ class CellDistribution:
     off_contact_log_density : without contact, the prior's log density at poses (n, 4, 4) in ``frame``; it is not saved
     log_evidence : log of the mean likelihood under the prior, comparable between objects for the same images and effort
     seed : of the random choices made where credible levels tie
-    runs : (N,) how many cells from each of ``cells`` on share one density, as those of a coarse cell do where there is
-        little mass; one each by default
     refined : what registration found, by pose id
     explored : the distribution within the cells, which keep the masses that they had before; None where it is that of the cells
     reference : poses of the prior or of the frame before, by which modes are reported at one of their images under the object's
@@ -64,7 +62,6 @@ class CellDistribution:
     off_contact_log_density: Callable[[Array], Array] | None = None
     log_evidence: float = 0.0
     seed: int = 0
-    runs: NDArray[np.int64] | None = None
     refined: dict[int, Refined] = field(default_factory=dict)
     explored: Explored | None = None
     reference: Reference | None = None
@@ -76,24 +73,15 @@ class CellDistribution:
 
 
 def rows_of(posterior: CellDistribution, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The row (n,) whose run may hold each pose id (n,), and whether it does."""
-    row = np.maximum(np.searchsorted(posterior.cells, ids, "right") - 1, 0)
-    return row, (ids >= posterior.cells[row]) & (ids < posterior.cells[row] + run_lengths(posterior, row))
-
-
-def run_lengths(posterior: CellDistribution, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number of cells (m,) in the run of each of ``rows`` (m,)."""
-    return np.ones(len(rows), np.int64) if posterior.runs is None else posterior.runs[rows]
+    """The row (n,) that may be that of each pose id (n,), and whether it is."""
+    row = np.minimum(np.searchsorted(posterior.cells, ids), len(posterior.cells) - 1)
+    return row, posterior.cells[row] == ids
 
 
 def row_log_density(posterior: CellDistribution, rows: NDArray[np.int64]) -> Array:
     """Log density (m,) of ``rows`` (m,) relative to the uniform distribution."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        if posterior.runs is None:
-            log_mass = posterior.index.log_weight[posterior.cells[rows]]
-        else:
-            log_mass = np.log(posterior.index.mass(posterior.cells[rows], posterior.runs[rows]))
-        density = (posterior.cell_log_prob[rows] - log_mass).astype(float)
+        density = (posterior.cell_log_prob[rows] - posterior.index.log_weight[posterior.cells[rows]]).astype(float)
     return np.where(np.isfinite(density), density, -np.inf)
 
 
@@ -107,11 +95,7 @@ def cell_densities(posterior: CellDistribution) -> NDArray[np.float32]:
     """Density (N,) in every cell of the index, relative to the uniform distribution."""
     index, cells = posterior.index, posterior.cells
     out = np.zeros(len(index), np.float32)
-    if posterior.runs is None:
-        out[cells] = np.exp(posterior.cell_log_prob.astype(np.float32) - index.log_weight[cells])
-    else:
-        density = np.exp(row_log_density(posterior, np.arange(len(cells))).astype(np.float32))
-        out[expand_runs(cells, posterior.runs)] = np.repeat(density, posterior.runs)
+    out[cells] = np.exp(posterior.cell_log_prob.astype(np.float32) - index.log_weight[cells])
     return out
 
 
@@ -128,7 +112,7 @@ def row_poses(posterior: CellDistribution, rows: ArrayLike) -> Array:
     """Poses (m, 4, 4) of ``rows`` (m,) in the posterior's frame: those rows of ``Posterior.poses``."""
     if posterior.explored is not None:
         return posterior.T_frame_sensor @ posterior.explored.poses[np.asarray(rows, np.int64)]
-    return posterior.T_frame_sensor @ cell_poses(posterior, middle_cells(posterior, np.asarray(rows, np.int64)))
+    return posterior.T_frame_sensor @ cell_poses(posterior, posterior.cells[np.asarray(rows, np.int64)])
 
 
 def row_log_prob(posterior: CellDistribution) -> NDArray[np.floating]:
@@ -136,28 +120,9 @@ def row_log_prob(posterior: CellDistribution) -> NDArray[np.floating]:
     return posterior.cell_log_prob if posterior.explored is None else np.log(posterior.explored.weight)
 
 
-def middle_cells(posterior: CellDistribution, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The cell (m,) that represents each of ``rows`` (m,): that of a run with half of the run's measure before it."""
-    cells, runs = posterior.cells[rows], run_lengths(posterior, rows)
-    many = runs > 1
-    out = cells.copy()
-    out[many] = posterior.index.within_runs(cells[many], runs[many], 0.5)
-    return out
-
-
-def log_mass_per_cell(posterior: CellDistribution) -> NDArray[np.floating]:
-    """Log mass (N,) of one cell of each row; the cells of a run share its mass equally."""
-    log_mass = posterior.cell_log_prob
-    if posterior.runs is not None:
-        many = np.flatnonzero(posterior.runs > 1)
-        log_mass = log_mass.copy()
-        log_mass[many] -= np.log(posterior.runs[many])
-    return log_mass
-
-
 def leading_rows(posterior: CellDistribution, n: int = LEADING_CELLS) -> NDArray[np.int64]:
-    """The ``n`` rows (m,) with the most mass per cell, in any order; fewer where fewer have mass."""
-    p = log_mass_per_cell(posterior)
+    """The ``n`` rows (m,) with the most mass, in any order; fewer where fewer have mass."""
+    p = posterior.cell_log_prob
     rows = np.zeros(0, np.int64)
     if len(p) > 100 * n:
         # the quantile of every fiftieth row leaves few to look at; for a small n, by chance, too few
@@ -171,9 +136,9 @@ def leading_rows(posterior: CellDistribution, n: int = LEADING_CELLS) -> NDArray
 
 
 def likeliest_cells(posterior: CellDistribution, n: int) -> NDArray[np.int64]:
-    """Pose ids (m,) of the ``n`` most probable cells, or of the middles of runs of them, the most probable first."""
+    """Pose ids (m,) of the ``n`` most probable cells, the most probable first."""
     rows = leading_rows(posterior, n)
-    return middle_cells(posterior, rows[np.argsort(-posterior.cell_log_prob[rows], kind="stable")[:n]])
+    return posterior.cells[rows[np.argsort(-posterior.cell_log_prob[rows], kind="stable")[:n]]]
 
 
 def nearest_images(posterior: CellDistribution, T: Array) -> Array:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from geomtact.errors import UsageError, nearest_name
 
-RESOLVED = ("coarse", "cells", "all")
-
 
 @dataclass(frozen=True)
 class Effort:
@@ -15,28 +13,23 @@ class Effort:
 
     Attributes
     ----------
-    resolved : what is scored: "coarse" cells of about 20 cells, "cells" (on a large grid those where the mass is), or "all"
-        cells, their pixels counted too
     modes : that are refined
-    thorough : whether each is refined by all registrations or by one
-    outlines : whether, of one mask that is not resolved by contacts, the outline refines the modes where few enough cells are
-        left (see ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by
-        FilterReg
-    contacts : that are cut, of one mask that is not of a known face, to resolve the pose within the cells (see
-        ``inference.sampler``); all cells are not scored then
+    contacts : that may be cut, of one mask that is not of a known face, to resolve the pose within the cells of the grid (see
+        ``inference.sampler``): a quarter, or 3,000, at first, and all of them where those do not settle it; half as many more
+        weigh the modes. 0 leaves the cells as they are
+    thorough : whether each mode is refined by all registrations or by one
+    pixels : whether the score of cells that no contacts resolve counts the pixels too
+    outlines : whether, of one mask that no contacts resolve, the outline refines the modes where few enough cells are left (see
+        ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by FilterReg
     """
 
-    resolved: str
     modes: int
-    thorough: bool = True
-    outlines: bool = False
     contacts: int = 0
+    thorough: bool = True
+    pixels: bool = False
+    outlines: bool = False
 
     def __post_init__(self) -> None:
-        if self.resolved not in RESOLVED:
-            raise UsageError(
-                f"Effort: no way to resolve named {self.resolved!r}{nearest_name(self.resolved, RESOLVED)}"
-            )
         if self.modes < 0:
             raise UsageError(f"Effort: expected 0 refined modes or more, got {self.modes}; give 0 for none")
         if self.contacts < 0:
@@ -44,9 +37,9 @@ class Effort:
 
 
 EFFORTS = {
-    "fast": Effort("coarse", 0),
-    "balanced": Effort("cells", 5, thorough=False),
-    "exact": Effort("all", 25, outlines=True, contacts=30_000),
+    "fast": Effort(0),
+    "balanced": Effort(5, 40_000, thorough=False),
+    "exact": Effort(25, 120_000, pixels=True, outlines=True),
 }
 
 

@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
 
 from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.index import Index
 from geomtact.inference.particles import Particles, Target, log_target, poses_of, prior_at
-from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
 from geomtact.se3 import Array, check_transforms
 
 
@@ -79,7 +78,7 @@ class Explored:
             np.log(weight) + log_target(log_likelihood, log_coarse, power) - log_evidence
             for power, weight, log_evidence in zip(POWERS, self.weights, self.log_evidence, strict=False)
         ]
-        return np.asarray(logsumexp(each, 0))
+        return np.asarray(np.logaddexp.reduce(each, 0))
 
     @cached_property
     def poses(self) -> Array:
@@ -105,8 +104,14 @@ class Explored:
         return density + prior_at(self.index, log_prior, poses.place, cut.reach - membrane)
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
-        """``n`` poses T_sensor_object (n, 4, 4) drawn by ``rng`` among the particles, at any image under the symmetry."""
+        """``n`` poses T_sensor_object (n, 4, 4) drawn by ``rng`` among the particles, at any image under the symmetry.
+
+        Instead of the few that no depth makes touch by the mesh, others are drawn again.
+        """
         T = self.settled(rng.choice(len(self.weight), n, p=self.weight))
+        touches = np.isfinite(self.index.space.penetration(T))
+        if touches.any():
+            T[~touches] = T[rng.choice(np.flatnonzero(touches), n - int(touches.sum()))]
         return self.index.directions.any_image(T, rng)
 
     def settled(self, rows: NDArray[np.int64]) -> Array:
@@ -137,6 +142,7 @@ class Explored:
             "hearts": self.hearts,
             "masses": self.masses,
             "touched": self.target.query.touched,
+            "source": np.array(self.target.query.source),
         }
 
     @classmethod
@@ -165,7 +171,10 @@ class Explored:
         whole = Particles(
             replace(poses, reach=membrane + depth), depth, arrays["log_likelihood"], log_coarse[poses.place], prior
         )
-        query = ContactQuery.showing(arrays["touched"].astype(bool), index.sensor)
+        source = str(arrays["source"])
+        if source not in INTERCEPT:
+            raise ValueError(f"a contact of another source: {source}")
+        query = ContactQuery.showing(arrays["touched"].astype(bool), index.sensor, source)
         return cls(
             Target(index, query, log_coarse, log_prior),
             tuple(whole.take(rows) for rows in np.split(np.arange(len(T)), np.cumsum(counts)[:-1])),

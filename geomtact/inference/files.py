@@ -31,7 +31,7 @@ _OFF = 1e-3  # largest deviation of the sum of probabilities from 1; hand-set
 WITHOUT_PRIOR = (
     "this file lacks the prior and other sensors: it holds only that one sensor without contact rules poses out"
 )
-_FORMAT = "geomtact/posterior/5"
+_FORMAT = "geomtact/posterior/6"
 _BROKEN = (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError)
 
 
@@ -40,9 +40,8 @@ def save(posterior: CellDistribution, path: str | Path) -> None:
     :func:`load` needs.
 
     A posterior may be spread over a million poses. For other programs the most probable are written out, those that
-    hold 99 % of the mass but at most 50,000, with log_prob normalised over them; ``row_log_prob`` holds all cells, for the runs
-    of ``row_length`` cells that begin at ``row_cell``; it is empty where each is one cell. What begins with ``explored`` is of a
-    posterior resolved within the cells; it is empty for others.
+    hold 99 % of the mass but at most 50,000, with log_prob normalised over them; ``row_log_prob`` holds all cells, of the
+    numbers ``row_cell``. What begins with ``explored`` is of a posterior resolved within the cells; it is empty for others.
 
     Raises
     ------
@@ -81,7 +80,6 @@ def save(posterior: CellDistribution, path: str | Path) -> None:
         "sensor_toml": np.array(posterior.index.sensor.to_toml()),
         "seed": np.array(posterior.seed),
         "row_cell": posterior.cells,
-        "row_length": np.zeros(0, np.int64) if posterior.runs is None else posterior.runs,
         "row_log_prob": posterior.cell_log_prob,
         "index_poses": np.array(len(posterior.index)),
         "T_frame_sensor": posterior.T_frame_sensor,
@@ -139,12 +137,12 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> CellDistribut
     try:
         mesh = Mesh(data["vertices"], data["faces"], meta["object"], meta["unit"], symmetry=_symmetry(data, meta))
         sensor = Sensor.from_toml(str(data["sensor_toml"]), str(path))
-        cells, runs, log_prob = data["row_cell"], data["row_length"], data["row_log_prob"]
+        cells, log_prob = data["row_cell"], data["row_log_prob"]
         poses, seed = int(data["index_poses"]), int(data["seed"])
         frame, evidence = str(data["frame"]), float(meta["log_evidence"])
         _check(mesh.sha256 == str(data["object_sha256"]), "its mesh is not the one that its checksum names")
         _check(frame in ("sensor", "world"), f"frame {frame!r}")
-        _check_rows(cells, runs, log_prob, poses)
+        _check_rows(cells, log_prob, poses)
         T_frame_sensor = check_pose(data["T_frame_sensor"], "T_frame_sensor")
         provenance = Provenance.from_json(meta["provenance"])
         diagnostics = Diagnostics(**meta["diagnostics"])
@@ -179,7 +177,6 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> CellDistribut
         contact=bool(meta["contact"]),
         log_evidence=evidence,
         seed=seed,
-        runs=runs if len(runs) else None,
         refined=refined,
         explored=explored,
         reference=reference,
@@ -219,13 +216,11 @@ def _read(path: Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any
     return data, meta
 
 
-def _check_rows(cells: NDArray[Any], runs: NDArray[Any], log_prob: NDArray[Any], poses: int) -> None:
-    """ValueError where runs of cells are none of a grid of so many ``poses``, or no distribution over it."""
+def _check_rows(cells: NDArray[Any], log_prob: NDArray[Any], poses: int) -> None:
+    """ValueError where cells are none of a grid of so many ``poses``, or no distribution over it."""
     _check(cells.ndim == 1 and cells.dtype.kind in "iu" and log_prob.shape == cells.shape, "rows of different length")
-    _check(len(runs) in (0, len(cells)), "rows of different length")
     if len(cells):
-        ends = cells + (runs if len(runs) else 1)
-        inside = cells[0] >= 0 and ends[-1] <= poses and (ends > cells).all() and (ends[:-1] <= cells[1:]).all()
+        inside = cells[0] >= 0 and cells[-1] < poses and (cells[:-1] < cells[1:]).all()
         _check(bool(inside), "cells that are not of its grid")
         total = float(np.exp(log_prob.astype(float)).sum())
         _check(abs(total - 1) < _OFF, f"probabilities that add up to {total:.3g}")

@@ -19,7 +19,6 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.contact_space.index import expand_runs
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array, inverse
@@ -124,7 +123,7 @@ class Filter:
             warnings=warnings,
         )
         if result is not None:
-            out = replace(out, cells=result[0], cell_log_prob=result[1], runs=None, contact=True)
+            out = replace(out, cells=result[0], cell_log_prob=result[1], contact=True)
         self._last = out if out.contact and not out.diagnostics.is_skipped else None
         return out
 
@@ -260,10 +259,4 @@ def _largest(values: NDArray[np.floating], n: int) -> NDArray[np.bool_]:
 
 def _gain(seen: Posterior) -> NDArray[np.float32]:
     """Log density (n,) of a posterior in all possible cells, relative to the uniform distribution."""
-    index = seen.index
-    if seen.runs is None:
-        return np.asarray(seen.cell_log_prob - index.log_possible_weight, np.float32)
-    density = (seen.cell_log_prob - np.log(index.mass(seen.cells, seen.runs))).astype(np.float32)
-    out = np.zeros(len(index), np.float32)
-    out[expand_runs(seen.cells, seen.runs)] = np.repeat(density, seen.runs)
-    return out[index.possible]
+    return np.asarray(seen.cell_log_prob - seen.index.log_possible_weight, np.float32)

@@ -164,7 +164,6 @@ def fused_posterior(
         first,
         cells=fused.cells,
         cell_log_prob=fused.log_prob,
-        runs=None,
         log_evidence=float(fused.weight @ [t.log_evidence for t in touches]) + fused.log_evidence,
         timing_ms=timing,
         **_of_all(touches, None if against is None else [against]),

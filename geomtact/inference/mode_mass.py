@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 
 from geomtact.contact_space.contact_maps import sample_pitch
 from geomtact.geometry.distance import PoseDistance, mode_radius
@@ -20,7 +20,7 @@ from geomtact.inference.explored import Explored
 from geomtact.se3 import Array, exp, inverse, log
 
 # These choose where the density is looked at: they change how precise a mass is, not what is estimated.
-_MODES = 20  # that are weighed
+_MODES = 5, 20  # that are weighed, at least and at most
 _ROUNDS, _DRAWS = 3, 150  # of poses, for each mode
 _WIDER = 1.6  # standard deviations of the draws over those of the poses before
 _TAIL = 5  # degrees of freedom of the draws, which are of Student's distribution
@@ -29,15 +29,17 @@ _KNOWN, _SAMPLES = 3, 0.5  # a covariance counts as much as so many draws, of th
 _POINTS = 128  # of the surface, for distances
 
 
-def weighed(explored: Explored, rng: np.random.Generator) -> tuple[Explored, float]:
-    """``explored`` with its leading modes, and the log of the sum of their masses as it was found.
+def weighed(explored: Explored, contacts: int, rng: np.random.Generator) -> tuple[Explored, float]:
+    """``explored`` with its leading modes, as many as ``contacts`` contacts weigh, and the log of the sum of their masses as it
+    was found.
 
     Each is the poses within the mode radius of its densest particle. If they have more than everything, then the evidence misses
     what they hold, and their masses are those of shares of them.
     """
     mesh = explored.index.mesh
     distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
-    hearts, members = _grown(explored, distance, radius)
+    count = int(np.clip(contacts // (_ROUNDS * _DRAWS), *_MODES))
+    hearts, members = _grown(explored, distance, radius, count)
     basis = explored.index.directions.symmetry.motions
     pitch = _SAMPLES * sample_pitch(explored.index.sensor)
     least = np.where(basis[:, :3].any(1), pitch / mesh.radius_rms, pitch)
@@ -88,14 +90,14 @@ def _log_volume(turn: Array, symmetry: Symmetry) -> Array:
 
 
 def _grown(
-    explored: Explored, distance: PoseDistance, radius: float
+    explored: Explored, distance: PoseDistance, radius: float, count: int
 ) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
-    """The densest particle of each mode, densest first, and the particles near it."""
+    """The densest particle of each of ``count`` modes, densest first, and the particles near it."""
     covered = np.zeros(len(explored.poses), bool)
     hearts: list[int] = []
     members: list[NDArray[np.int64]] = []
     for row in np.argsort(-explored.particle_log_density, kind="stable").tolist():
-        if len(hearts) == _MODES:
+        if len(hearts) == count:
             break
         if not covered[row]:
             near = distance.within(explored.poses[row], explored.poses, radius)
@@ -141,7 +143,9 @@ class _Mode:
         self.log_density.append(log_density)
         drawn = np.concatenate(self.motions)
         # all rounds are drawn from the mean of their distributions
-        density = logsumexp([each.log_density(drawn) for each in self.students], 0) - np.log(len(self.students))
+        density = np.logaddexp.reduce([each.log_density(drawn) for each in self.students], 0) - np.log(
+            len(self.students)
+        )
         log_weight = np.concatenate(self.log_density) - density
         self.log_integral = _log_mean(log_weight)
         weight = _flattened(log_weight)
@@ -180,8 +184,8 @@ def _log_mean(log_weight: Array) -> float:
     """Log of the mean weight, where none counts more than sqrt(n) mean ones (Ionides 2008): a draw where hardly any was to be
     expected would else decide alone."""
     n = len(log_weight)
-    most = logsumexp(log_weight) - 0.5 * np.log(n)
-    return float(logsumexp(np.minimum(log_weight, most)) - np.log(n))
+    most = np.logaddexp.reduce(log_weight) - 0.5 * np.log(n)
+    return float(np.logaddexp.reduce(np.minimum(log_weight, most)) - np.log(n))
 
 
 def _flattened(log_weight: Array) -> Array:

@@ -14,7 +14,6 @@ from geomtact.inference.distribution import (
     cell_log_density,
     cell_poses,
     leading_rows,
-    middle_cells,
     nearest_images,
     rows_of,
 )
@@ -62,7 +61,7 @@ def grown(posterior: CellDistribution, k: int, full: bool = True) -> list[tuple[
     ``full``, the mass is that of the mode's most probable cells.
     """
     moved = np.array(sorted(posterior.refined), np.int64)
-    seeds = np.union1d(moved, middle_cells(posterior, leading_rows(posterior)))
+    seeds = np.union1d(moved, posterior.cells[leading_rows(posterior)])
     seeds = seeds[np.argsort(-cell_log_density(posterior, seeds) - posterior.index.log_weight[seeds], kind="stable")]
     poses = cell_poses(posterior, seeds)
     distance, radius = PoseDistance(posterior.index.mesh, _POINTS), mode_radius(posterior.index.mesh)
@@ -173,4 +172,4 @@ def _within(
 def _mass_of(posterior: CellDistribution, cells: NDArray[np.int64]) -> Array:
     """Probability (m,) of the run that each of ``cells`` (m,) stands for; 0 where it stands for none."""
     row, held = rows_of(posterior, cells)
-    return np.where(held & (middle_cells(posterior, row) == cells), np.exp(posterior.cell_log_prob[row]), 0.0)
+    return np.where(held, np.exp(posterior.cell_log_prob[row]), 0.0)

@@ -11,12 +11,12 @@ from geomtact.scoring.fitted import FittedScorer, fitted_scorer
 from geomtact.scoring.probability import Calibration
 
 _Kind = TypeVar("_Kind")
-Fit = tuple[Calibration, Calibration | None, bool]
+Fit = tuple[Calibration, Calibration | None]
 
 
 def fit_of(scorer: FittedScorer) -> Fit:
     """What distinguishes a score from another of its name."""
-    return scorer.calibration, scorer.exact_calibration, scorer.cascade is None
+    return scorer.calibration, scorer.exact_calibration
 
 
 @lru_cache(4)

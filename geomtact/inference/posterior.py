@@ -21,13 +21,10 @@ from geomtact.inference.distribution import (
     cell_log_density,
     cell_poses,
     leading_rows,
-    log_mass_per_cell,
-    middle_cells,
     nearest_images,
     row_log_density,
     row_log_prob,
     row_poses,
-    run_lengths,
 )
 from geomtact.inference.files import load, save
 from geomtact.inference.modes import Mode, grown, mode_at, modes_within
@@ -85,7 +82,7 @@ class Posterior(CellDistribution):
 
     @cached_property
     def poses(self) -> Array:
-        """Poses (N, 4, 4) of the object in ``frame``, one per particle, or per run of cells; refined ones where registration
+        """Poses (N, 4, 4) of the object in ``frame``, one per particle or cell; refined ones where registration
         found better."""
         return row_poses(self, np.arange(len(self.log_prob)))
 
@@ -124,8 +121,8 @@ class Posterior(CellDistribution):
         return [mode_at(self, cell, mass) for cell, mass in grown(self, k)]
 
     def likeliest(self, n: int) -> Array:
-        """The ``n`` most probable poses (m, 4, 4) in ``frame``, most probable first: one a cell, or a run of cells of one
-        density; refined where registration found better.
+        """The ``n`` most probable poses (m, 4, 4) in ``frame``, most probable first: one a cell, refined
+        where registration found better.
 
         Fewer where there are fewer, none without contact. Most are neighbours; for places that are apart see :meth:`modes`, which
         has the same images under the object's symmetry.
@@ -134,8 +131,8 @@ class Posterior(CellDistribution):
             rows = np.argsort(-self._log_density, kind="stable")[: max(n, 0)]
             return self.T_frame_sensor @ nearest_images(self, self.explored.poses[rows])
         rows = leading_rows(self, n) if self.contact and n > 0 else np.zeros(0, np.int64)
-        rows = rows[np.argsort(-log_mass_per_cell(self)[rows], kind="stable")]
-        return self.T_frame_sensor @ nearest_images(self, cell_poses(self, middle_cells(self, rows)))
+        rows = rows[np.argsort(-self.cell_log_prob[rows], kind="stable")]
+        return self.T_frame_sensor @ nearest_images(self, cell_poses(self, self.cells[rows]))
 
     def log_density(self, T: ArrayLike) -> Any:
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
@@ -239,7 +236,7 @@ class Posterior(CellDistribution):
 
     @cached_property
     def _log_density(self) -> Array:
-        """Log density (N,) of the particles or runs relative to the uniform distribution."""
+        """Log density (N,) of the particles or cells relative to the uniform distribution."""
         if self.explored is not None:
             return self.explored.particle_log_density
         return row_log_density(self, np.arange(len(self.cells)))
@@ -253,10 +250,7 @@ class Posterior(CellDistribution):
     def _draw_cells(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
         total = np.cumsum(self._probability)
         row = np.minimum(np.searchsorted(total, rng.random(n) * total[-1]), len(total) - 1)
-        cells, runs = self.cells[row], run_lengths(self, row)
-        many = runs > 1
-        cells[many] = self.index.within_runs(cells[many], runs[many], rng.random(int(many.sum())))
-        return cells
+        return self.cells[row]
 
 
 def _share(T: Array, seed: int) -> float:

@@ -20,18 +20,18 @@ def reweight_cells(
     image_power: float = 1.0,
     log_prior: NDArray[np.floating] | None = None,
 ) -> Posterior:
-    """``posterior`` with the mass of the runs that hold ``cells`` shared out among these again.
+    """``posterior`` with the mass of ``cells`` shared out among these again.
 
-    Each run gets mass in proportion to what the images gave it before, to the power ``image_power``, times
-    exp(``log_likelihood``). A run without likelihood keeps its mass; cells in no run get none.
+    Each gets mass in proportion to what the images gave it before, to the power ``image_power``, times
+    exp(``log_likelihood``). A cell without likelihood keeps its mass; one that the posterior does not hold gets none.
 
     Parameters
     ----------
     cells : (n,) pose ids
-    log_likelihood : (n,) up to a constant; of several cells in a run the largest counts
-    kept_share : share of the runs' mass that stays as it was
-    others_factor : factor on the mass of all other runs, before normalising
-    image_power : power of what the images gave each run before
+    log_likelihood : (n,) up to a constant; of a cell that is named twice the largest counts
+    kept_share : share of the cells' mass that stays as it was
+    others_factor : factor on the mass of all other cells, before normalising
+    image_power : power of what the images gave each before
     log_prior : (M,) log mass of every cell of the index before the images; the uniform's by default
     """
     row, held_here = rows_of(posterior, cells)

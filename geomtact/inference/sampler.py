@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import logsumexp, ndtr, ndtri
+from scipy.special import ndtr, ndtri
 
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located, sample_pitch
 from geomtact.contact_space.index import Index
@@ -47,8 +47,10 @@ _TURN = 0.1  # rad, standard deviation of the first moves; they differ by a fact
 _EXPONENTS = np.geomspace(2e-4, 1, 40)  # of the likelihood, that the first step may have
 _HALVINGS = 30
 # Mean difference of two log evidences, by the weights of the powers, or log of the sum of all masses, above which no run is
-# believed [nats], and by how much more contacts are cut then; hand-set.
-_AGREE, MORE = 1.0, 4
+# believed [nats]; hand-set.
+_AGREE = 1.0
+_FIRST, _LEAST = 0.25, 3000  # share of the contacts with which it is tried first, and how many at least
+_WEIGHING = 0.5  # contacts that weigh the modes, for each that finds them
 
 
 def explore_twice(
@@ -59,10 +61,10 @@ def explore_twice(
     rng: np.random.Generator,
     log_prior: NDArray[np.floating] | None = None,
 ) -> Explored:
-    """As :func:`explore`, with its modes, by two runs that share the ``contacts`` and have to agree on the evidence.
+    """As :func:`explore`, with its modes, by two runs that share some of the ``contacts`` and have to agree on the evidence.
 
     Where they do not, one has missed what the other found; where the modes hold more than everything, both have. Then both are
-    repeated with more contacts. If that does not help, the largest powers of the likelihood are left out, until they agree.
+    repeated with all ``contacts``. If that does not help, the largest powers of the likelihood are left out, until they agree.
 
     Raises
     ------
@@ -71,19 +73,17 @@ def explore_twice(
     """
     cut, all_powers = 0, len(POWERS)
     ContactMaps.of(index)  # made or read here, before both runs ask for them
-    for more in (1, MORE):
+    some = min(max(round(_FIRST * contacts), _LEAST), contacts)
+    for asked in sorted({some, contacts}):
         with ThreadPoolExecutor(2) as pool:
-            runs = [
-                pool.submit(explore, index, query, coarse, more * contacts // 2, each, log_prior)
-                for each in rng.spawn(2)
-            ]
+            runs = [pool.submit(explore, index, query, coarse, asked // 2, each, log_prior) for each in rng.spawn(2)]
             one, other = (run.result() for run in runs)
         cut += one.contacts + other.contacts
-        for powers in range(all_powers, 1 if more == MORE else all_powers - 1, -1):
+        for powers in range(all_powers, 1 if asked == contacts else all_powers - 1, -1):
             found = replace(_pooled(one, other, powers, rng), contacts=cut)
             apart = float(found.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
             if apart < _AGREE:
-                found, log_sum = weighed(found, rng)
+                found, log_sum = weighed(found, round(_WEIGHING * asked), rng)
                 if log_sum < _AGREE:
                     return found
                 cut = found.contacts
@@ -130,7 +130,8 @@ def explore(
     cells = index.weight.astype(float) / index.weight.sum(dtype=float)
     measure = cells.sum(0)
     share = (1 - _UNIFORM) * coarse / coarse.sum() + _UNIFORM * measure
-    target = Target(index, query, np.log(share / measure), log_prior)
+    log_coarse = np.log(share / measure).astype(np.float32).astype(float)  # as files hold it
+    target = Target(index, query, log_coarse, log_prior)
     known = 0.0  # log of the mean of the coarse density under the prior
     if log_prior is not None:
         share = share / measure * (cells * np.exp(log_prior.reshape(cells.shape))).sum(0)
@@ -138,7 +139,7 @@ def explore(
     n = max(contacts // (_DRAWS * _CUTS + _MOVES * _STEPS), 20)
     drawn, log_weight, cut = _draw(target, share, _DRAWS * n, rng)
     # the evidence of the coarse posterior is known: what is left is an error of the measure, which all share
-    whole = float(logsumexp(log_weight + drawn.log_target(0)))
+    whole = float(np.logaddexp.reduce(log_weight + drawn.log_target(0)))
     if not np.isfinite(whole):
         raise InputError(f"{index.mesh.name}: no pose that was drawn touches the sensor; allow more contacts")
     log_weight = log_weight + known - whole
@@ -149,7 +150,7 @@ def explore(
     found, evidence = [], []
     for each in (*(each for each in POWERS if each < power), power):
         weight = log_weight + drawn.log_target(each)
-        evidence.append(float(logsumexp(weight)))
+        evidence.append(float(np.logaddexp.reduce(weight)))
         found.append(drawn.take(_resampled(weight, n, rng)))
     particles, log_evidence, exponents, size = found[-1], evidence[-1], [power], 1.0
     while True:
@@ -165,7 +166,7 @@ def explore(
         change = particles.log_likelihood - particles.log_coarse
         after = min(each for each in POWERS if each > power)
         step = min(_next_step(change, 1 - power), after - power)
-        log_evidence += float(logsumexp(step * change)) - np.log(n)
+        log_evidence += float(np.logaddexp.reduce(step * change)) - np.log(n)
         particles = particles.take(_resampled(step * change, n, rng))
         power = after if step == after - power else power + step
         exponents.append(power)

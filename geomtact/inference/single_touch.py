@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
+from geomtact.inference.distribution import cell_densities
 from geomtact.inference.effort import Effort
 from geomtact.inference.facts import Diagnostics, Provenance, ViewRecord
 from geomtact.inference.joint_refinement import refine_jointly
@@ -38,7 +39,7 @@ _CONTRADICTION_NATS = 5.0
 
 
 def touch_posterior(
-    index: Index, scorer: FittedScorer, placed: Placed, prior: Any, resolved: str, provenance: Provenance, seed: int
+    index: Index, scorer: FittedScorer, placed: Placed, prior: Any, pixels: bool, provenance: Provenance, seed: int
 ) -> tuple[Posterior, LogMass]:
     """The posterior of one image on the cells of ``index``, not refined, and the log prior mass of every cell (M,).
 
@@ -47,7 +48,7 @@ def touch_posterior(
     Parameters
     ----------
     prior : as of ``Localizer.localize``, opened
-    resolved : which cells are scored, as ``Effort.resolved``
+    pixels : whether the score counts them too
     """
     observation, T_frame_sensor, frame = placed.observation, placed.T_frame_sensor, placed.frame
     contact, warnings = observation.contact, [*index.mesh.warnings, *observation.warnings]
@@ -71,10 +72,7 @@ def touch_posterior(
     with timed(timing, "score"):
         if prior is not None:
             log_prior = prior_log_mass(index, prior, T_frame_sensor, frame)
-        if prior is None and not above:
-            rows = scorer.rows(index, shown, resolved)
-        else:
-            rows = scorer.cells(index, shown, log_prior, resolved == "all", above)
+        rows = scorer.rows(index, shown, log_prior, pixels, above)
     with timed(timing, "posterior"):
         log_prob = rows.log_prob
         model = scorer.evidence_model
@@ -93,9 +91,8 @@ def touch_posterior(
     calibration = rows.calibration
     posterior = replace(
         posterior,
-        cells=rows.first,
+        cells=rows.cells,
         cell_log_prob=log_prob,
-        runs=rows.runs,
         log_evidence=evidence,
         provenance=replace(
             posterior.provenance, scored_by=rows.by, temperature=calibration.temperature, floor=calibration.floor
@@ -121,23 +118,21 @@ def explore_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer
         return posterior
     with timed(posterior.timing_ms, "explore"):
         mask = observation.contact.soft_mask
-        coarse = np.exp(scorer.log_mass(index, mask)).sum(0)
         density = None
-        if log_prior is not None:
+        if log_prior is None:
+            coarse = (cell_densities(posterior).reshape(index.weight.shape) * index.weight).sum(0, dtype=float)
+        else:
+            coarse = np.exp(scorer.log_mass(index, mask)).sum(0)
             density = np.where(index.log_weight > -np.inf, log_prior - np.maximum(index.log_weight, -1e3), -np.inf)
-        query, rng = ContactQuery.of(mask, posterior.sensor), np.random.default_rng(posterior.seed)
+        source = "mask" if observation.method is None else "image"
+        query, rng = ContactQuery.of(mask, posterior.sensor, source), np.random.default_rng(posterior.seed)
         try:
             explored = explore_twice(index, query, coarse, effort.contacts, rng, density)
         except InputError as error:
             warning = f"the pose is not resolved within the grid's cells: {error}"
             return replace(posterior, warnings=[*posterior.warnings, warning])
-    warnings = list(posterior.warnings)
-    if len(explored.particles) < len(POWERS):
-        warnings.append(
-            f"the pose is resolved less finely than the contact allows: {explored.contacts:,} contacts do not settle how likely "
-            "it is; Effort(contacts=) allows more"
-        )
-    return replace(posterior, explored=explored, warnings=warnings)
+    settled = replace(posterior.diagnostics, settled_power=POWERS[len(explored.particles) - 1])
+    return replace(posterior, explored=explored, diagnostics=settled)
 
 
 def drop_lost_contact_prior(posterior: Posterior, prior: Any) -> tuple[Posterior, Any]:

@@ -6,7 +6,6 @@ import numpy as np
 
 from geomtact.contact_space.draw import draw_within
 from geomtact.errors import InputError
-from geomtact.inference.distribution import run_lengths
 from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array, exp
 
@@ -19,7 +18,7 @@ def draw_cells(posterior: Posterior, n: int, rng: np.random.Generator, within: i
     """
     p = np.exp(np.asarray(posterior.cell_log_prob, float))
     row = rng.choice(len(p), n, p=p / p.sum())
-    cells = posterior.index.within_runs(posterior.cells[row], run_lengths(posterior, row), rng.random(n))
+    cells = posterior.cells[row]
     T = draw_within(posterior.index, posterior.space, np.tile(cells, within), rng)[0].reshape(-1, n, 4, 4)
     for i in np.flatnonzero(np.isin(cells, list(posterior.refined))):
         found = posterior.refined[int(cells[i])]

@@ -110,19 +110,14 @@ def _drawn(index: Index, rng: np.random.Generator) -> tuple[Array, int] | None:
     if index.sensor.housing_depth is not None:
         T, depth = index.space.sample(1, rng, batch=_BATCH)
         return T[0], int(index.lookup(T, depth)[0])
-    cells = index.within_runs(0, len(index), rng.random(1))
+    cells = index.at_share(rng.random(1))
     T, _, found = draw_within(index, index.space, cells, rng, tries=5)
     return (T[0], int(cells[0])) if found[0] else None
 
 
-def fit_calibration(
-    scorer: Scorer, index: Index, touches: CalibrationTouches, weight: NDArray[np.floating] | None = None
-) -> Calibration:
-    """The temperature and uniform mixture weight under which the true poses of ``touches`` are most probable.
-
-    ``weight`` is the measure of what ``scorer`` scores and ``touches.ids`` count: the cells of ``index`` by default.
-    """
-    weight = np.asarray(index.weight).ravel() if weight is None else weight
+def fit_calibration(scorer: Scorer, index: Index, touches: CalibrationTouches) -> Calibration:
+    """The temperature and uniform mixture weight under which the true poses of ``touches`` are most probable."""
+    weight = np.asarray(index.weight).ravel()
     return fit_to_scores(lambda i: scorer.score(index, touches.masks[i]).ravel(), touches.ids, weight)
 
 

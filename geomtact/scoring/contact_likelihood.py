@@ -36,12 +36,13 @@ from geomtact.sensing.sensor import Sensor
 
 # Fitted on procedural objects for the mean log density at the true pose: the first two by ``python -m tools.training likelihood``
 # (docs/results/contact-likelihood.json), the weights by ``python -m tools.training mixture`` (docs/results/mixture.json).
-RATE = 34.1e9  # nats for each m^3 of energy
-SHARE = (5.9, 11.1)  # of the beta distribution of an elastic contact's share of the depth
+RATE = 36.1e9  # nats for each m^3 of energy
+SHARE = (6.47, 13.18)  # of the beta distribution of an elastic contact's share of the depth
 POWERS = (0.0, 0.03, 0.1, 0.3, 1.0)  # of the likelihood, by the posteriors that are mixed; hand-set
-# Their weights are the softmax of intercept + slope log(outline / OUTLINE).
-INTERCEPT = (-1.97, 0.07, 0.41, 0.60, 0.0)
-SLOPE = (0.69, 1.27, 0.82, 0.41, 0.0)
+# Their weights are the softmax of intercept + slope log(outline / OUTLINE): of a given mask, and of a contact found in an image,
+# perhaps badly.
+INTERCEPT = {"mask": (-3.89, -1.54, -0.21, 0.37, 0.0), "image": (-2.65, 0.00, 0.10, 0.29, 0.0)}
+SLOPE = {"mask": (0.24, 1.02, 1.26, 0.31, 0.0), "image": (0.80, 0.98, 0.80, 0.16, 0.0)}
 OUTLINE = 15e-3  # m, the length of a usual outline
 RIGID = 0.5  # share of touches on a rigid gel
 _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more is added
@@ -58,6 +59,7 @@ class ContactQuery:
     centroid : (3,) of the contact, on the membrane [m]
     area : of the contact, in samples
     log_outline : log of the length of its outline over ``OUTLINE``
+    source : "mask", or "image" where it was found in one
     """
 
     touched: NDArray[np.bool_]
@@ -65,14 +67,15 @@ class ContactQuery:
     centroid: Array
     area: float
     log_outline: float
+    source: str
 
     @classmethod
-    def of(cls, mask: SoftMask, sensor: Sensor) -> ContactQuery:
+    def of(cls, mask: SoftMask, sensor: Sensor, source: str = "mask") -> ContactQuery:
         """From the observed ``mask`` (H, W), which shows contact."""
-        return cls.showing(cleaned(mask, sensor) > 0.5, sensor)
+        return cls.showing(cleaned(mask, sensor) > 0.5, sensor, source)
 
     @classmethod
-    def showing(cls, touched: NDArray[np.bool_], sensor: Sensor) -> ContactQuery:
+    def showing(cls, touched: NDArray[np.bool_], sensor: Sensor, source: str) -> ContactQuery:
         """From the contact ``touched`` (H, W) without specks."""
         pitch = float(np.sqrt(sensor.pixel_area(touched.shape)))
         count = touched.sum()
@@ -81,12 +84,12 @@ class ContactQuery:
         # a straight line at any angle crosses 4 / pi times as many pairs of neighbours as its length has pixels
         crossed = (touched[:, 1:] != touched[:, :-1]).sum() + (touched[1:] != touched[:-1]).sum()
         log_outline = float(np.log(max(0.25 * np.pi * pitch * crossed, pitch) / OUTLINE))
-        return cls(touched, _samples(touched, pitch, sensor), centroid, float(area), log_outline)
+        return cls(touched, _samples(touched, pitch, sensor), centroid, float(area), log_outline, source)
 
     @property
     def weights(self) -> Array:
         """Weights (K,) of the posteriors by ``POWERS``."""
-        return np.asarray(softmax(np.array(INTERCEPT) + np.array(SLOPE) * self.log_outline))
+        return np.asarray(softmax(np.array(INTERCEPT[self.source]) + np.array(SLOPE[self.source]) * self.log_outline))
 
     def log_likelihood(self, energy: NDArray[np.float32]) -> Array:
         """Log likelihood (n,) of the contact at poses whose contacts have ``energy`` (n, SHARES), up to a constant of the image;

@@ -18,7 +18,6 @@ from geomtact.errors import MeshError
 from geomtact.files import write_text, write_whole
 from geomtact.progress import Progress
 from geomtact.scoring.calibration import CalibrationTouches, fit_calibration, simulate_touches
-from geomtact.scoring.cascade import Cascade, Rows
 from geomtact.scoring.catalogue import (
     DEFAULT_SCORER,
     ENCODER,
@@ -33,21 +32,45 @@ from geomtact.scoring.encoder import EncoderScorer
 from geomtact.scoring.evidence_model import EvidenceModel
 from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
 from geomtact.scoring.moments import Moments
-from geomtact.scoring.probability import Calibration
+from geomtact.scoring.probability import Calibration, posterior_log_prob
 from geomtact.scoring.product import Comparison, Product, choose
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import describe_index
 from geomtact.sensing.contact import SoftMask
 
-FORMAT = 13
+FORMAT = 14
 # All constants are hand-set.
 _COSTLY = 300_000  # number of poses above which a second score slows a touch down
-_LARGE = 2_000_000  # number of poses up to which scoring all of them takes no longer than choosing which
 _USUAL = 0.9  # share of the touches whose distance to the nearest stored contact counts as usual
 _OUTLIERS = 0.01  # share of the touches whose evidence, or best pose, counts as an outlier
 _LEAST_GAIN = 0.05  # least mean information gain of a touch, below which preparing fails [nats]
 TOUCHES, SEED = 500, 20_200_531  # number and seed of the simulated touches that scores are calibrated on
 _LEARN = 0.6  # share of these touches that the moments are fitted to; the rest are held out
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Scores of all cells that have mass.
+
+    Attributes
+    ----------
+    cells : (N,) pose ids, ascending
+    score : (N,)
+    log_prior : (N,) log mass of each
+    calibration : of the scores
+    by : name of the score
+    """
+
+    cells: NDArray[np.int64]
+    score: NDArray[np.float32]
+    log_prior: NDArray[np.floating]
+    calibration: Calibration
+    by: str
+
+    @property
+    def log_prob(self) -> NDArray[np.floating]:
+        """Log mass (N,) of each, by its score."""
+        return posterior_log_prob(self.score, self.log_prior, self.calibration)
 
 
 @dataclass(frozen=True)
@@ -59,7 +82,6 @@ class FittedScorer:
     name : as requested
     scorer, calibration : of the cells
     evidence_model : gives the likelihood of a touch, given the object
-    cascade : of coarse cells and some cells, by the encoder; None for other scores
     exact_scorer, exact_calibration : of one that counts the pixels too; None where the score goes without
     """
 
@@ -67,28 +89,15 @@ class FittedScorer:
     scorer: Scorer
     calibration: Calibration
     evidence_model: EvidenceModel
-    cascade: Cascade | None = None
     exact_scorer: Scorer | None = None
     exact_calibration: Calibration | None = None
 
-    def rows(self, index: Index, mask: SoftMask, resolved: str) -> Rows:
-        """Scores of all cells under the uniform prior.
-
-        ``resolved`` says how: "coarse" cells alone, "cells" where the mass is and, on a large grid, coarse cells elsewhere, or
-        "all" cells, the pixels counted too. A score without a coarse form scores all cells.
-        """
-        if self.cascade is not None and resolved == "coarse":
-            return self.cascade.whole(index, mask)
-        if self.cascade is not None and self.cascade.partly is not None and resolved == "cells":
-            return self.cascade.expanded(index, mask)
-        return self.cells(index, mask, None, resolved == "all")
-
-    def cells(
+    def rows(
         self,
         index: Index,
         mask: SoftMask,
-        log_prior: NDArray[np.floating] | None,
-        exact: bool,
+        log_prior: NDArray[np.floating] | None = None,
+        exact: bool = False,
         above: float = 0.0,
     ) -> Rows:
         """Scores of every single cell that has mass.
@@ -107,13 +116,13 @@ class FittedScorer:
         scores = [index.deeper(scorer.score(index, each), above).reshape(-1) for each in masks]
         score = mix_hypotheses(shares, scores, index.log_weight, calibration.temperature)
         score = score if len(cells) == len(score) else score[cells]
-        return Rows(cells, None, score, prior, calibration, scorer.name)
+        return Rows(cells, score, prior, calibration, scorer.name)
 
     def log_mass(self, index: Index, mask: SoftMask) -> NDArray[np.float64]:
         """Log mass (P, n) of every cell at all places of ``index``, under the uniform prior."""
-        rows = self.cells(index, mask, None, False)
+        rows = self.rows(index, mask)
         out = np.full(index.height.size, -np.inf)
-        out[rows.first] = rows.log_prob
+        out[rows.cells] = rows.log_prob
         return out.reshape(index.height.shape)
 
 
@@ -233,11 +242,6 @@ def _fit(name: str, scorers: dict[str, Scorer], index: Index, touches: Calibrati
     data["calibration"] = asdict(calibration)
     if name == DEFAULT_SCORER and data["exact_weights"] == data["weights"]:
         data["exact"] = data["calibration"]
-    vectors = scorers[vectors_name(name)]
-    if isinstance(vectors, EncoderScorer):
-        alone = list(data["weights"]) == [vectors_name(name)]
-        fine = calibration if alone else fit_calibration(vectors, index, touches)
-        data["cascade"] = Cascade.fit(vectors, fine, index, touches, alone and len(index) > _LARGE).to_json()
     return data
 
 
@@ -247,10 +251,6 @@ def _from_json(name: str, data: dict[str, Any], scorers: dict[str, Scorer], inde
     m = data["moments"]
     moments = Moments(np.array(m["bias"]), np.array(m["covariance"]), m["freedom"])
     scorers = {**_limited(scorers, data["nearest"]), "moments": moments}
-    vectors = scorers.get(vectors_name(name))
-    cascade = None
-    if isinstance(vectors, EncoderScorer):
-        cascade = Cascade.from_json(data["cascade"], vectors, index)
     exact_scorer, exact_calibration = None, None
     if "exact" in data:
         exact_scorer = _weighed(data["exact_weights"], scorers)
@@ -260,7 +260,6 @@ def _from_json(name: str, data: dict[str, Any], scorers: dict[str, Scorer], inde
         _weighed(data["weights"], scorers),
         Calibration(**data["calibration"]),
         EvidenceModel(moments, tuple(data["usual"])),
-        cascade,
         exact_scorer,
         exact_calibration,
     )

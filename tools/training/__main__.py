@@ -94,8 +94,9 @@ def mixture(
     from tools.training.mixture import fit_mixture
 
     with progress_bar("fitting") as progress:
-        found = fit_mixture(out, folder_of(work, out), objects, touches, seed, progress)
-    to_stderr(f"{found.gain:.2f} nats at the true poses, {found.expected_gain:.2f} expected")
+        fits = fit_mixture(out, folder_of(work, out), objects, touches, seed, progress)
+    for source, found in fits.items():
+        to_stderr(f"{source}: {found.gain:.2f} nats at the true poses, {found.expected_gain:.2f} expected")
 
 
 def with_rate(settings: Any, rate: float | None) -> Any:

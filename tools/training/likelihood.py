@@ -189,7 +189,7 @@ class _Model(torch.nn.Module):
         super().__init__()
         self.rate = torch.nn.Parameter(torch.tensor(RATE * _UNIT).log())
         self.share = torch.nn.Parameter(torch.tensor(SHARE).log())
-        self.weight = torch.nn.Parameter(torch.tensor(INTERCEPT))
+        self.weight = torch.nn.Parameter(torch.tensor(INTERCEPT["mask"]))
 
     def log_likelihood(self, energy: torch.Tensor) -> torch.Tensor:
         """Of energies (..., SHARES): (...)."""

@@ -2,7 +2,8 @@
 
 Touches of procedural objects, on any side or a known face, on rigid and elastic gels, with noise of any strength up to heavy, are
 explored by the sampler as it is. What each power makes of the true pose says how to weigh it: the weights maximise the mean log
-density at the true poses ("covariate-dependent stacking", Yao et al. 2022).
+density at the true poses ("covariate-dependent stacking", Yao et al. 2022). Every third contact is found badly, as in an image:
+given masks have weights without these.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ _DISPLACED = 1.2e-3, (1e-3, 8e-3)  # m: by how much it is displaced, rms, at mos
 _PENALTY = 1e-3  # of the square of a slope, beside a mean log density
 _LEAST = -60.0  # nats: a lower log density at a true pose is as bad as this
 
-SCHEMA = "geomtact/mixture/1"
+_SINGLE = ("log_outline", "elastic", "badly_found")
+
+SCHEMA = "geomtact/mixture/2"
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 
 
@@ -57,6 +60,7 @@ class Example:
     sizes : (K,) how many particles each has
     log_outline : log of the outline's length over ``OUTLINE``
     elastic : whether the gel was
+    badly_found : whether the contact was
     """
 
     at_truth: Array
@@ -64,6 +68,7 @@ class Example:
     sizes: Array
     log_outline: float
     elastic: bool
+    badly_found: bool
 
 
 def make_examples(
@@ -79,14 +84,15 @@ def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
     sensor, mesh = drawn_object(i, SIZES, rng)
     face = [(np.eye(3)[rng.integers(3)] * rng.choice([-1, 1]), 0.0)] if i % FACES == FACES - 1 else None
     localizer = Localizer.prepare(mesh, sensor=sensor, approach=face, max_poses=MAX_POSES)
-    for touch in _touches(localizer, touches, rng):
+    for touch, badly_found in _touches(localizer, touches, rng):
         query = ContactQuery.of(touch.mask, sensor)
         coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
-        yield _example(explore(localizer.index, query, coarse, CONTACTS, rng), touch)
+        yield _example(explore(localizer.index, query, coarse, CONTACTS, rng), touch, badly_found)
 
 
-def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator[Touch]:
-    """``n`` touches with noise of any strength up to heavy, that still show 1 mm^2 of contact.
+def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator[tuple[Touch, bool]]:
+    """``n`` touches with noise of any strength up to heavy, without those that show less than 1 mm^2 of contact then, and whether
+    each is found badly.
 
     Every third is found badly, as in images of a gel that nobody measured: its outline lies too far out or in, and is displaced
     by much more than noise does.
@@ -94,17 +100,17 @@ def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator
     space = localizer.space
     for number, touch in enumerate(each_touch(space, n, int(rng.integers(1 << 31)), noise=CLEAN)):
         mask = simulate_mask(space, touch.T_sensor_object, touch.elastic)
-        noise = draw_noise(CALIBRATION_NOISE, rng)
-        if number % 3 == 2:
+        noise, badly_found = draw_noise(CALIBRATION_NOISE, rng), number % 3 == 2
+        if badly_found:
             pitch = float(np.sqrt(space.sensor.pixel_area(mask.shape)))
             mask = from_outline(mask, pitch) < rng.uniform(-_OFF, _OFF)
             noise = replace(noise, outline_rms=rng.uniform(0, _DISPLACED[0]), correlation=_DISPLACED[1])
         mask = spoilt(mask, space, noise, rng)
         if counts(space, mask):
-            yield replace(touch, mask=mask)
+            yield replace(touch, mask=mask), badly_found
 
 
-def _example(explored: Explored, touch: Touch) -> Example:
+def _example(explored: Explored, touch: Touch, badly_found: bool) -> Example:
     index, query = explored.index, explored.target.query
     poses, membrane = located(index, touch.T_sensor_object[None])
     cut = ContactMaps.of(index).compare(query.samples, query.area, poses, membrane)
@@ -116,14 +122,14 @@ def _example(explored: Explored, touch: Touch) -> Example:
         return np.stack([log_target(log_likelihood, log_coarse, power) for power in POWERS], 1) - evidence
 
     sizes = np.array([len(p) for p in explored.particles])
-    return Example(by_power(at, coarse)[0], by_power(*each), sizes, query.log_outline, touch.elastic)
+    return Example(by_power(at, coarse)[0], by_power(*each), sizes, query.log_outline, touch.elastic, badly_found)
 
 
 def _save(path: Path, examples: Sequence[Example]) -> None:
     n = max(len(e.at_particles) for e in examples)
     padded = [np.pad(e.at_particles, ((0, n - len(e.at_particles)), (0, 0))) for e in examples]
     columns = {name: np.stack([getattr(e, name) for e in examples]) for name in ("at_truth", "sizes")}
-    single = {name: np.array([getattr(e, name) for e in examples]) for name in ("log_outline", "elastic")}
+    single = {name: np.array([getattr(e, name) for e in examples]) for name in _SINGLE}
     with open(path, "wb") as file:
         np.savez(file, allow_pickle=False, at_particles=np.stack(padded).astype(np.float32), **columns, **single)
 
@@ -131,7 +137,7 @@ def _save(path: Path, examples: Sequence[Example]) -> None:
 def _load(path: Path) -> list[Example]:
     with np.load(path, allow_pickle=False) as data:
         rows = zip(*(data[name] for name in Example.__dataclass_fields__), strict=True)
-        return [Example(t, p[: s.sum()].astype(float), s, float(o), bool(e)) for t, p, s, o, e in rows]
+        return [Example(t, p[: s.sum()].astype(float), s, float(o), bool(e), bool(b)) for t, p, s, o, e, b in rows]
 
 
 @dataclass(frozen=True)
@@ -192,10 +198,12 @@ def fit(examples: Sequence[Example]) -> Fit:
 
 def fit_mixture(
     out: Path, folder: Path, objects: int, touches: int, seed: int, progress: Progress | None = None
-) -> Fit:
-    """Make examples in ``folder``, fit the weights to them and write these to ``out``."""
-    found = fit(make_examples(folder, objects, touches, seed, progress))
+) -> dict[str, Fit]:
+    """Make examples in ``folder``, fit the weights of masks and of images to them, and write these to ``out``."""
+    examples = make_examples(folder, objects, touches, seed, progress)
+    found = {"mask": fit([e for e in examples if not e.badly_found]), "image": fit(examples)}
     settings = {"objects": objects, "touches": touches, "seed": seed, "contacts": CONTACTS, "max_poses": MAX_POSES}
-    content = {"schema": SCHEMA, "settings": settings, "sensors": SENSORS, "powers": POWERS, **asdict(found)}
-    write_text(out, json.dumps(content | {"versions": versions()}, indent=1) + "\n")
+    content = {"schema": SCHEMA, "settings": settings, "sensors": SENSORS, "powers": POWERS}
+    fits = {source: asdict(each) for source, each in found.items()}
+    write_text(out, json.dumps(content | fits | {"versions": versions()}, indent=1) + "\n")
     return found

@@ -15,14 +15,15 @@ from geomtact.contact_space.index import Index
 from geomtact.contact_space.touches import Touch
 from geomtact.errors import InputError
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.inference.sampler import MORE, explore_twice
+from geomtact.inference.effort import EFFORTS
+from geomtact.inference.sampler import explore_twice
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
 ROOTS = (75_000, 300_000, 1_200_000)  # poses of the grids whose cells are opened
-CONTACTS = (3_000, 10_000, 30_000)  # budgets of the sampler, as ``Effort.contacts``
+CONTACTS = (3_000, *(EFFORTS[name].contacts for name in ("balanced", "exact")))  # as ``Effort.contacts``
 CHILDREN = 32  # contacts that open a cell: two parts of each tilt, turn, x and y
 _IN_CELL = 400  # poses drawn in the true cell
 BUDGETS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)  # of opening, for the chart
@@ -113,7 +114,7 @@ def _found(
         density = np.log(mass / index.weight.sum(0, dtype=float))
         at = float(density[located(index, T)[0].place[0]])
         level = float(mass[density > at].sum())
-        return _Found(at, float(mass @ density), level, False, (1 + MORE) * contacts, 1, 0.0, False)
+        return _Found(at, float(mass @ density), level, False, contacts, 1, 0.0, False)
     at, most = float(explored.log_density(T)[0]), float(explored.particle_log_density.max())
     first = explored.poses[explored.hearts[0]]
     held = bool(PoseDistance(index.mesh).within(first, T, mode_radius(index.mesh))[0])

@@ -104,7 +104,7 @@ _THESIS_POSES = 150_000  # of its discretisation (6.1.2)
 
 # what is modelled: (the variant without it, the variant with it), both of which count nats from the same uniform
 MODELLED = {
-    "every cell, not blocks": ("fast", DEFAULT),
+    "balanced, not fast": ("fast", DEFAULT),
     "outlines, pixels and 25 modes (exact)": (DEFAULT, "exact"),
     "a mode refined": ("no mode refined", "1 mode"),
     "5 modes refined": ("1 mode", DEFAULT),
@@ -183,7 +183,7 @@ def prepare(
         fitted = localizer.scorer
         touches = simulate_touches(localizer.index, TOUCHES, SEED, progress, way.elastic, way.noise)
         calibration = fit_calibration(fitted.scorer, localizer.index, touches)
-        localizer = replace(localizer, scorer=replace(fitted, calibration=calibration, cascade=None))
+        localizer = replace(localizer, scorer=replace(fitted, calibration=calibration))
     steps = (times.index, times.describe, times.calibrate)
     known = [s for s in steps if s is not None]
     return localizer, sum(known) if len(known) == len(steps) else None

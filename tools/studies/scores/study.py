@@ -89,9 +89,6 @@ def prepare(
 def bytes_read(localizer: Localizer, effort: str) -> float:
     """Bytes a pose that the localizer's score reads for a touch at ``effort``."""
     fitted, index = localizer.scorer, localizer.index
-    if effort == "fast" and fitted.cascade is not None:
-        blocks = fitted.cascade.coarse_scorer
-        return (blocks.narrowing.nbytes + blocks.narrowed.nbytes + blocks.constant.nbytes) / len(index)
     exact = fitted.exact_scorer if effort == "exact" else None
     return bytes_per_pose(exact or fitted.scorer, index)
 

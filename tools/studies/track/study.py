@@ -117,10 +117,7 @@ def _judged(
     the share ``tie`` counts."""
     index = posterior.index
     gain = float(cell_log_density(posterior, cell)[0])
-    if posterior.runs is None:
-        log_measure = index.log_weight[posterior.cells]
-    else:
-        log_measure = np.log(index.mass(posterior.cells, posterior.runs))
+    log_measure = index.log_weight[posterior.cells]
     density, probability = posterior.cell_log_prob - log_measure, np.exp(posterior.cell_log_prob)
     held = probability > 0
     claimed = float(probability[held] @ density[held])
