@@ -15,8 +15,8 @@ class Effort:
     ----------
     modes : that are refined
     contacts : that may be cut, of one mask that is not of a known face, to resolve the pose within the cells of the grid (see
-        ``inference.sampler``): a quarter, or 3,000, at first, and all of them where those do not settle it; half as many more
-        weigh the modes. 0 leaves the cells as they are
+        ``inference.sampler``): a sixteenth at first, but at least 3,000; a quarter where that does not settle all of the
+        likelihood; all where that settles nothing. Half as many more weigh the modes. 0 leaves the cells as they are
     thorough : whether each mode is refined by all registrations or by one
     pixels : whether the score of cells that no contacts resolve counts the pixels too
     outlines : whether, of one mask that no contacts resolve, the outline refines the modes where few enough cells are left (see
@@ -38,8 +38,8 @@ class Effort:
 
 EFFORTS = {
     "fast": Effort(0),
-    "balanced": Effort(5, 40_000, thorough=False),
-    "exact": Effort(25, 120_000, pixels=True, outlines=True),
+    "balanced": Effort(5, thorough=False),
+    "exact": Effort(25, 160_000, pixels=True, outlines=True),
 }
 
 

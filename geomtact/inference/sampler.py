@@ -49,7 +49,7 @@ _HALVINGS = 30
 # Mean difference of two log evidences, by the weights of the powers, or log of the sum of all masses, above which no run is
 # believed [nats]; hand-set.
 _AGREE = 1.0
-_FIRST, _LEAST = 0.25, 3000  # share of the contacts with which it is tried first, and how many at least
+_MORE, _LEAST = 4, 3000  # by how much more contacts are cut in the next attempt, and how many in the first, at least
 _WEIGHING = 0.5  # contacts that weigh the modes, for each that finds them
 
 
@@ -64,7 +64,8 @@ def explore_twice(
     """As :func:`explore`, with its modes, by two runs that share some of the ``contacts`` and have to agree on the evidence.
 
     Where they do not, one has missed what the other found; where the modes hold more than everything, both have. Then both are
-    repeated with all ``contacts``. If that does not help, the largest powers of the likelihood are left out, until they agree.
+    repeated with four times as many. If that does not help, the largest powers of the likelihood are left out, until they agree;
+    if they agree on nothing, both are repeated once more.
 
     Raises
     ------
@@ -73,13 +74,13 @@ def explore_twice(
     """
     cut, all_powers = 0, len(POWERS)
     ContactMaps.of(index)  # made or read here, before both runs ask for them
-    some = min(max(round(_FIRST * contacts), _LEAST), contacts)
-    for asked in sorted({some, contacts}):
+    first, second, most = (min(max(contacts // more, _LEAST), contacts) for more in (_MORE**2, _MORE, 1))
+    for asked in sorted({first, second, most}):
         with ThreadPoolExecutor(2) as pool:
             runs = [pool.submit(explore, index, query, coarse, asked // 2, each, log_prior) for each in rng.spawn(2)]
             one, other = (run.result() for run in runs)
         cut += one.contacts + other.contacts
-        for powers in range(all_powers, 1 if asked == contacts else all_powers - 1, -1):
+        for powers in range(all_powers, 1 if asked >= second else all_powers - 1, -1):
             found = replace(_pooled(one, other, powers, rng), contacts=cut)
             apart = float(found.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
             if apart < _AGREE:

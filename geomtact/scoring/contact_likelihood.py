@@ -41,8 +41,8 @@ SHARE = (6.47, 13.18)  # of the beta distribution of an elastic contact's share 
 POWERS = (0.0, 0.03, 0.1, 0.3, 1.0)  # of the likelihood, by the posteriors that are mixed; hand-set
 # Their weights are the softmax of intercept + slope log(outline / OUTLINE): of a given mask, and of a contact found in an image,
 # perhaps badly.
-INTERCEPT = {"mask": (-3.89, -1.54, -0.21, 0.37, 0.0), "image": (-2.65, 0.00, 0.10, 0.29, 0.0)}
-SLOPE = {"mask": (0.24, 1.02, 1.26, 0.31, 0.0), "image": (0.80, 0.98, 0.80, 0.16, 0.0)}
+INTERCEPT = {"mask": (-2.96, -1.15, 0.47, 0.55, 0.0), "image": (-2.01, 0.07, 0.62, 0.50, 0.0)}
+SLOPE = {"mask": (1.25, 1.18, 0.69, 0.17, 0.0), "image": (1.21, 1.01, 0.35, 0.03, 0.0)}
 OUTLINE = 15e-3  # m, the length of a usual outline
 RIGID = 0.5  # share of touches on a rigid gel
 _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more is added

@@ -13,7 +13,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax, logsumexp
 
@@ -38,6 +40,8 @@ FACES = 3  # every so manieth object is touched on a known face
 MAX_POSES = 400_000  # of the grid
 CONTACTS = 10_000  # of the sampler
 LONGEST = 0.3  # m: outlines beyond are as this long
+_SCALE = 0.02  # pixels are as much larger or smaller than stated, at most
+_WITHIN = -0.1e-3, 0.2e-3  # m: by how much an outline lies too far in or out that is not badly found, at most
 _OFF = 0.7e-3  # m: by how much the outline of a badly found contact lies too far out or in, at most
 _DISPLACED = 1.2e-3, (1e-3, 8e-3)  # m: by how much it is displaced, rms, at most; and over which lengths
 _PENALTY = 1e-3  # of the square of a slope, beside a mean log density
@@ -101,13 +105,22 @@ def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator
     for number, touch in enumerate(each_touch(space, n, int(rng.integers(1 << 31)), noise=CLEAN)):
         mask = simulate_mask(space, touch.T_sensor_object, touch.elastic)
         noise, badly_found = draw_noise(CALIBRATION_NOISE, rng), number % 3 == 2
+        off = rng.uniform(-_OFF, _OFF) if badly_found else rng.uniform(*_WITHIN)
+        mask = _scaled(mask, 1 + rng.uniform(-_SCALE, _SCALE))
+        mask = from_outline(mask, float(np.sqrt(space.sensor.pixel_area(mask.shape)))) < off
         if badly_found:
-            pitch = float(np.sqrt(space.sensor.pixel_area(mask.shape)))
-            mask = from_outline(mask, pitch) < rng.uniform(-_OFF, _OFF)
             noise = replace(noise, outline_rms=rng.uniform(0, _DISPLACED[0]), correlation=_DISPLACED[1])
         mask = spoilt(mask, space, noise, rng)
         if counts(space, mask):
             yield replace(touch, mask=mask), badly_found
+
+
+def _scaled(mask: NDArray[np.bool_], by: float) -> NDArray[np.bool_]:
+    """``mask`` (H, W) enlarged ``by`` a factor about its middle."""
+    middle = 0.5 * (np.array(mask.shape[::-1]) - 1)
+    moved = np.column_stack([by * np.eye(2), (1 - by) * middle])
+    image, size = 255 * mask.astype(np.uint8), mask.shape[::-1]
+    return np.asarray(cv2.warpAffine(image, moved, size, borderMode=cv2.BORDER_REPLICATE) > 127)
 
 
 def _example(explored: Explored, touch: Touch, badly_found: bool) -> Example:
