@@ -113,7 +113,7 @@ class Localizer(PreparedObject):
                 one.scorer,
                 view,
                 prior if len(views) == 1 else None,
-                resolved.pixels and not alone,  # what is explored needs no more than where the mass is
+                resolved.pixels and not alone,  # contacts stand for the pixels
                 Provenance(effort, one.scorer.name, one.max_poses),
                 seed,
             )

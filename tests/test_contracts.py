@@ -32,7 +32,7 @@ from geomtact.sensing.sensor import Sensor
 TOUCHES = 60  # that each score is fitted on; the laws are coarse enough for it
 POOR = ("l1", "hu", "fpfh")  # the thesis's pixel distance, and those that are blind to where a contact lies
 ONLY_BY_WEIGHTS = {"CosineScorer"}  # of a user's own trained network
-INNER = {"CoarseScorer", "Product"}  # a coarse form of the encoder's, see test_cascade; and where "best" weighs several
+INNER = {"Product"}  # where "best" weighs several
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ class Effort:
     Attributes
     ----------
     modes : that are refined
-    contacts : that may be cut, of one mask that is not of a known face, to resolve the pose within the cells of the grid (see
-        ``inference.sampler``): a sixteenth at first, but at least 3,000; a quarter where that does not settle all of the
-        likelihood; all where that settles nothing. Half as many more weigh the modes. 0 leaves the cells as they are
+    contacts : of the last attempt to resolve the pose within the cells of the grid (see ``inference.sampler``), of one mask that
+        is not of a known face. The first attempt has a sixteenth, but at least 3,000, and settles most touches. The second has a
+        quarter; with a prior it comes first. Half as many more weigh the modes. 0 leaves the cells as they are
     thorough : whether each mode is refined by all registrations or by one
-    pixels : whether the score of cells that no contacts resolve counts the pixels too
+    pixels : whether the score of cells counts the pixels too, where no contacts are to resolve them
     outlines : whether, of one mask that no contacts resolve, the outline refines the modes where few enough cells are left (see
         ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by FilterReg
     """

@@ -170,6 +170,6 @@ def _within(
 
 
 def _mass_of(posterior: CellDistribution, cells: NDArray[np.int64]) -> Array:
-    """Probability (m,) of the run that each of ``cells`` (m,) stands for; 0 where it stands for none."""
+    """Probability (m,) of each of ``cells`` (m,); 0 where the posterior does not hold it."""
     row, held = rows_of(posterior, cells)
     return np.where(held, np.exp(posterior.cell_log_prob[row]), 0.0)

@@ -64,7 +64,7 @@ def explore_twice(
     """As :func:`explore`, with its modes, by two runs that share some of the ``contacts`` and have to agree on the evidence.
 
     Where they do not, one has missed what the other found; where the modes hold more than everything, both have. Then both are
-    repeated with four times as many. If that does not help, the largest powers of the likelihood are left out, until they agree;
+    repeated with more. If that does not help, the largest powers of the likelihood are left out, until they agree;
     if they agree on nothing, both are repeated once more.
 
     Raises
@@ -74,13 +74,15 @@ def explore_twice(
     """
     cut, all_powers = 0, len(POWERS)
     ContactMaps.of(index)  # made or read here, before both runs ask for them
-    first, second, most = (min(max(contacts // more, _LEAST), contacts) for more in (_MORE**2, _MORE, 1))
-    for asked in sorted({first, second, most}):
+    attempts = sorted({min(max(contacts // more, _LEAST), contacts) for more in (_MORE**2, _MORE, 1)})
+    if log_prior is not None:  # what a narrow prior leaves is missed by a small attempt
+        attempts = attempts[-2:]
+    for number, asked in enumerate(attempts):
         with ThreadPoolExecutor(2) as pool:
             runs = [pool.submit(explore, index, query, coarse, asked // 2, each, log_prior) for each in rng.spawn(2)]
             one, other = (run.result() for run in runs)
         cut += one.contacts + other.contacts
-        for powers in range(all_powers, 1 if asked >= second else all_powers - 1, -1):
+        for powers in range(all_powers, 1 if number or len(attempts) == 1 else all_powers - 1, -1):
             found = replace(_pooled(one, other, powers, rng), contacts=cut)
             apart = float(found.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
             if apart < _AGREE:

@@ -97,16 +97,16 @@ class FittedScorer:
         index: Index,
         mask: SoftMask,
         log_prior: NDArray[np.floating] | None = None,
-        exact: bool = False,
+        pixels: bool = False,
         above: float = 0.0,
     ) -> Rows:
         """Scores of every single cell that has mass.
 
-        ``log_prior`` (N,) is the log mass of all cells, the uniform's where it is None; ``exact`` scores count the pixels too.
+        ``log_prior`` (N,) is the log mass of all cells, the uniform's where it is None; with ``pixels`` their overlap counts too.
         ``mask`` is the contact of the object drawn back by ``above`` [m]: a contour line of the depth map.
         """
         scorer, calibration = self.scorer, self.calibration
-        if exact and self.exact_scorer is not None and self.exact_calibration is not None:
+        if pixels and self.exact_scorer is not None and self.exact_calibration is not None:
             scorer, calibration = self.exact_scorer, self.exact_calibration
         cells, prior = index.possible, index.log_possible_weight
         if log_prior is not None:

@@ -79,7 +79,7 @@ def make_examples(
     folder: Path, objects: int, touches: int, seed: int, progress: Progress | None = None
 ) -> list[Example]:
     """``touches`` of each of so many ``objects``, in files of ``folder``, so that a stopped run goes on."""
-    paths = [folder / f"mixture-{i}.npz" for i in range(objects)]
+    paths = [folder / f"touches-{i}.npz" for i in range(objects)]
     return resumed(paths, lambda i: _examples_of(i, touches, seed), _save, _load, progress)
 
 
