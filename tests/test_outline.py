@@ -187,8 +187,8 @@ def test_outlines_add_information_to_the_grid_on_a_known_contact_face(upright):
 def test_a_prior_counts_once(upright):
     """What a prior makes twice as probable is so after it, too; what it rules out stays so.
 
-    The search moves the log of one touch's odds by 0.3, so the mean of 4 by 0.15. A prior that does not count would leave 0, one
-    that counts twice 1.39.
+    The search moves the log of one touch's odds by 0.2, now and then by 1 or 2: hence the median. Of 16 touches it is 0.48, with
+    a standard error of 0.07; of 8 it scatters by 0.10. A prior that does not count would leave 0, one that counts twice 1.39.
     """
     left = upright.index.poses()[:, 0, 3] < 0
 
@@ -196,13 +196,13 @@ def test_a_prior_counts_once(upright):
         return np.where(poses[:, 0, 3] < 0, np.log(2.0), 0.0)
 
     log_odds = []
-    for seed in range(10, 14):
+    for seed in range(10, 18):
         touch = random_touches(upright.space, 1, seed)[0]
         for given in (None, prior):
             posterior = upright.localize(touch.mask, "mask", effort="exact", prior=given)
             p, there = np.exp(posterior.log_prob), left[posterior.cells]
             log_odds.append(np.log(p[there].sum() / p[~there].sum()))
-    assert np.diff(np.reshape(log_odds, (-1, 2))).mean() == pytest.approx(np.log(2), abs=0.5)
+    assert np.median(np.diff(np.reshape(log_odds, (-1, 2)))) == pytest.approx(np.log(2), abs=0.45)
     T = touch.T_sensor_object
     known = upright.localize(touch.mask, "mask", effort="exact", prior=lambda p: np.where(p[:, 0, 3] < 0, 0.0, -np.inf))
     assert np.isfinite(known.log_density(T)) == (T[0, 3] < 0)
