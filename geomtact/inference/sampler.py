@@ -91,7 +91,7 @@ def explore_twice(
                     return found
                 cut = found.contacts
     raise InputError(
-        f"{index.mesh.name}: {cut:,} contacts do not settle how likely the observed one is; allow more contacts"
+        f"{index.mesh.name}: {cut:,} contacts do not settle how likely the observed one is; allow more by Effort(contacts=)"
     )
 
 
