@@ -138,12 +138,12 @@ def fit_to_scores(
         terms = np.exp(below * np.float32(-1) / temperatures[:, None].astype(np.float32))
         evidence = np.log(np.maximum((terms @ mass).astype(float), TINY))
         ratio[:, i] = (score[true] - top) / temperatures - evidence
-    found = [best_floor(each) for each in ratio]
+    found = [_best_floor(each) for each in ratio]
     best = int(np.argmax([gain for _, gain in found]))
     return Calibration(float(temperatures[best]), *found[best])
 
 
-def best_floor(ratio: Array) -> tuple[float, float]:
+def _best_floor(ratio: Array) -> tuple[float, float]:
     """The uniform mixture weight under which the true poses are most probable, and their mean gain with it.
 
     ``ratio`` (n,) are the gains at the true poses without a mixture: the density there becomes one with the uniform.

@@ -27,7 +27,6 @@ from geomtact.sensing.sensor import Sensor
 
 WEIGHTS = Path(__file__).with_name("encoder.safetensors")  # trained once for all objects, with a card beside it
 ARCHITECTURE, THESIS = "encoder", "resnet50"  # as the metadata of weights name them
-_CHUNK = 1 << 13  # vectors compared at a time
 Weights = dict[str, NDArray[np.float32]]
 
 
@@ -55,19 +54,6 @@ class EncoderScorer(VectorScorer):
     def trust(self, best: float) -> np.float32:
         """What scores are to be multiplied by, of which the ``best`` is given."""
         return np.float32(min(1.0, self.usual / max(-best, 1e-9)))
-
-    def of(self, ids: NDArray[np.int64], seen: NDArray[np.float32]) -> NDArray[np.float32]:
-        """As :meth:`score`, before :meth:`trust`, of poses ``ids`` (n,), for the vector ``seen`` (d,) of the contact: (n,)."""
-        out = np.empty(len(ids), np.float32)
-        vectors = np.empty((_CHUNK, self.stored.shape[1]), self.stored.dtype)
-        for start in range(0, len(ids), _CHUNK):
-            some = ids[start : start + _CHUNK]
-            # into the same memory each time, which stays in the processor's cache
-            np.take(self.stored, some, 0, out=vectors[: len(some)], mode="clip")
-            np.matmul(vectors[: len(some)], 2 * seen, out=out[start : start + len(some)])
-        out -= self._squared[ids]
-        out -= np.float32(seen @ seen)
-        return out
 
     def seen(self, index: Index, mask: SoftMask) -> NDArray[np.float32]:
         """Vector (d,) of the observed ``mask`` (h, w)."""

@@ -151,21 +151,21 @@ def fitted_scorer(
         path = None if folder is None else vectors_file(folder, descriptor)
         scorers[vectors_name(name)] = compared(descriptor, describe_index(index, descriptor, path, progress))
     path = None if folder is None else folder / f"{label}.json"
-    fitted = _fitted_before(name, path, scorers, index)
+    fitted = _fitted_before(name, path, scorers)
     if fitted is not None:
         return fitted
     with contextlib.ExitStack() as held:  # of two processes that would fit it, the second waits for the first
         if folder is not None:
             with contextlib.suppress(OSError):  # beside a read-only cache no lock can be written
                 held.enter_context(lock_of(folder))
-        return _fitted_before(name, path, scorers, index) or _fitted_now(name, path, scorers, index, progress)
+        return _fitted_before(name, path, scorers) or _fitted_now(name, path, scorers, index, progress)
 
 
-def _fitted_before(name: str, path: Path | None, scorers: dict[str, Scorer], index: Index) -> FittedScorer | None:
+def _fitted_before(name: str, path: Path | None, scorers: dict[str, Scorer]) -> FittedScorer | None:
     """The fit in ``path``; None where nothing does, or nothing that can be used."""
     if path is not None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            return _from_json(name, json.loads(path.read_text("utf-8")), scorers, index)
+            return _from_json(name, json.loads(path.read_text("utf-8")), scorers)
     return None
 
 
@@ -188,7 +188,7 @@ def _fitted_now(
     if path is not None:
         with contextlib.suppress(OSError):  # a read-only cache costs the fit each time, no more
             write_text(path, json.dumps(data))
-    return _from_json(name, data, scorers, index)
+    return _from_json(name, data, scorers)
 
 
 def _simulated(index: Index, path: Path | None, progress: Progress | None) -> CalibrationTouches:
@@ -245,7 +245,7 @@ def _fit(name: str, scorers: dict[str, Scorer], index: Index, touches: Calibrati
     return data
 
 
-def _from_json(name: str, data: dict[str, Any], scorers: dict[str, Scorer], index: Index) -> FittedScorer:
+def _from_json(name: str, data: dict[str, Any], scorers: dict[str, Scorer]) -> FittedScorer:
     if data["format"] != FORMAT:
         raise ValueError("another format")
     m = data["moments"]
