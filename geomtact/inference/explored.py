@@ -108,8 +108,7 @@ class Explored:
 
         Instead of the few that no depth makes touch by the mesh, others are drawn again.
         """
-        T = self.settled(rng.choice(len(self.weight), n, p=self.weight))
-        touches = np.isfinite(self.index.space.penetration(T))
+        T, touches = self._settled(rng.choice(len(self.weight), n, p=self.weight))
         if touches.any():
             T[~touches] = T[rng.choice(np.flatnonzero(touches), n - int(touches.sum()))]
         return self.index.directions.any_image(T, rng)
@@ -120,11 +119,16 @@ class Explored:
         Height maps miss what lies between their pixels, so that a pose may touch by them and not quite by the mesh, or press a
         little too deep: it is moved along z.
         """
+        return self._settled(rows)[0]
+
+    def _settled(self, rows: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+        """:meth:`settled`, and which (n,) of them touch by the mesh."""
         T, space = self.poses[rows], self.index.space
-        off = np.flatnonzero(~np.isfinite(space.penetration(T)))
+        touches = np.isfinite(space.penetration(T))
+        off = np.flatnonzero(~touches)
         settled, ok = space.settle(T[off], self.depth[rows[off]])
-        T[off[ok]] = settled[ok]
-        return T
+        T[off[ok]], touches[off[ok]] = settled[ok], True
+        return T, touches
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All that :meth:`of_arrays` needs beside the index."""
