@@ -117,9 +117,9 @@ def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator
 
 def _scaled(mask: NDArray[np.bool_], by: float) -> NDArray[np.bool_]:
     """``mask`` (H, W) enlarged ``by`` a factor about its middle."""
-    middle = 0.5 * (np.array(mask.shape[::-1]) - 1)
-    moved = np.column_stack([by * np.eye(2), (1 - by) * middle])
-    image, size = 255 * mask.astype(np.uint8), mask.shape[::-1]
+    height, width = mask.shape
+    moved = cv2.getRotationMatrix2D((0.5 * (width - 1), 0.5 * (height - 1)), 0, by)
+    image, size = 255 * mask.astype(np.uint8), (width, height)
     return np.asarray(cv2.warpAffine(image, moved, size, borderMode=cv2.BORDER_REPLICATE) > 127)
 
 
