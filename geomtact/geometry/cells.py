@@ -105,6 +105,12 @@ class SphereCells:
         """Angle [rad] across the cells of the disk that holds a direction ``a`` (3,); inf where none does."""
         return min((2 * middle_angle(half) for v, half in self.disks if a @ v >= np.cos(half)), default=np.inf)
 
+    @cached_property
+    def _across(self) -> tuple[Array, Array]:
+        """Two directions (n, 3) each across the middle of every disk."""
+        x, y, _ = np.moveaxis(facing(self.middles), 1, 0)
+        return x, y
+
     def _part_of(self, a: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The disk (n,) that holds each direction, -1 for none, and which of its cells does (n,): 0 the middle one."""
         if not self.disks:
@@ -114,7 +120,7 @@ class SphereCells:
         v = self.middles[disk]
         # the share of the disk's area that lies nearer to its middle; by the chord, precise at small angles
         inner = ((a - v) ** 2).sum(1) / (4 * np.sin(half[disk] / 2) ** 2)
-        x, y, _ = np.moveaxis(facing(v), 1, 0)
+        x, y = self._across[0][disk], self._across[1][disk]
         turn = np.arctan2((a * y).sum(1), (a * x).sum(1)) / (2 * np.pi) % 1
         part = np.where(inner * _PARTS <= 1, 0, 1 + (turn * (_PARTS - 1)).astype(np.int64) % (_PARTS - 1))
         return np.where(inner <= 1, disk, -1), part
