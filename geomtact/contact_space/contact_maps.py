@@ -22,7 +22,7 @@ from geomtact.contact_space.heightmap import NOTHING, HeightMap
 from geomtact.contact_space.index import Index
 from geomtact.files import write_whole
 from geomtact.geometry.approach import facing
-from geomtact.kernels.contact_energy import BLOCK, Cut, Maps, Poses, Samples, contact_energy
+from geomtact.kernels.contact_energy import BLOCK, COARSER, Cut, Maps, Poses, Samples, contact_energy
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
@@ -152,8 +152,14 @@ def _cast(index: Index) -> NDArray[np.float32]:
 def _maps(heights: NDArray[np.float32], pixel: float) -> Maps:
     # a block reaches half its side from its centre, and half a pixel more where it is cut
     side = 2 * int(np.ceil(BLOCK / 2 * _PIXELS_PER_SAMPLE * np.sqrt(2) + 1)) + 1
-    square = np.ones((side, side), np.uint8)
-    return Maps(heights, np.stack([np.asarray(cv2.dilate(each, square), np.float32) for each in heights]), pixel)
+    square, off = np.ones((side, side), np.uint8), -heights.shape[1] % COARSER
+
+    def widest(map_: NDArray[np.float32]) -> NDArray[np.float32]:
+        whole = cv2.copyMakeBorder(cv2.dilate(map_, square), 0, off, 0, off, cv2.BORDER_REPLICATE)
+        parts = whole.reshape(len(whole) // COARSER, COARSER, -1, COARSER)
+        return np.asarray(parts.max((1, 3)), np.float32)
+
+    return Maps(heights, np.stack([widest(each) for each in heights]), pixel)
 
 
 def _written(path: Path, heights: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -15,6 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 BLOCK = 4  # samples along each side of a block
+COARSER = (
+    4  # pixels of a height map along each side of one of its block heights, which stay in the processor's cache so
+)
 SHARES = 40  # of the depth at which contacts are compared: ((j + 1) / SHARES)^2, the last one a rigid gel's
 _ROUNDS = 3  # cuts at most, until the height of the membrane over the map is known
 _NOTHING = -500.0  # m: lower heights mean that the object is not there
@@ -27,7 +30,7 @@ class Maps(NamedTuple):
     Attributes
     ----------
     heights : (D, n, n) float32 [m] along each direction beyond the object's centre, which is the middle pixel
-    widest : (D, n, n) float32 [m] the largest height within a block about each pixel
+    widest : (D, m, m) float32 [m] the largest height within a block about any of ``COARSER`` by ``COARSER`` pixels
     pixel : [m]
     """
 
@@ -146,6 +149,9 @@ def _contact_energy(  # type: ignore[no-untyped-def]
     deep, wide_deep = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
     # how much higher than at its centre a tilted block may be
     beside = max(np.abs(within[:, :, 0]).max(), np.abs(within[:, :, 1]).max()) + np.float32(0.5) / per_pixel
+    least_sag = np.empty(blocks, np.float32)
+    for k in range(blocks):
+        least_sag[k] = sag[k].min()
     for i in range(n):
         height, wide, r = heights[direction[i]], widest[direction[i]], tilt[i]
         tx, ty, lean_x, lean_y, up = r[0, 2], r[1, 2], r[2, 0], r[2, 1], r[2, 2]
@@ -167,7 +173,7 @@ def _contact_energy(  # type: ignore[no-untyped-def]
                 column, row = int(u * per_pixel + half), int(v * per_pixel + half)
                 h = nothing
                 if 0 <= column < size and 0 <= row < size:
-                    h = up * wide[row, column] - lean_x * u - lean_y * v + slack - sag[k].min()
+                    h = up * wide[row // COARSER, column // COARSER] - lean_x * u - lean_y * v + slack - least_sag[k]
                 highest[k] = h
                 cut[k] = 0
                 top = max(top, h)
