@@ -1,51 +1,44 @@
 """The distribution of a pose within the cells of an index: what the sampler leaves of it, and the density at any pose.
 
-The posterior is a mixture of posteriors by powers of the likelihood. Of each there are poses drawn from it, and its evidence, so
-that its density is known wherever the likelihood is made.
+The posterior is a mixture of posteriors by powers of the likelihood, whose evidences are known. So its density is known wherever
+the likelihood is made: at a pose, and at those that errors of the object's scale and of the contact's place make of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geomtact.contact_space.contact_maps import ContactMaps, located
+from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
-from geomtact.inference.particles import Particles, Target, log_target, poses_of, prior_at
+from geomtact.inference.particles import Particles, Target, log_target, prior_at
+from geomtact.inference.systematic_errors import nodes, with_errors, without_errors
 from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
-from geomtact.se3 import Array, check_transforms
+from geomtact.se3 import Array, check_transforms, transform
+
+_PART = 512  # poses whose density is made at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Explored:
-    """The distribution of the pose after one touch: a mixture of the posteriors by powers of the likelihood, ``POWERS`` or the
-    smallest of them.
+class Density:
+    """The density of the pose after one touch: a mixture of the posteriors by powers of the likelihood, ``POWERS`` or the
+    smallest of them, each averaged over the errors that the whole contact has in common.
 
     Attributes
     ----------
-    target : what poses are judged by
-    particles : of each posterior, poses drawn from it, equally probable
-    log_evidence : of each, the log of the mean of the power of the likelihood over the coarse posterior
-    exponents : of the likelihood, step by step
-    contacts : that were cut
-    log_measure : log of the uniform measure of poses that touch over that of the cells that hold them
-    hearts : (m,) rows of ``poses``, the densest of each leading mode, the most probable mode first
-    masses : (m,) of these modes
+    target : what poses without errors are judged by
+    log_evidence : of each posterior, the log of the mean of the power of the likelihood over the coarse posterior
+    log_inside : log of the share of the poses with errors that are in the contact pose space
     """
 
     target: Target
-    particles: tuple[Particles, ...]
     log_evidence: tuple[float, ...]
-    exponents: tuple[float, ...]
-    contacts: int
-    log_measure: float = 0.0
-    hearts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    masses: Array = field(default_factory=lambda: np.zeros(0))
+    log_inside: float = 0.0
 
     @property
     def index(self) -> Index:
@@ -55,53 +48,93 @@ class Explored:
     @cached_property
     def weights(self) -> Array:
         """Weight of each posterior; the last one has those of the powers that are left out too."""
-        weights, last = self.target.query.weights, len(self.particles) - 1
+        weights, last = self.target.query.weights, len(self.log_evidence) - 1
         return np.append(weights[:last], weights[last:].sum())
+
+    def by_power(self, log_likelihood: Array, log_coarse: Array) -> Array:
+        """Log density (..., K) of each posterior over the prior, without errors, from the log likelihood and the log density of
+        the coarse posterior (...)."""
+        each = [
+            log_target(log_likelihood, log_coarse, power) - log_evidence
+            for power, log_evidence in zip(POWERS, self.log_evidence, strict=False)
+        ]
+        return np.stack(each, -1)
+
+    def with_errors(self, T: Array, errors: Array) -> Array:
+        """Poses ``T`` (..., 4, 4) with ``errors`` (..., 4)."""
+        R, middle = T[..., :3, :3], self.index.mesh.centre
+        centre = with_errors(T[..., :3, 3] + R @ middle, errors, self.target.query.centroid)
+        return transform(R, centre - R @ middle)
+
+    def without_errors(self, particles: Particles) -> Array:
+        """Log density (n,) of the mixture at ``particles`` (n,), if there were no errors."""
+        each = self.by_power(particles.log_likelihood, particles.log_coarse) + np.log(self.weights)
+        return np.asarray(particles.log_prior + np.logaddexp.reduce(each, -1))
+
+    def at(self, T: ArrayLike) -> Array:
+        """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4) of the contact pose space."""
+        return np.asarray(np.logaddexp.reduce(self.of_powers(T) + np.log(self.weights), -1)) - self.log_inside
+
+    def of_powers(self, T: ArrayLike) -> Array:
+        """As :meth:`at` of each posterior (n, K), wherever its poses with errors are."""
+        T = np.asarray(T, float).reshape(-1, 4, 4)
+        parts = [self._of_powers(T[first : first + _PART]) for first in range(0, len(T), _PART)]
+        return np.concatenate(parts) if parts else np.zeros((0, len(self.log_evidence)))
+
+    def _of_powers(self, T: Array) -> Array:
+        index, query, n = self.index, self.target.query, len(T)
+        poses, membrane = located(index, T)
+        errors, log_weight = nodes()
+        centre = without_errors(np.column_stack([poses.centre, membrane])[:, None], errors, query.centroid)
+        flat, rows = centre.reshape(-1, 3), np.repeat(np.arange(n), len(errors))
+        place = index.place_of(index.rotation[poses.place[rows]].astype(np.int64), flat)
+        reach = poses.reach[rows] + flat[:, 2] - membrane[rows]
+        asked = Placements(place, poses.direction[rows], poses.rotation[rows], flat[:, :2], reach)
+        cut = ContactMaps.of(index).compare(query.samples, query.area, asked, flat[:, 2])
+        each = self.by_power(query.log_likelihood(cut.energy), self.target.log_coarse[place])
+        prior = prior_at(index, self.target.log_prior, place, cut.reach - flat[:, 2])
+        # volumes with errors are larger
+        each = (each + prior[:, None]).reshape(n, len(errors), -1) + (log_weight - 3 * errors[:, 0])[:, None]
+        return np.asarray(np.logaddexp.reduce(each, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Explored:
+    """The distribution of the pose after one touch.
+
+    Attributes
+    ----------
+    density : at any pose
+    poses : T_sensor_object (n, 4, 4) drawn from it, equally probable
+    depth : penetration (n,) [m]
+    log_density : at the poses (n,)
+    contacts : that were cut
+    hearts : (m,) rows of ``poses``, the densest of each leading mode, the most probable mode first
+    masses : (m,) of these modes
+    """
+
+    density: Density
+    poses: Array
+    depth: Array
+    log_density: Array
+    contacts: int
+    hearts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    masses: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def index(self) -> Index:
+        """All touches of the object."""
+        return self.density.index
 
     @cached_property
     def weight(self) -> Array:
-        """Mass of each particle of all posteriors."""
-        return np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(self.particles, self.weights, strict=True)])
-
-    @cached_property
-    def particle_log_density(self) -> Array:
-        """Log density at each particle of all posteriors."""
-        return np.concatenate([self.log_density_of(p) for p in self.particles])
-
-    def log_density_of(self, particles: Particles) -> Array:
-        """Log density (n,) at ``particles`` (n,)."""
-        return particles.log_prior + self._posteriors(particles.log_likelihood, particles.log_coarse)
-
-    def _posteriors(self, log_likelihood: Array, log_coarse: Array) -> Array:
-        """Log density (n,) over the prior."""
-        each = [
-            np.log(weight) + log_target(log_likelihood, log_coarse, power) - log_evidence
-            for power, weight, log_evidence in zip(POWERS, self.weights, self.log_evidence, strict=False)
-        ]
-        return np.asarray(np.logaddexp.reduce(each, 0))
-
-    @cached_property
-    def poses(self) -> Array:
-        """T_sensor_object (n, 4, 4) of the particles of all posteriors."""
-        return np.concatenate([poses_of(p.poses, p.depth, self.index.mesh.centre) for p in self.particles])
-
-    @cached_property
-    def depth(self) -> Array:
-        """Penetration (n,) of the particles of all posteriors [m]."""
-        return np.concatenate([p.depth for p in self.particles])
+        """Mass (n,) of each pose."""
+        return np.full(len(self.poses), 1 / len(self.poses))
 
     @property
     def expected_gain(self) -> float:
         """Mean log density under the distribution itself [nats]."""
-        return float(self.weight @ self.particle_log_density)
-
-    def log_density(self, T: ArrayLike) -> Array:
-        """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4) of the contact pose space."""
-        query, log_prior = self.target.query, self.target.log_prior
-        poses, membrane = located(self.index, np.asarray(T, float))
-        cut = ContactMaps.of(self.index).compare(query.samples, query.area, poses, membrane)
-        density = self._posteriors(query.log_likelihood(cut.energy), self.target.log_coarse[poses.place])
-        return density + prior_at(self.index, log_prior, poses.place, cut.reach - membrane)
+        return float(self.log_density.mean())
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """``n`` poses T_sensor_object (n, 4, 4) drawn by ``rng`` among the particles, at any image under the symmetry.
@@ -132,21 +165,20 @@ class Explored:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All that :meth:`of_arrays` needs beside the index."""
+        target = self.density.target
         return {
             "T": self.poses,
-            "log_likelihood": np.concatenate([p.log_likelihood for p in self.particles]),
             "depth": self.depth,
-            "counts": np.array([len(p) for p in self.particles]),
-            "log_evidence": np.array(self.log_evidence),
-            "log_coarse": self.target.log_coarse.astype(np.float32),
-            "log_prior": np.zeros(0) if self.target.log_prior is None else self.target.log_prior,
-            "exponents": np.array(self.exponents),
+            "log_density": self.log_density,
+            "log_evidence": np.array(self.density.log_evidence),
+            "log_inside": np.array(self.density.log_inside),
+            "log_coarse": target.log_coarse.astype(np.float32),
+            "log_prior": np.zeros(0) if target.log_prior is None else target.log_prior,
             "contacts": np.array(self.contacts),
-            "log_measure": np.array(self.log_measure),
             "hearts": self.hearts,
             "masses": self.masses,
-            "touched": self.target.query.touched,
-            "source": np.array(self.target.query.source),
+            "touched": target.query.touched,
+            "source": np.array(target.query.source),
         }
 
     @classmethod
@@ -158,38 +190,32 @@ class Explored:
         KeyError, ValueError, PoseError
             They are not what it gives.
         """
-        T, depth, counts = check_transforms(arrays["T"]), arrays["depth"], arrays["counts"]
-        log_coarse = arrays["log_coarse"].astype(float)
+        T, log_coarse = check_transforms(arrays["T"]), arrays["log_coarse"].astype(float)
         log_prior = arrays["log_prior"] if len(arrays["log_prior"]) else None
-        if (
-            not 1 < len(counts) <= len(POWERS)
-            or not len(T) == len(depth) == len(arrays["log_likelihood"]) == counts.sum()
+        if not 1 < len(arrays["log_evidence"]) <= len(POWERS) or not len(T) == len(arrays["depth"]) == len(
+            arrays["log_density"]
         ):
             raise ValueError("particles of different number")
         if len(arrays["hearts"]) != len(arrays["masses"]) or not (arrays["hearts"] < len(T)).all():
             raise ValueError("modes that are not of its particles")
         if len(log_coarse) != index.places or (log_prior is not None and len(log_prior) != len(index)):
             raise ValueError("densities that are not of its grid")
-        poses, membrane = located(index, T)
-        prior = prior_at(index, log_prior, poses.place, depth)
-        whole = Particles(
-            replace(poses, reach=membrane + depth), depth, arrays["log_likelihood"], log_coarse[poses.place], prior
-        )
         source = str(arrays["source"])
         if source not in INTERCEPT:
             raise ValueError(f"a contact of another source: {source}")
-        query = ContactQuery.showing(arrays["touched"].astype(bool), index.sensor, source)
+        target = Target(
+            index, ContactQuery.showing(arrays["touched"].astype(bool), index.sensor, source), log_coarse, log_prior
+        )
         return cls(
-            Target(index, query, log_coarse, log_prior),
-            tuple(whole.take(rows) for rows in np.split(np.arange(len(T)), np.cumsum(counts)[:-1])),
-            tuple(arrays["log_evidence"].tolist()),
-            tuple(arrays["exponents"].tolist()),
+            Density(target, tuple(arrays["log_evidence"].tolist()), float(arrays["log_inside"])),
+            T,
+            arrays["depth"],
+            arrays["log_density"],
             int(arrays["contacts"]),
-            float(arrays["log_measure"]),
             arrays["hearts"],
             arrays["masses"],
         )
 
     def credible_level(self, log_density: float) -> float:
         """Mass of the poses that are denser than ``log_density``."""
-        return float(self.weight @ (self.particle_log_density > log_density))
+        return float(self.weight @ (self.log_density > log_density))

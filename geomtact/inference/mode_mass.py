@@ -17,6 +17,7 @@ from geomtact.contact_space.contact_maps import sample_pitch
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.explored import Explored
+from geomtact.inference.systematic_errors import drawn
 from geomtact.se3 import Array, exp, inverse, log
 
 # These choose where the density is looked at: they change how precise a mass is, not what is estimated.
@@ -29,14 +30,14 @@ _KNOWN, _SAMPLES = 3, 0.5  # a covariance counts as much as so many draws, of th
 _POINTS = 128  # of the surface, for distances
 
 
-def weighed(explored: Explored, contacts: int, rng: np.random.Generator) -> tuple[Explored, float]:
+def weighed(explored: Explored, log_measure: float, contacts: int, rng: np.random.Generator) -> tuple[Explored, float]:
     """``explored`` with its leading modes, as many as ``contacts`` contacts weigh, and the log of the sum of their masses as it
     was found.
 
     Each is the poses within the mode radius of its densest particle. If they have more than everything, then the evidence misses
     what they hold, and their masses are those of shares of them.
     """
-    mesh = explored.index.mesh
+    density, mesh = explored.density, explored.index.mesh
     distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
     count = int(np.clip(contacts // (_ROUNDS * _DRAWS), *_MODES))
     hearts, members = _grown(explored, distance, radius, count)
@@ -50,20 +51,21 @@ def weighed(explored: Explored, contacts: int, rng: np.random.Generator) -> tupl
     for _ in range(_ROUNDS):
         motions = np.stack([mode.students[-1].draw(_DRAWS, rng) for mode in modes])
         T = np.stack([mode.heart @ exp(each @ basis) for mode, each in zip(modes, motions, strict=True)])
-        near = np.stack([distance.within(mode.heart, each, radius) for mode, each in zip(modes, T, strict=True)])
+        moved = density.with_errors(T, drawn(T[..., 0, 0].size, rng).reshape(*motions.shape[:2], -1))
+        near = np.stack([distance.within(mode.heart, each, radius) for mode, each in zip(modes, moved, strict=True)])
         turn = np.linalg.norm(motions @ basis[:, :3], axis=-1)
         # beyond these turns a placement is met again
         near &= (turn < np.pi) & np.stack(
             [_is_nearest(distance, mode.heart, each) for mode, each in zip(modes, T, strict=True)]
         )
         found = np.full(near.shape, -np.inf)
-        particles = explored.target.at(T[near])
-        density = explored.log_density_of(particles) + np.log(explored.index.uniform_density(T[near]))
-        density += _log_volume(turn[near], explored.index.directions.symmetry)
-        found[near] = np.where(np.isfinite(particles.log_likelihood), density, -np.inf)
-        for mode, each, log_density in zip(modes, motions, found, strict=True):
-            mode.add(each, log_density)
-    log_mass = np.array([mode.log_integral + explored.log_measure for mode in modes])
+        particles = density.target.at(T[near])
+        log_density = density.without_errors(particles) + np.log(explored.index.uniform_density(T[near]))
+        log_density += _log_volume(turn[near], explored.index.directions.symmetry)
+        found[near] = np.where(np.isfinite(particles.log_likelihood), log_density, -np.inf)
+        for mode, each, log_densities in zip(modes, motions, found, strict=True):
+            mode.add(each, log_densities)
+    log_mass = np.array([mode.log_integral + log_measure for mode in modes]) - density.log_inside
     most = max(float(log_mass.max()), 0.0)
     mass = _shared_out(explored, members, np.exp(log_mass - most))
     log_sum = most + float(np.log(max(mass.sum(), 1e-300)))
@@ -96,7 +98,7 @@ def _grown(
     covered = np.zeros(len(explored.poses), bool)
     hearts: list[int] = []
     members: list[NDArray[np.int64]] = []
-    for row in np.argsort(-explored.particle_log_density, kind="stable").tolist():
+    for row in np.argsort(-explored.log_density, kind="stable").tolist():
         if len(hearts) == count:
             break
         if not covered[row]:

@@ -91,11 +91,11 @@ class ModeRefiner:
         found = [refiner.refine(problem, hearts) for refiner in self.refiners(posterior.index, True)]
         T = np.stack([hearts, *(each.T for each in found)])
         density = np.full(T.shape[:2], -np.inf)
-        density[0] = explored.particle_log_density[rows]
+        density[0] = explored.log_density[rows]
         distance, radius = PoseDistance(self.space.mesh), mode_radius(self.space.mesh)
         near = np.stack([distance.within(heart, T[1:, i], radius) for i, heart in enumerate(hearts)], 1)
         near[near] = np.isfinite(self.space.penetration(T[1:][near]))
-        density[1:][near] = explored.log_density(T[1:][near])
+        density[1:][near] = explored.density.at(T[1:][near])
         best = density.argmax(0)
         # where no registration helped, the covariance is that of the first one
         by = [found[max(b - 1, 0)] for b in best]

@@ -238,13 +238,13 @@ class Posterior(CellDistribution):
     def _log_density(self) -> Array:
         """Log density (N,) of the particles or cells relative to the uniform distribution."""
         if self.explored is not None:
-            return self.explored.particle_log_density
+            return self.explored.log_density
         return row_log_density(self, np.arange(len(self.cells)))
 
     def _within(self, T: Array, depth: Array) -> Array:
         """Log density (n,) at poses ``T`` (n, 4, 4) in the sensor frame, which press ``depth`` (n,) [m] deep."""
         if self.explored is not None:
-            return self.explored.log_density(T)
+            return self.explored.density.at(T)
         return cell_log_density(self, self.index.lookup(T, depth))
 
     def _draw_cells(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -13,8 +13,7 @@ observed one, and moves turn the object about that point of the membrane.
 from __future__ import annotations
 
 import itertools
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,10 @@ from scipy.special import ndtr, ndtri
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located, sample_pitch
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
-from geomtact.inference.explored import Explored
+from geomtact.inference.explored import Density, Explored
 from geomtact.inference.mode_mass import weighed
 from geomtact.inference.particles import Particles, Target, poses_of
+from geomtact.inference.systematic_errors import NODES, drawn
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array, exp, inverse, log, transform
 
@@ -46,11 +46,38 @@ _ALONG = 1.0  # largest multiple of a difference
 _TURN = 0.1  # rad, standard deviation of the first moves; they differ by a factor of ten from pose to pose
 _EXPONENTS = np.geomspace(2e-4, 1, 40)  # of the likelihood, that the first step may have
 _HALVINGS = 30
+_POSES, _FOR_EACH = (300, 600), 20  # poses that are kept in the end, at least and at most, and contacts for each
 # Mean difference of two log evidences, by the weights of the powers, or log of the sum of all masses, above which no run is
 # believed [nats]; hand-set.
 _AGREE = 1.0
-_MORE, _LEAST = 4, 3000  # by how much more contacts are cut in the next attempt, and how many in the first, at least
+_MORE = 4  # times as many contacts are cut in the second attempt
+_LEFT_OUT = 3  # powers that the first attempt may leave out
 _WEIGHING = 0.5  # contacts that weigh the modes, for each that finds them
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What one run of the sampler found.
+
+    Attributes
+    ----------
+    density : of the pose
+    particles : of each posterior by a power of the likelihood, poses without errors drawn from it, equally probable
+    exponents : of the likelihood, step by step
+    contacts : that were cut
+    log_measure : log of the uniform measure of poses that touch over that of the cells that hold them
+    """
+
+    density: Density
+    particles: tuple[Particles, ...]
+    exponents: tuple[float, ...]
+    contacts: int
+    log_measure: float
+
+    @property
+    def log_evidence(self) -> tuple[float, ...]:
+        """Of each posterior."""
+        return self.density.log_evidence
 
 
 def explore_twice(
@@ -61,11 +88,12 @@ def explore_twice(
     rng: np.random.Generator,
     log_prior: NDArray[np.floating] | None = None,
 ) -> Explored:
-    """As :func:`explore`, with its modes, by two runs that share some of the ``contacts`` and have to agree on the evidence.
+    """As :func:`explore`, with its modes, by two runs that share a quarter of the ``contacts`` and have to agree on
+    the evidence.
 
-    Where they do not, one has missed what the other found; where the modes hold more than everything, both have. Then both are
-    repeated with more. If that does not help, the largest powers of the likelihood are left out, until they agree;
-    if they agree on nothing, both are repeated once more.
+    Where they do not, one has missed what the other found; where the modes hold more than everything, both have. Then the largest
+    powers of the likelihood are left out until they agree, three of them at most. If that does not help, both are repeated with
+    all contacts, and as many powers are left out as need be.
 
     Raises
     ------
@@ -73,20 +101,16 @@ def explore_twice(
         No pose that was drawn touches the sensor, or the runs agree on nothing.
     """
     cut, all_powers = 0, len(POWERS)
-    ContactMaps.of(index)  # made or read here, before both runs ask for them
-    attempts = sorted({min(max(contacts // more, _LEAST), contacts) for more in (_MORE**2, _MORE, 1)})
-    if log_prior is not None:  # what a narrow prior leaves is missed by a small attempt
-        attempts = attempts[-2:]
-    for number, asked in enumerate(attempts):
-        with ThreadPoolExecutor(2) as pool:
-            runs = [pool.submit(explore, index, query, coarse, asked // 2, each, log_prior) for each in rng.spawn(2)]
-            one, other = (run.result() for run in runs)
+    for asked in (contacts // _MORE, contacts):
+        one, other = explore(index, query, coarse, asked // 2, rng, log_prior, runs=2)
         cut += one.contacts + other.contacts
-        for powers in range(all_powers, 1 if number or len(attempts) == 1 else all_powers - 1, -1):
-            found = replace(_pooled(one, other, powers, rng), contacts=cut)
-            apart = float(found.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
+        least = 2 if asked == contacts else all_powers - _LEFT_OUT
+        for powers in range(all_powers, least - 1, -1):
+            run = replace(_pooled(one, other, powers, rng), contacts=cut)
+            apart = float(run.density.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
             if apart < _AGREE:
-                found, log_sum = weighed(found, round(_WEIGHING * asked), rng)
+                found = _with_errors(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
+                found, log_sum = weighed(found, run.log_measure, round(_WEIGHING * asked), rng)
                 if log_sum < _AGREE:
                     return found
                 cut = found.contacts
@@ -95,7 +119,7 @@ def explore_twice(
     )
 
 
-def _pooled(one: Explored, other: Explored, powers: int, rng: np.random.Generator) -> Explored:
+def _pooled(one: Run, other: Run, powers: int, rng: np.random.Generator) -> Run:
     """Two runs as one: of each posterior by the smallest ``powers`` the particles of both, by how likely each run makes the
     contact."""
     particles, evidence = [], []
@@ -107,7 +131,33 @@ def _pooled(one: Explored, other: Explored, powers: int, rng: np.random.Generato
         of_second = _systematic(np.ones(len(second)), n - round(share * n), rng)
         particles.append(first.take(of_first).joined(second.take(of_second)))
     measure = float(np.logaddexp(one.log_measure, other.log_measure) - np.log(2))
-    return replace(one, particles=tuple(particles), log_evidence=tuple(evidence), log_measure=measure)
+    density = replace(one.density, log_evidence=tuple(evidence))
+    return replace(one, density=density, particles=tuple(particles), log_measure=measure)
+
+
+def _with_errors(run: Run, n: int, rng: np.random.Generator) -> Explored:
+    """Up to ``n`` poses of a ``run`` with errors, drawn by ``rng``: those that are in the contact pose space.
+
+    Raises
+    ------
+    InputError
+        None is.
+    """
+    density, target = run.density, run.density.target
+    mass = np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(run.particles, density.weights, strict=True)])
+    each = run.particles[0]
+    for particles in run.particles[1:]:
+        each = each.joined(particles)
+    each = each.take(_systematic(mass, min(len(mass), n), rng))
+    T = density.with_errors(poses_of(each.poses, each.depth, target.index.mesh.centre), drawn(len(each), rng))
+    moved = target.at(T)
+    inside = np.flatnonzero(np.isfinite(moved.log_target(1)))
+    if not len(inside):
+        raise InputError(f"{target.index.mesh.name}: no pose that was found touches the sensor; allow more contacts")
+    density = replace(density, log_inside=float(np.log(len(inside) / len(each))))
+    contacts = run.contacts + len(each) + NODES * len(inside)
+    T = T[inside]
+    return Explored(density, T, moved.depth[inside], density.at(T), contacts)
 
 
 def explore(
@@ -117,8 +167,9 @@ def explore(
     contacts: int,
     rng: np.random.Generator,
     log_prior: NDArray[np.floating] | None = None,
-) -> Explored:
-    """The distribution of the pose, from about ``contacts`` contacts.
+    runs: int = 1,
+) -> tuple[Run, ...]:
+    """The distribution of the pose, found ``runs`` times from about ``contacts`` contacts each, all at once.
 
     Parameters
     ----------
@@ -140,54 +191,69 @@ def explore(
         share = share / measure * (cells * np.exp(log_prior.reshape(cells.shape))).sum(0)
         known = float(np.log(share.sum()))
     n = max(contacts // (_DRAWS * _CUTS + _MOVES * _STEPS), 20)
-    drawn, log_weight, cut = _draw(target, share, _DRAWS * n, rng)
-    # the evidence of the coarse posterior is known: what is left is an error of the measure, which all share
-    whole = float(np.logaddexp.reduce(log_weight + drawn.log_target(0)))
-    if not np.isfinite(whole):
+    drawn, log_weight, cut = _draw(target, share, runs, _DRAWS * n, rng)
+    # the evidence of the coarse posterior is known: what is left is an error of the measure, which all poses of a run share
+    whole = np.logaddexp.reduce(log_weight + drawn.log_target(0).reshape(runs, -1), 1)
+    if not np.isfinite(whole).all():
         raise InputError(f"{index.mesh.name}: no pose that was drawn touches the sensor; allow more contacts")
-    log_weight = log_weight + known - whole
+    log_weight = log_weight + (known - whole)[:, None]
+
+    def by_power(exponent: float) -> Array:
+        """Log weights (runs, m) of the draws in the posterior by that power."""
+        return log_weight + drawn.log_target(exponent).reshape(runs, -1)
+
     # the first exponent is the largest that leaves enough draws effective: a distinctive contact begins low
-    effective = np.array([_effective(log_weight + drawn.log_target(exponent)) for exponent in _EXPONENTS])
-    power = float(_EXPONENTS[np.flatnonzero(effective >= min(n, effective.max()))[-1]])
+    effective = np.array([_effective(by_power(exponent)) for exponent in _EXPONENTS])
+    enough = (effective >= np.minimum(n, effective.max(0))).all(1)
+    enough[0] = True
+    power = float(_EXPONENTS[np.flatnonzero(enough)[-1]])
     # the posteriors by powers of at most this one are those of the draws
     found, evidence = [], []
     for each in (*(each for each in POWERS if each < power), power):
-        weight = log_weight + drawn.log_target(each)
-        evidence.append(float(np.logaddexp.reduce(weight)))
+        weight = by_power(each)
+        evidence.append(np.logaddexp.reduce(weight, 1))
         found.append(drawn.take(_resampled(weight, n, rng)))
     particles, log_evidence, exponents, size = found[-1], evidence[-1], [power], 1.0
     while True:
         for _ in range(_MOVES):
-            particles, accepted = _moved(target, particles, power, size, rng)
+            particles, accepted = _moved(target, particles, runs, power, size, rng)
             size = float(np.clip(size * np.exp(accepted - _ACCEPTED), 1e-3, 1))
-            cut += n
+            cut += runs * n
         if power in POWERS:
             found[POWERS.index(power) :] = [particles]
             evidence[POWERS.index(power) :] = [log_evidence]
         if power >= 1:
             break
-        change = particles.log_likelihood - particles.log_coarse
+        change = (particles.log_likelihood - particles.log_coarse).reshape(runs, n)
         after = min(each for each in POWERS if each > power)
         step = min(_next_step(change, 1 - power), after - power)
-        log_evidence += float(np.logaddexp.reduce(step * change)) - np.log(n)
+        log_evidence = log_evidence + np.logaddexp.reduce(step * change, 1) - np.log(n)
         particles = particles.take(_resampled(step * change, n, rng))
         power = after if step == after - power else power + step
         exponents.append(power)
-    return Explored(target, tuple(found), tuple(evidence), tuple(exponents), cut, known - whole)
+    return tuple(
+        Run(
+            Density(target, tuple(float(each[run]) for each in evidence)),
+            tuple(each.take(np.arange(run * n, (run + 1) * n)) for each in found),
+            tuple(exponents),
+            cut // runs,
+            float(known - whole[run]),
+        )
+        for run in range(runs)
+    )
 
 
-def _effective(log_weight: Array) -> float:
-    """How many draws of equal weight would do as well."""
-    most = log_weight.max()
-    if not np.isfinite(most):
-        return 0.0
-    weight = np.exp(log_weight - most)
-    return float(weight.sum() ** 2 / np.square(weight).sum())
+def _effective(log_weight: Array) -> Array:
+    """How many draws of equal weight would do as well (...), of those of ``log_weight`` (..., m)."""
+    most = log_weight.max(-1, keepdims=True)
+    weight = np.exp(log_weight - np.where(np.isfinite(most), most, 0.0))
+    return np.asarray(weight.sum(-1) ** 2 / np.maximum(np.square(weight).sum(-1), 1e-300))
 
 
 def _resampled(log_weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """``n`` rows by their weight."""
-    return _systematic(np.exp(log_weight - log_weight.max()), n, rng)
+    """``n`` rows by their weight for each run of ``log_weight`` (runs, m), one run after the other."""
+    weight = np.exp(log_weight - log_weight.max(1, keepdims=True))
+    return np.concatenate([run * len(each) + _systematic(each, n, rng) for run, each in enumerate(weight)])
 
 
 def _systematic(weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -197,39 +263,43 @@ def _systematic(weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.i
 
 
 def _next_step(change: Array, most: float) -> float:
-    """By how much, ``most`` at most, the exponent may grow so that weights of exp(step ``change``) leave a share ``_KEPT`` of the
-    poses effective."""
-    if _effective(most * change) >= _KEPT * len(change):
+    """By how much, ``most`` at most, the exponent may grow so that weights of exp(step ``change``) (runs, n) leave a share
+    ``_KEPT`` of the poses of each run effective."""
+
+    def leaves_enough(step: float) -> bool:
+        return bool((_effective(step * change) >= _KEPT * change.shape[1]).all())
+
+    if leaves_enough(most):
         return most
     low, high = 0.0, most
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if _effective(middle * change) >= _KEPT * len(change) else (low, middle)
+        low, high = (middle, high) if leaves_enough(middle) else (low, middle)
     return max(low, 1e-4)
 
 
 def _moved(
-    target: Target, particles: Particles, power: float, size: float, rng: np.random.Generator
+    target: Target, particles: Particles, runs: int, power: float, size: float, rng: np.random.Generator
 ) -> tuple[Particles, float]:
     """Every pose after one Metropolis step, and the share of small motions that was accepted.
 
-    Half of the poses move at a time: some by small motions, some by multiples of the motion from one pose of the other half
-    to another near it (ter Braak 2006), which follow the directions that the contact leaves open. Both keep the uniform
-    measure.
+    Half of the poses move at a time: some by small motions, some by multiples of the motion from one pose of the other half of
+    their run to another near it (ter Braak 2006), which follow the directions that the contact leaves open. Both keep the
+    uniform measure.
     """
     small = rng.random(len(particles)) < _SMALL
     accepted = np.zeros(len(particles), bool)
     half = rng.random(len(particles)) < 0.5
-    for some in (np.flatnonzero(half), np.flatnonzero(~half)):
-        others = np.setdiff1d(np.arange(len(particles)), some)
-        if not len(some) or len(others) < 2:
+    run = np.arange(len(particles)) * runs // len(particles)
+    for moving in (half, ~half):
+        some, others = np.flatnonzero(moving), np.flatnonzero(~moving)
+        if not len(some) or np.bincount(run[others], minlength=runs).min() < 2:
             continue
         T = poses_of(particles.poses, particles.depth, target.index.mesh.centre)
-        moved = np.where(
-            small[some, None, None],
-            _nudged(target, T[some], size, rng),
-            _differences(T[others], particles.poses.place[others], len(some), rng) @ T[some],
-        )
+        others = others[np.lexsort((particles.poses.place[others], run[others]))]
+        moved, nudged = T[some], small[some]
+        moved[nudged] = _nudged(target, moved[nudged], size, rng)
+        moved[~nudged] = _differences(T[others], run[others], run[some[~nudged]], rng) @ moved[~nudged]
         now = particles.take(some)
         poses, membrane = located(target.index, moved)
         new = target.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane)
@@ -263,14 +333,15 @@ def _nudged(target: Target, T: Array, size: float, rng: np.random.Generator) -> 
     return transform(turn @ T[:, :3, :3], where)
 
 
-def _draw(target: Target, share: Array, n: int, rng: np.random.Generator) -> tuple[Particles, Array, int]:
-    """``n`` poses, their log weights (n,), and how many contacts were cut.
+def _draw(target: Target, share: Array, runs: int, n: int, rng: np.random.Generator) -> tuple[Particles, Array, int]:
+    """``n`` poses for each run, one run after the other, their log weights (runs, n), and how many contacts were cut.
 
     A place is drawn in proportion to ``share`` (m,), a rotation uniformly in its cell, a centre in its lattice cell. A weight
     is the uniform density over that of the draw, over n.
     """
     index = target.index
-    place, share = _systematic(share, n, rng), share / share.sum()
+    place = np.concatenate([_systematic(share, n, rng) for _ in range(runs)])
+    share = share / share.sum()
     drawn = transform(index.directions.draw(index.rotation[place], rng), np.zeros(3))
     rotation = index.directions.canonical(drawn)[:, :3, :3]
     direction = index.directions.direction_of_rotation(index.rotation[place]).astype(np.int32)
@@ -280,22 +351,24 @@ def _draw(target: Target, share: Array, n: int, rng: np.random.Generator) -> tup
     poses = Placements(place, direction, rotation, middle, reach)
     about, cut = _aligned(target, poses, step)
     centre, density = _centres(about, middle, step, _WIDTH * sample_pitch(index.sensor), rng)
-    depth = index.sensor.max_penetration * rng.random(n)
+    depth = index.sensor.max_penetration * rng.random(len(place))
     particles = target.admitted(target.evaluated(replace(poses, centre=centre), depth=depth))
     log_weight = np.log(index.cell_measure[place]) - np.log(share[place]) - np.log(density * n)
-    return particles, log_weight, cut + n
+    return particles, log_weight.reshape(runs, n), cut + len(place)
 
 
-def _differences(T: Array, place: NDArray[np.int64], n: int, rng: np.random.Generator) -> Array:
-    """``n`` motions (n, 4, 4) along those from poses ``T`` (m, 4, 4) to others at near places (m,).
+def _differences(T: Array, run: NDArray[np.int64], of: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """Motions (n, 4, 4) along those from poses ``T`` (m, 4, 4) to others near them, for each of the runs ``of`` (n,).
 
-    They are motions in the sensor frame, so that they act on images under the symmetry alike.
+    The poses come run by run, as ``run`` (m,) says, those near each other one after the other. Motions are in the sensor frame,
+    so that they act on images under the symmetry alike.
     """
-    order = np.argsort(place, kind="stable")
-    first = rng.integers(len(T), size=n)
-    second = (first + rng.integers(1, _NEAR + 1, size=n)) % len(T)
-    share = _ALONG * rng.choice([-1.0, 1.0], n) * 10 ** -rng.random(n)
-    return exp(share[:, None] * log(T[order[second]] @ inverse(T[order[first]])))
+    count = np.bincount(run)
+    start = np.cumsum(count) - count
+    first = rng.integers(count[of])
+    second = (first + rng.integers(1, _NEAR + 1, size=len(of))) % count[of]
+    share = _ALONG * rng.choice([-1.0, 1.0], len(of)) * 10 ** -rng.random(len(of))
+    return exp(share[:, None] * log(T[start[of] + second] @ inverse(T[start[of] + first])))
 
 
 def _aligned(target: Target, poses: Placements, step: float) -> tuple[Array, int]:

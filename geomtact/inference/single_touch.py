@@ -131,7 +131,7 @@ def explore_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer
         except InputError as error:
             warning = f"the pose is not resolved within the grid's cells: {error}"
             return replace(posterior, warnings=[*posterior.warnings, warning])
-    settled = replace(posterior.diagnostics, settled_power=POWERS[len(explored.particles) - 1])
+    settled = replace(posterior.diagnostics, settled_power=POWERS[len(explored.density.log_evidence) - 1])
     return replace(posterior, explored=explored, diagnostics=settled)
 
 

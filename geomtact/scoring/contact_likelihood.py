@@ -34,15 +34,17 @@ from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
 
-# Fitted on procedural objects for the mean log density at the true pose: the first two by ``python -m tools.training likelihood``
-# (docs/results/contact-likelihood.json), the weights by ``python -m tools.training mixture`` (docs/results/mixture.json).
-RATE = 36.1e9  # nats for each m^3 of energy
+# Fitted on procedural objects for the mean log density at the true pose: the shares by ``python -m tools.training likelihood``
+# (docs/results/contact-likelihood.json), errors and weights by ``python -m tools.training mixture`` (docs/results/mixture.json).
+RATE = 108e9  # nats for each m^3 of energy: three times the rate that fits best alone, so that some powers are sharper
 SHARE = (6.47, 13.18)  # of the beta distribution of an elastic contact's share of the depth
-POWERS = (0.0, 0.03, 0.1, 0.3, 1.0)  # of the likelihood, by the posteriors that are mixed; hand-set
+POWERS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the likelihood, by the posteriors that are mixed; hand-set
 # Their weights are the softmax of intercept + slope log(outline / OUTLINE): of a given mask, and of a contact found in an image,
 # perhaps badly.
-INTERCEPT = {"mask": (-2.96, -1.15, 0.47, 0.55, 0.0), "image": (-2.01, 0.07, 0.62, 0.50, 0.0)}
-SLOPE = {"mask": (1.25, 1.18, 0.69, 0.17, 0.0), "image": (1.21, 1.01, 0.35, 0.03, 0.0)}
+INTERCEPT = {"mask": (-4.52, -2.33, -1.91, 0.35, -0.16, 0.0), "image": (-2.24, -0.96, -0.4, 0.3, -0.18, 0.0)}
+SLOPE = {"mask": (-0.03, 0.82, 0.92, 0.56, 0.24, 0.0), "image": (1.15, 1.03, 0.94, 0.41, 0.22, 0.0)}
+SCALE_ERROR = 0.0025  # half width of the distribution of errors of the object's scale
+SHIFT_ERROR = 0.05e-3  # m: that of errors of where a contact is, along each axis
 OUTLINE = 15e-3  # m, the length of a usual outline
 RIGID = 0.5  # share of touches on a rigid gel
 _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more is added

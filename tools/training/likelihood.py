@@ -21,9 +21,8 @@ from scipy.special import logsumexp
 from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.touches import Touch, random_touches
 from geomtact.files import write_text
-from geomtact.inference.explored import Explored
 from geomtact.inference.particles import Particles, log_target
-from geomtact.inference.sampler import explore
+from geomtact.inference.sampler import Run, explore
 from geomtact.kernels.contact_energy import SHARES
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
@@ -107,21 +106,21 @@ def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
 def _example(localizer: Localizer, maps: ContactMaps, touch: Touch, rng: np.random.Generator) -> Example:
     query = ContactQuery.of(touch.mask, localizer.sensor)
     coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
-    explored = explore(localizer.index, query, coarse, CONTACTS, rng)
-    mixed = [p.take(rng.permutation(len(p))[:KEPT]) for p in explored.particles[1:]]
+    (run,) = explore(localizer.index, query, coarse, CONTACTS, rng)
+    mixed = [p.take(rng.permutation(len(p))[:KEPT]) for p in run.particles[1:]]
     energy = np.concatenate([_energy(maps, query, p) for p in mixed])
     at_truth, place = _at_truth(maps, query, touch)
     lc = np.concatenate([p.log_coarse for p in mixed])
     ll = np.concatenate([p.log_likelihood for p in mixed])
-    true_lc = float(explored.target.log_coarse[place])
+    true_lc = float(run.density.target.log_coarse[place])
     true_ll = float(query.log_likelihood(at_truth)[0])
     return Example(
         _in_units(energy),
         lc,
-        _mixture(explored, ll, lc),
+        _mixture(run, ll, lc),
         _in_units(at_truth)[0],
         true_lc,
-        float(_mixture(explored, np.array([true_ll]), np.array([true_lc]))[0]),
+        float(_mixture(run, np.array([true_ll]), np.array([true_lc]))[0]),
         touch.elastic,
     )
 
@@ -136,11 +135,10 @@ def _at_truth(maps: ContactMaps, query: ContactQuery, touch: Touch) -> tuple[NDA
     return maps.compare(query.samples, query.area, poses, membrane).energy, int(poses.place[0])
 
 
-def _mixture(explored: Explored, ll: Array, lc: Array) -> Array:
+def _mixture(run: Run, ll: Array, lc: Array) -> Array:
     """Log density (n,) of the poses of all powers but 0 together, each the same share."""
     each = [
-        log_target(ll, lc, power) - evidence
-        for power, evidence in zip(POWERS[1:], explored.log_evidence[1:], strict=True)
+        log_target(ll, lc, power) - evidence for power, evidence in zip(POWERS[1:], run.log_evidence[1:], strict=True)
     ]
     return np.asarray(logsumexp(each, 0)) - np.log(len(each))
 

@@ -1,9 +1,9 @@
 """Fits the weights of the powers of the likelihood that a posterior mixes, as functions of how long the contact's outline is.
 
 Touches of procedural objects, on any side or a known face, on rigid and elastic gels, with noise of any strength up to heavy, are
-explored by the sampler as it is. What each power makes of the true pose says how to weigh it: the weights maximise the mean log
-density at the true poses ("covariate-dependent stacking", Yao et al. 2022). Every third contact is found badly, as in an image:
-given masks have weights without these.
+explored by the sampler as it is. What each power makes of the true pose, averaged over the errors that a whole contact has in
+common, says how to weigh it: the weights maximise the mean log density at the true poses ("covariate-dependent stacking", Yao et
+al. 2022). Every third contact is found badly, as in an image: given masks have weights without these.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax, logsumexp
 
-from geomtact.contact_space.contact_maps import ContactMaps, located
+from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import CALIBRATION_NOISE, draw_noise, simulate_mask, spoilt
 from geomtact.contact_space.touches import Touch, counts, each_touch
 from geomtact.files import write_text
-from geomtact.inference.explored import Explored
-from geomtact.inference.particles import log_target
-from geomtact.inference.sampler import explore
+from geomtact.geometry.mesh import Mesh
+from geomtact.inference.particles import poses_of
+from geomtact.inference.sampler import Run, explore
+from geomtact.inference.systematic_errors import drawn
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
-from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.scoring.contact_likelihood import POWERS, SCALE_ERROR, SHIFT_ERROR, ContactQuery
 from geomtact.scoring.outline import from_outline
 from geomtact.se3 import Array
-from geomtact.sensing.noise import CLEAN
+from geomtact.sensing.noise import CLEAN, MODERATE
 from geomtact.versions import versions
 from tools.training.examples import SENSORS, drawn_object, resumed
 
@@ -40,6 +41,8 @@ FACES = 3  # every so manieth object is touched on a known face
 MAX_POSES = 400_000  # of the grid
 CONTACTS = 10_000  # of the sampler
 LONGEST = 0.3  # m: outlines beyond are as this long
+KEPT = 80  # poses of each posterior, at most
+_LARGER = 0.01  # objects are as much larger or smaller than their meshes, at most
 _SCALE = 0.02  # pixels are as much larger or smaller than stated, at most
 _WITHIN = -0.1e-3, 0.2e-3  # m: by how much an outline lies too far in or out that is not badly found, at most
 _OFF = 0.7e-3  # m: by how much the outline of a badly found contact lies too far out or in, at most
@@ -49,7 +52,7 @@ _LEAST = -60.0  # nats: a lower log density at a true pose is as bad as this
 
 _SINGLE = ("log_outline", "elastic", "badly_found")
 
-SCHEMA = "geomtact/mixture/2"
+SCHEMA = "geomtact/mixture/3"
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 
 
@@ -60,8 +63,9 @@ class Example:
     Attributes
     ----------
     at_truth : (K,) log density at the true pose by each of ``POWERS``
-    at_particles : (n, K) at the particles of all powers
-    sizes : (K,) how many particles each has
+    at_particles : (n, K) at poses of all powers that are in the contact pose space
+    sizes : (K,) how many of these each has
+    inside : (K,) which share of its poses that is
     log_outline : log of the outline's length over ``OUTLINE``
     elastic : whether the gel was
     badly_found : whether the contact was
@@ -70,6 +74,7 @@ class Example:
     at_truth: Array
     at_particles: Array
     sizes: Array
+    inside: Array
     log_outline: float
     elastic: bool
     badly_found: bool
@@ -91,28 +96,37 @@ def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
     for touch, badly_found in _touches(localizer, touches, rng):
         query = ContactQuery.of(touch.mask, sensor)
         coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
-        yield _example(explore(localizer.index, query, coarse, CONTACTS, rng), touch, badly_found)
+        (run,) = explore(localizer.index, query, coarse, CONTACTS, rng)
+        yield _example(run, touch, badly_found, rng)
 
 
 def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator[tuple[Touch, bool]]:
-    """``n`` touches with noise of any strength up to heavy, without those that show less than 1 mm^2 of contact then, and whether
-    each is found badly.
+    """``n`` touches without those that show less than 1 mm^2 of contact, and whether each is found badly.
 
-    Every third is found badly, as in images of a gel that nobody measured: its outline lies too far out or in, and is displaced
-    by much more than noise does.
+    Half of them are as the localizer expects them, with moderate noise. Of the others, noise has any strength up to heavy, and
+    objects, pixels and outlines are off. Every third is found badly, as in images of a gel that nobody measured: its outline
+    lies too far out or in, and is displaced by much more than noise does.
     """
     space = localizer.space
     for number, touch in enumerate(each_touch(space, n, int(rng.integers(1 << 31)), noise=CLEAN)):
-        mask = simulate_mask(space, touch.T_sensor_object, touch.elastic)
-        noise, badly_found = draw_noise(CALIBRATION_NOISE, rng), number % 3 == 2
-        off = rng.uniform(-_OFF, _OFF) if badly_found else rng.uniform(*_WITHIN)
-        mask = _scaled(mask, 1 + rng.uniform(-_SCALE, _SCALE))
+        as_expected = number % 4 < 2  # rigid and elastic ones alike
+        size = 0.0 if as_expected else rng.random()  # of errors, of the largest
+        mesh = larger(space.mesh, 1 + size * rng.uniform(-_LARGER, _LARGER))
+        mask = simulate_mask(ContactSpace(mesh, space.sensor), touch.T_sensor_object, touch.elastic)
+        noise, badly_found = MODERATE if as_expected else draw_noise(CALIBRATION_NOISE, rng), number % 3 == 2
+        off = rng.uniform(-_OFF, _OFF) if badly_found else size * rng.uniform(*_WITHIN)
+        mask = _scaled(mask, 1 + size * rng.uniform(-_SCALE, _SCALE))
         mask = from_outline(mask, float(np.sqrt(space.sensor.pixel_area(mask.shape)))) < off
         if badly_found:
             noise = replace(noise, outline_rms=rng.uniform(0, _DISPLACED[0]), correlation=_DISPLACED[1])
         mask = spoilt(mask, space, noise, rng)
         if counts(space, mask):
             yield replace(touch, mask=mask), badly_found
+
+
+def larger(mesh: Mesh, by: float) -> Mesh:
+    """``mesh`` enlarged ``by`` a factor about its centre."""
+    return replace(mesh, vertices=mesh.centre + by * (mesh.vertices - mesh.centre))
 
 
 def _scaled(mask: NDArray[np.bool_], by: float) -> NDArray[np.bool_]:
@@ -123,25 +137,32 @@ def _scaled(mask: NDArray[np.bool_], by: float) -> NDArray[np.bool_]:
     return np.asarray(cv2.warpAffine(image, moved, size, borderMode=cv2.BORDER_REPLICATE) > 127)
 
 
-def _example(explored: Explored, touch: Touch, badly_found: bool) -> Example:
-    index, query = explored.index, explored.target.query
-    poses, membrane = located(index, touch.T_sensor_object[None])
-    cut = ContactMaps.of(index).compare(query.samples, query.area, poses, membrane)
-    at, coarse = query.log_likelihood(cut.energy), explored.target.log_coarse[poses.place]
-    each = [np.concatenate([getattr(p, name) for p in explored.particles]) for name in ("log_likelihood", "log_coarse")]
-    evidence = np.array(explored.log_evidence)
-
-    def by_power(log_likelihood: Array, log_coarse: Array) -> Array:
-        return np.stack([log_target(log_likelihood, log_coarse, power) for power in POWERS], 1) - evidence
-
-    sizes = np.array([len(p) for p in explored.particles])
-    return Example(by_power(at, coarse)[0], by_power(*each), sizes, query.log_outline, touch.elastic, badly_found)
+def _example(run: Run, touch: Touch, badly_found: bool, rng: np.random.Generator) -> Example:
+    density, target = run.density, run.density.target
+    at_particles, sizes, inside = [], [], []
+    for particles in run.particles:
+        some = particles.take(rng.permutation(len(particles))[:KEPT])
+        poses = poses_of(some.poses, some.depth, target.index.mesh.centre)
+        poses = density.with_errors(poses, drawn(len(some), rng))
+        poses = poses[np.isfinite(target.at(poses).log_likelihood)]
+        at_particles.append(density.of_powers(poses))
+        sizes.append(len(poses))
+        inside.append(len(poses) / len(some))
+    return Example(
+        density.of_powers(touch.T_sensor_object)[0],
+        np.concatenate(at_particles),
+        np.array(sizes),
+        np.array(inside),
+        target.query.log_outline,
+        touch.elastic,
+        badly_found,
+    )
 
 
 def _save(path: Path, examples: Sequence[Example]) -> None:
     n = max(len(e.at_particles) for e in examples)
     padded = [np.pad(e.at_particles, ((0, n - len(e.at_particles)), (0, 0))) for e in examples]
-    columns = {name: np.stack([getattr(e, name) for e in examples]) for name in ("at_truth", "sizes")}
+    columns = {name: np.stack([getattr(e, name) for e in examples]) for name in ("at_truth", "sizes", "inside")}
     single = {name: np.array([getattr(e, name) for e in examples]) for name in _SINGLE}
     with open(path, "wb") as file:
         np.savez(file, allow_pickle=False, at_particles=np.stack(padded).astype(np.float32), **columns, **single)
@@ -150,7 +171,9 @@ def _save(path: Path, examples: Sequence[Example]) -> None:
 def _load(path: Path) -> list[Example]:
     with np.load(path, allow_pickle=False) as data:
         rows = zip(*(data[name] for name in Example.__dataclass_fields__), strict=True)
-        return [Example(t, p[: s.sum()].astype(float), s, float(o), bool(e), bool(b)) for t, p, s, o, e, b in rows]
+        return [
+            Example(t, p[: s.sum()].astype(float), s, i, float(o), bool(e), bool(b)) for t, p, s, i, o, e, b in rows
+        ]
 
 
 @dataclass(frozen=True)
@@ -161,7 +184,8 @@ class Fit:
     ----------
     intercept, slope : (K,) the weights are the softmax of intercept + slope log(outline / OUTLINE)
     n : touches
-    gain, expected_gain : means [nats], at the true poses and under the posteriors themselves
+    gain, expected_gain : means [nats], at the true poses, where it is at most that of the densest particle, and under the
+        posteriors themselves
     coverage : share of the touches whose true pose is in the regions of ``LEVELS``: of all, rigid, elastic ones
     """
 
@@ -177,6 +201,7 @@ def fit(examples: Sequence[Example]) -> Fit:
     """The weights that maximise the mean log density at the true poses."""
     truth = np.maximum(np.stack([e.at_truth for e in examples]), _LEAST)
     outline = np.array([e.log_outline for e in examples])
+    inside = np.stack([e.inside for e in examples])
     k = truth.shape[1]
 
     def log_weights(z: Array) -> Array:
@@ -185,14 +210,18 @@ def fit(examples: Sequence[Example]) -> Fit:
         return np.asarray(log_softmax(intercept + slope * outline[:, None], axis=1))
 
     def loss(z: Array) -> float:
-        return float(_PENALTY * (z[k - 1 :] ** 2).sum() - logsumexp(truth + log_weights(z), axis=1).mean())
+        log_weight = log_weights(z)
+        gain = logsumexp(truth + log_weight, axis=1) - logsumexp(log_weight, axis=1, b=inside)
+        # as if each power alone explained one touch more: no power is ruled out by those that were drawn
+        return float(_PENALTY * (z[k - 1 :] ** 2).sum() - (gain.sum() + log_weight.mean(0).sum()) / len(gain))
 
     z = minimize(loss, np.zeros(2 * (k - 1)), method="L-BFGS-B").x
     gain, expected, level = [], [], []
     for e, log_weight in zip(examples, log_weights(z), strict=True):
-        density = logsumexp(e.at_particles + log_weight, axis=1)
-        mass = np.repeat(np.exp(log_weight) / e.sizes, e.sizes)
-        gain.append(float(logsumexp(e.at_truth + log_weight)))
+        log_inside = logsumexp(log_weight, b=e.inside)
+        density = logsumexp(e.at_particles + log_weight, axis=1) - log_inside
+        mass = np.repeat(np.exp(log_weight - log_inside) * e.inside / np.maximum(e.sizes, 1), e.sizes)
+        gain.append(float(min(logsumexp(e.at_truth + log_weight) - log_inside, density.max(initial=-np.inf))))
         expected.append(float(mass @ density))
         level.append(float(mass @ (density > gain[-1])))
     elastic = np.array([e.elastic for e in examples])
@@ -216,6 +245,7 @@ def fit_mixture(
     examples = make_examples(folder, objects, touches, seed, progress)
     found = {"mask": fit([e for e in examples if not e.badly_found]), "image": fit(examples)}
     settings = {"objects": objects, "touches": touches, "seed": seed, "contacts": CONTACTS, "max_poses": MAX_POSES}
+    settings |= {"scale_error": SCALE_ERROR, "shift_error": SHIFT_ERROR}
     content = {"schema": SCHEMA, "settings": settings, "sensors": SENSORS, "powers": POWERS}
     fits = {source: asdict(each) for source, each in found.items()}
     write_text(out, json.dumps(content | fits | {"versions": versions()}, indent=1) + "\n")

@@ -10,12 +10,14 @@ import numpy as np
 from scipy.special import logsumexp
 
 from geomtact.contact_space.contact_class import contact_class
-from geomtact.contact_space.contact_maps import ContactMaps, located
+from geomtact.contact_space.contact_maps import located
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touches import Touch
 from geomtact.errors import InputError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.effort import EFFORTS
+from geomtact.inference.explored import Density
+from geomtact.inference.particles import Target, poses_of
 from geomtact.inference.sampler import explore_twice
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
@@ -23,7 +25,7 @@ from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
 ROOTS = (75_000, 300_000, 1_200_000)  # poses of the grids whose cells are opened
-CONTACTS = (12_000, EFFORTS["exact"].contacts, 480_000)  # as ``Effort.contacts``
+CONTACTS = (12_000, EFFORTS["balanced"].contacts, EFFORTS["exact"].contacts)  # as ``Effort.contacts``
 CHILDREN = 32  # contacts that open a cell: two parts of each tilt, turn, x and y
 _IN_CELL = 400  # poses drawn in the true cell
 BUDGETS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)  # of opening, for the chart
@@ -81,18 +83,18 @@ class _Found:
 
 def judged(localizers: Sequence[Localizer], touches: Sequence[Touch], seed: int, first: int) -> Iterator[Outcome]:
     """The outcome of each touch from the ``first`` on; ``localizers`` are on the grids of ``ROOTS``."""
-    maps = [ContactMaps.of(localizer.index) for localizer in localizers]
+    indexes = [localizer.index for localizer in localizers]
     for number, touch in enumerate(touches[first:], first):
         rng = np.random.default_rng([seed, number])
         query = ContactQuery.of(touch.mask, localizers[-1].sensor)
         log_masses = [localizer.scorer.log_mass(localizer.index, touch.mask) for localizer in localizers]
         roots = [
-            _root(each.index, log_mass.ravel(), each, query, touch, rng)
-            for each, log_mass in zip(maps, log_masses, strict=True)
+            _root(index, log_mass.ravel(), query, touch, rng)
+            for index, log_mass in zip(indexes, log_masses, strict=True)
         ]
         rank, coarse, in_cell, touching = zip(*roots, strict=True)
         mass = np.exp(log_masses[-1]).sum(0)
-        found = [_found(maps[-1].index, query, mass, contacts, touch, rng) for contacts in CONTACTS]
+        found = [_found(indexes[-1], query, mass, contacts, touch, rng) for contacts in CONTACTS]
         yield Outcome(
             touch.elastic,
             contact_class(localizers[-1].space, touch.T_sensor_object),
@@ -115,7 +117,7 @@ def _found(
         at = float(density[located(index, T)[0].place[0]])
         level = float(mass[density > at].sum())
         return _Found(at, float(mass @ density), level, False, contacts, 1, 0.0, False)
-    at, most = float(explored.log_density(T)[0]), float(explored.particle_log_density.max())
+    at, most = float(explored.density.at(T)[0]), float(explored.log_density.max())
     first = explored.poses[explored.hearts[0]]
     held = bool(PoseDistance(index.mesh).within(first, T, mode_radius(index.mesh))[0])
     return _Found(
@@ -124,53 +126,40 @@ def _found(
         explored.credible_level(at),
         at > most,
         explored.contacts,
-        len(explored.particles),
+        len(explored.density.log_evidence),
         float(explored.masses[0]),
         held,
     )
 
 
 def _root(
-    index: Index,
-    log_mass: Array,
-    maps: ContactMaps,
-    query: ContactQuery,
-    touch: Touch,
-    rng: np.random.Generator,
+    index: Index, log_mass: Array, query: ContactQuery, touch: Touch, rng: np.random.Generator
 ) -> tuple[int, float, float, float]:
     """Rank of the true cell, coarse gain and gain within the cell, and the share of the cell that touches."""
     true = int(index.lookup(touch.T_sensor_object[None], np.array([touch.penetration]))[0])
-    inside = _in_cell(index, maps, query, true, rng)
-    at_truth = float(_log_likelihood(maps, query, touch.T_sensor_object[None])[0])
+    density = Density(Target(index, query, np.zeros(index.places), None), (0.0,) * len(POWERS))
+    inside = density.of_powers(_in_cell(density.target, true, rng))
     return (
         int((log_mass > log_mass[true]).sum()),
         float(log_mass[true] - index.log_weight[true]),
-        _gain(at_truth, inside, query.weights),
+        _gain(density.of_powers(touch.T_sensor_object), inside, query.weights),
         float(index.touching[true % index.places]),
     )
 
 
-def _gain(at_truth: float, inside: Array, weights: Array) -> float:
-    """Log density at the true pose relative to the cell's mean, by the mixture of powers of the likelihood, of which the log is
-    ``at_truth`` there and ``inside`` (n,) at others. The true pose counts for the mean."""
-    together = np.append(inside, at_truth)
-    each = [power * np.array([at_truth]) - log_mean_exp(power * together[None]) for power in POWERS[1:]]
-    return float(logsumexp([0.0, *np.concatenate(each)], b=weights))
+def _gain(at_truth: Array, inside: Array, weights: Array) -> float:
+    """Log density at the true pose relative to the cell's mean, by the mixture of posteriors, whose logs are ``at_truth`` (1, K)
+    there and ``inside`` (n, K) at others, up to constants. The true pose counts for the mean."""
+    mean = log_mean_exp(np.concatenate([inside, at_truth]).T)
+    return float(logsumexp(at_truth[0] - mean, b=weights))
 
 
-def _in_cell(index: Index, maps: ContactMaps, query: ContactQuery, cell: int, rng: np.random.Generator) -> Array:
-    """Log likelihoods (n,) of poses drawn evenly in a cell, of those that touch."""
-    T, depth = index.draw(np.full(_IN_CELL, cell), rng)
-    found = _log_likelihood(maps, query, T, depth)
-    return found[np.isfinite(found)]
-
-
-def _log_likelihood(maps: ContactMaps, query: ContactQuery, T: Array, depth: Array | None = None) -> Array:
-    """Log likelihood (n,) of the observed contact at ``T_sensor_object`` (n, 4, 4), where the object is moved along z to press
-    ``depth`` (n,) [m] deep if that is given."""
-    poses, membrane = located(maps.index, np.asarray(T, float))
-    where = {"membrane": membrane} if depth is None else {"depth": depth}
-    return query.log_likelihood(maps.compare(query.samples, query.area, poses, **where).energy)
+def _in_cell(target: Target, cell: int, rng: np.random.Generator) -> Array:
+    """Poses (n, 4, 4) drawn evenly in a cell, of those that touch."""
+    T, depth = target.index.draw(np.full(_IN_CELL, cell), rng)
+    drawn = target.evaluated(located(target.index, T)[0], depth=depth)
+    drawn = drawn.take(np.flatnonzero(np.isfinite(drawn.log_likelihood)))
+    return poses_of(drawn.poses, drawn.depth, target.index.mesh.centre)
 
 
 def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:

@@ -1,0 +1,62 @@
+"""Errors that a whole contact has in common: of the object's scale, and of where the contact was found.
+
+The object is a little larger or smaller than its mesh, so that its centre is farther from the contact or nearer than the mesh
+says. And the contact lies beside where it was found: pixels are larger than stated, or the gel shows contact where the object is
+still above it, or only deeper. Neither changes the shape of a contact of some millimetres by much. So a pose with errors has the
+contact that the pose without them has. How large the errors are is not known either, so they follow heavy-tailed distributions
+(Cauchy's, up to a limit).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from scipy.stats import qmc
+
+from geomtact.scoring.contact_likelihood import SCALE_ERROR, SHIFT_ERROR
+from geomtact.se3 import Array
+
+NODES = 32  # errors over which a density is averaged, a power of two
+_LIMIT = 40.0  # widths
+_WIDER = np.array([4.0, 1.0, 1.0, 1.0])  # distribution of the nodes, so that some lie where errors are large
+
+
+def drawn(n: int, rng: np.random.Generator) -> Array:
+    """Errors (n, 4): the log of how much larger the object is than its mesh, and by how much the contact lies beside where it
+    was found along x, y and z, sensor frame [m]."""
+    return _quantiles(rng.random((n, 4)), _widths())
+
+
+@cache
+def nodes() -> tuple[Array, Array]:
+    """Errors (NODES, 4) spread evenly, and the log of their weights (NODES,), by which they have the distribution of
+    :func:`drawn`."""
+    share = qmc.Sobol(4, scramble=False).random(NODES) + 0.5 / NODES
+    errors = _quantiles(share, _WIDER * _widths())
+    log_weight = (_log_density(errors, _widths()) - _log_density(errors, _WIDER * _widths())).sum(1)
+    return errors, log_weight - np.log(np.exp(log_weight).sum())
+
+
+def with_errors(centre: Array, errors: Array, about: Array) -> Array:
+    """Where the object's ``centre`` (..., 3) is with ``errors`` (..., 4), of a contact found ``about`` (3,) [m]."""
+    return about + np.exp(errors[..., :1]) * (centre - about) + errors[..., 1:]
+
+
+def without_errors(centre: Array, errors: Array, about: Array) -> Array:
+    """Inverse of :func:`with_errors`."""
+    return about + np.exp(-errors[..., :1]) * (centre - errors[..., 1:] - about)
+
+
+def _widths() -> Array:
+    return np.array([SCALE_ERROR, SHIFT_ERROR, SHIFT_ERROR, SHIFT_ERROR])
+
+
+def _quantiles(share: Array, width: Array) -> Array:
+    """Errors (n, 4) below which ``share`` (n, 4) of the distributions of ``width`` (4,) lie."""
+    return np.asarray(width * np.tan((2 * share - 1) * np.arctan(_LIMIT * _widths() / width)))
+
+
+def _log_density(errors: Array, width: Array) -> Array:
+    """Log density (n, 4) of ``errors`` (n, 4) along each axis."""
+    return np.asarray(-np.log(2 * width * np.arctan(_LIMIT * _widths() / width)) - np.log1p((errors / width) ** 2))

@@ -1,0 +1,45 @@
+"""Errors that a whole contact has in common: how they are distributed, and how they move a pose."""
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from geomtact.inference.systematic_errors import NODES, drawn, nodes, with_errors, without_errors
+from geomtact.scoring.contact_likelihood import SCALE_ERROR, SHIFT_ERROR
+
+WIDTH = np.array([SCALE_ERROR] + 3 * [SHIFT_ERROR])
+
+
+def share(errors):
+    """Which share of the distribution is below ``errors`` (n, 4)."""
+    return 0.5 + 0.5 * np.arctan(errors / WIDTH) / np.arctan(40)
+
+
+def test_errors_are_drawn_from_their_distribution():
+    of_all = share(drawn(20_000, np.random.default_rng(0)))
+    assert all(kstest(each, "uniform").pvalue > 1e-3 for each in of_all.T)
+
+
+def test_nodes_have_the_distribution():
+    """Shifts lie in the middle of every share of it, errors of the scale farther apart; their weights make up for that."""
+    errors, log_weight = nodes()
+    weight = np.exp(log_weight)
+    assert weight.sum() == pytest.approx(1)
+    for each in share(errors)[:, 1:].T:
+        np.testing.assert_allclose(np.sort(each), (np.arange(NODES) + 0.5) / NODES, atol=1e-12)
+    order = np.argsort(errors[:, 0])
+    middle = np.cumsum(weight[order]) - 0.5 * weight[order]
+    np.testing.assert_allclose(share(errors)[order, 0], middle, atol=0.01)
+    assert errors[:, 0].max() > 20 * SCALE_ERROR
+
+
+def test_errors_are_undone():
+    rng = np.random.default_rng(1)
+    centre, errors, about = rng.normal(size=(50, 3)), drawn(50, rng), rng.normal(size=3)
+    np.testing.assert_allclose(without_errors(with_errors(centre, errors, about), errors, about), centre, atol=1e-12)
+
+
+def test_a_larger_object_has_its_centre_farther_from_the_contact():
+    centre, about = np.array([0.03, -0.02, 0.04]), np.array([0.003, 0.001, 0.0])
+    moved = with_errors(centre, np.array([np.log(1.01), 0, 0, 1e-4]), about)
+    assert moved - about == pytest.approx(1.01 * (centre - about) + [0, 0, 1e-4])
