@@ -138,7 +138,8 @@ class Posterior(CellDistribution):
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
 
         -inf outside the contact pose space; inside it finite, unless the prior ruled T out, or T misses another sensor that shows
-        contact. Without contact, -inf where T would touch, however deep, and elsewhere the prior's, 0 without one.
+        contact. Where the pose is resolved within the cells, at most that of the densest pose in ``poses``. Without contact, -inf
+        where T would touch, however deep, and elsewhere the prior's, 0 without one.
 
         Raises
         ------
@@ -244,7 +245,8 @@ class Posterior(CellDistribution):
     def _within(self, T: Array, depth: Array) -> Array:
         """Log density (n,) at poses ``T`` (n, 4, 4) in the sensor frame, which press ``depth`` (n,) [m] deep."""
         if self.explored is not None:
-            return self.explored.density.at(T)
+            # what is denser than all poses that were found was missed, and the evidence with it
+            return np.minimum(self.explored.density.at(T), self.explored.log_density.max())
         return cell_log_density(self, self.index.lookup(T, depth))
 
     def _draw_cells(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -47,9 +47,7 @@ _TURN = 0.1  # rad, standard deviation of the first moves; they differ by a fact
 _EXPONENTS = np.geomspace(2e-4, 1, 40)  # of the likelihood, that the first step may have
 _HALVINGS = 30
 _POSES, _FOR_EACH = (300, 600), 20  # poses that are kept in the end, at least and at most, and contacts for each
-# Mean difference of two log evidences, by the weights of the powers, or log of the sum of all masses, above which no run is
-# believed [nats]; hand-set.
-_AGREE = 1.0
+_AGREE = 1.0  # nats: mean difference of two log evidences, by the weights of the powers, above which no run is believed; hand-set
 _MORE = 4  # times as many contacts are cut in the second attempt
 _LEFT_OUT = 3  # powers that the first attempt may leave out
 _WEIGHING = 0.5  # contacts that weigh the modes, for each that finds them
@@ -111,7 +109,7 @@ def explore_twice(
             if apart < _AGREE:
                 found = _with_errors(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
                 found, log_sum = weighed(found, run.log_measure, round(_WEIGHING * asked), rng)
-                if log_sum < _AGREE:
+                if log_sum < 0:
                     return found
                 cut = found.contacts
     raise InputError(
