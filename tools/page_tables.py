@@ -258,6 +258,16 @@ def sweeps(content):
         yield [f"`{name}`", KEPT, told, promised]
 
 
+def within_cells(content):
+    for sweep in content["together"].values():
+        for at in sweep["levels"]:
+            f, promised = at["figures"], "yes" if at["level"] in sweep["inside"] else "no"
+            yield [
+                sweep["title"], f"{at['level']:g}", promised, *cells("{n} | {claimed_mean:.1f}", **f), *inside(f),
+                *cells("{silent:.0%}", **f),
+            ]  # fmt: skip
+
+
 def expected(touches, triplets):
     def over(sensors, key, form="{:.1f}", scale=1.0):
         values = [
@@ -299,6 +309,7 @@ TABLES = [
     ("benchmark", "| contact |", kinds, "classes", "flat"),
     ("benchmark", "| object |", answers, "localize"),
     ("stability", "| sweep |", sweeps, "stability"),
+    ("stability", "| what gets worse | level |", within_cells, "stability-within-cells"),
     ("stability", "| object |", answers, "housing"),
 ]
 

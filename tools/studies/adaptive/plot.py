@@ -24,8 +24,8 @@ def draw_adaptive(content: Mapping[str, Any]) -> bytes:
         sampled.plot(contacts, [each["gain"] for each in f["sampled"]], "o-", color=colour, label=name)
         sampled.plot(contacts, [each["expected_gain"] for each in f["sampled"]], "s:", color=colour, mfc="white")
     sampled.plot([], [], "s:", color="0.4", mfc="white", label="expected by the posterior")
-    opened.set_title("Opening cells: 4 nats lie beyond 100,000 contacts", fontsize=10)
-    sampled.set_title("Sampling the density: 7 to 9 nats", fontsize=10)
+    opened.set_title("Opening cells: 4 nats take 100,000 to 1,000,000 contacts", fontsize=10)
+    sampled.set_title("Sampling the density: 8 to 9 nats", fontsize=10)
     opened.set_ylabel("information gain [nats]")
     for axes in (opened, sampled):
         axes.set_xscale("log")
