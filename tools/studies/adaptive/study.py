@@ -25,7 +25,7 @@ from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
 ROOTS = (75_000, 300_000, 1_200_000)  # poses of the grids whose cells are opened
-CONTACTS = (12_000, EFFORTS["balanced"].contacts, EFFORTS["exact"].contacts)  # as ``Effort.contacts``
+CONTACTS = (40_000, EFFORTS["balanced"].contacts, EFFORTS["exact"].contacts)  # as ``Effort.contacts``
 CHILDREN = 32  # contacts that open a cell: two parts of each tilt, turn, x and y
 _IN_CELL = 400  # poses drawn in the true cell
 BUDGETS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)  # of opening, for the chart
