@@ -51,7 +51,7 @@ def weighed(explored: Explored, log_measure: float, contacts: int, rng: np.rando
     for _ in range(_ROUNDS):
         motions = np.stack([mode.students[-1].draw(_DRAWS, rng) for mode in modes])
         T = np.stack([mode.heart @ exp(each @ basis) for mode, each in zip(modes, motions, strict=True)])
-        moved = density.with_errors(T, drawn(T[..., 0, 0].size, rng).reshape(*motions.shape[:2], -1))
+        moved = density.with_errors(T, drawn(len(modes) * _DRAWS, rng).reshape(*motions.shape[:2], -1))
         near = np.stack([distance.within(mode.heart, each, radius) for mode, each in zip(modes, moved, strict=True)])
         turn = np.linalg.norm(motions @ basis[:, :3], axis=-1)
         # beyond these turns a placement is met again

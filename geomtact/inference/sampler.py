@@ -12,6 +12,7 @@ observed one, and moves turn the object about that point of the membrane.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from dataclasses import dataclass, replace
 
@@ -61,14 +62,12 @@ class Run:
     ----------
     density : of the pose
     particles : of each posterior by a power of the likelihood, poses without errors drawn from it, equally probable
-    exponents : of the likelihood, step by step
     contacts : that were cut
     log_measure : log of the uniform measure of poses that touch over that of the cells that hold them
     """
 
     density: Density
     particles: tuple[Particles, ...]
-    exponents: tuple[float, ...]
     contacts: int
     log_measure: float
 
@@ -143,10 +142,7 @@ def _with_errors(run: Run, n: int, rng: np.random.Generator) -> Explored:
     """
     density, target = run.density, run.density.target
     mass = np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(run.particles, density.weights, strict=True)])
-    each = run.particles[0]
-    for particles in run.particles[1:]:
-        each = each.joined(particles)
-    each = each.take(_systematic(mass, min(len(mass), n), rng))
+    each = functools.reduce(Particles.joined, run.particles).take(_systematic(mass, min(len(mass), n), rng))
     T = density.with_errors(poses_of(each.poses, each.depth, target.index.mesh.centre), drawn(len(each), rng))
     moved = target.at(T)
     inside = np.flatnonzero(np.isfinite(moved.log_target(1)))
@@ -211,7 +207,7 @@ def explore(
         weight = by_power(each)
         evidence.append(np.logaddexp.reduce(weight, 1))
         found.append(drawn.take(_resampled(weight, n, rng)))
-    particles, log_evidence, exponents, size = found[-1], evidence[-1], [power], 1.0
+    particles, log_evidence, size = found[-1], evidence[-1], 1.0
     while True:
         for _ in range(_MOVES):
             particles, accepted = _moved(target, particles, runs, power, size, rng)
@@ -228,12 +224,10 @@ def explore(
         log_evidence = log_evidence + np.logaddexp.reduce(step * change, 1) - np.log(n)
         particles = particles.take(_resampled(step * change, n, rng))
         power = after if step == after - power else power + step
-        exponents.append(power)
     return tuple(
         Run(
             Density(target, tuple(float(each[run]) for each in evidence)),
             tuple(each.take(np.arange(run * n, (run + 1) * n)) for each in found),
-            tuple(exponents),
             cut // runs,
             float(known - whole[run]),
         )

@@ -18,14 +18,15 @@ from geomtact.scoring.contact_likelihood import SCALE_ERROR, SHIFT_ERROR
 from geomtact.se3 import Array
 
 NODES = 32  # errors over which a density is averaged, a power of two
-_LIMIT = 40.0  # widths
+_WIDTHS = np.array([SCALE_ERROR, SHIFT_ERROR, SHIFT_ERROR, SHIFT_ERROR])
+_LIMIT = 40 * _WIDTHS
 _WIDER = np.array([4.0, 1.0, 1.0, 1.0])  # distribution of the nodes, so that some lie where errors are large
 
 
 def drawn(n: int, rng: np.random.Generator) -> Array:
     """Errors (n, 4): the log of how much larger the object is than its mesh, and by how much the contact lies beside where it
     was found along x, y and z, sensor frame [m]."""
-    return _quantiles(rng.random((n, 4)), _widths())
+    return _quantiles(rng.random((n, 4)), _WIDTHS)
 
 
 @cache
@@ -33,8 +34,8 @@ def nodes() -> tuple[Array, Array]:
     """Errors (NODES, 4) spread evenly, and the log of their weights (NODES,), by which they have the distribution of
     :func:`drawn`."""
     share = qmc.Sobol(4, scramble=False).random(NODES) + 0.5 / NODES
-    errors = _quantiles(share, _WIDER * _widths())
-    log_weight = (_log_density(errors, _widths()) - _log_density(errors, _WIDER * _widths())).sum(1)
+    errors = _quantiles(share, _WIDER * _WIDTHS)
+    log_weight = (_log_density(errors, _WIDTHS) - _log_density(errors, _WIDER * _WIDTHS)).sum(1)
     return errors, log_weight - np.log(np.exp(log_weight).sum())
 
 
@@ -48,15 +49,11 @@ def without_errors(centre: Array, errors: Array, about: Array) -> Array:
     return about + np.exp(-errors[..., :1]) * (centre - errors[..., 1:] - about)
 
 
-def _widths() -> Array:
-    return np.array([SCALE_ERROR, SHIFT_ERROR, SHIFT_ERROR, SHIFT_ERROR])
-
-
 def _quantiles(share: Array, width: Array) -> Array:
     """Errors (n, 4) below which ``share`` (n, 4) of the distributions of ``width`` (4,) lie."""
-    return np.asarray(width * np.tan((2 * share - 1) * np.arctan(_LIMIT * _widths() / width)))
+    return np.asarray(width * np.tan((2 * share - 1) * np.arctan(_LIMIT / width)))
 
 
 def _log_density(errors: Array, width: Array) -> Array:
     """Log density (n, 4) of ``errors`` (n, 4) along each axis."""
-    return np.asarray(-np.log(2 * width * np.arctan(_LIMIT * _widths() / width)) - np.log1p((errors / width) ** 2))
+    return np.asarray(-np.log(2 * width * np.arctan(_LIMIT / width)) - np.log1p((errors / width) ** 2))

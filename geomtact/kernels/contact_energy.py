@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 BLOCK = 4  # samples along each side of a block
-COARSER = (
-    4  # pixels of a height map along each side of one of its block heights, which stay in the processor's cache so
-)
+COARSER = 4  # pixels of a height map along each side of one of its block heights
 SHARES = 40  # of the depth at which contacts are compared: ((j + 1) / SHARES)^2, the last one a rigid gel's
 _ROUNDS = 3  # cuts at most, until the height of the membrane over the map is known
 _NOTHING = -500.0  # m: lower heights mean that the object is not there
