@@ -12,7 +12,7 @@ from geomtact.contact_space.contact_maps import located
 from geomtact.contact_space.touches import random_touches
 from geomtact.evaluation import simultaneous_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.inference import sampler
+from geomtact.inference import sampler, two_runs
 from geomtact.inference.effort import Effort
 from geomtact.inference.particles import prior_at
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
@@ -45,7 +45,7 @@ def test_it_says_more_than_its_cells(localizer, touch, posterior):
 
 
 def test_runs_that_agree_on_nothing_are_not_believed(localizer, touch, monkeypatch):
-    monkeypatch.setattr(sampler, "_AGREE", -np.inf)
+    monkeypatch.setattr(two_runs, "_AGREE", -np.inf)
     found = localizer.localize(touch.mask, "mask", effort=EFFORT)
     assert found.explored is None and "not resolved within the grid's cells" in found.warnings[-1]
     cells = localizer.localize(touch.mask, "mask", effort=replace(EFFORT, contacts=0))
@@ -60,7 +60,7 @@ def test_two_runs_pool_what_they_found(localizer, touch):
     one, other = sampler.explore(localizer.index, query, coarse, 3000, rng, runs=2)
     mean = np.log(np.exp(np.array([one.log_evidence, other.log_evidence])).mean(0))
     for powers in (len(mean), 3):
-        both = sampler._pooled(one, other, powers, rng)
+        both = two_runs._pooled(one, other, powers, rng)
         np.testing.assert_allclose(both.log_evidence, mean[:powers], atol=1e-9)
         assert [len(p) for p in both.particles] == [
             len(p) + len(q) for p, q in zip(one.particles[:powers], other.particles[:powers], strict=True)
@@ -79,7 +79,7 @@ def test_powers_on_which_runs_disagree_are_left_out(localizer, touch, monkeypatc
         off = (*other.log_evidence[:2], *(e - 50 for e in other.log_evidence[2:]))
         return one, replace(other, density=replace(other.density, log_evidence=off))
 
-    monkeypatch.setattr(sampler, "explore", apart)
+    monkeypatch.setattr(two_runs, "explore", apart)
     found = localizer.localize(touch.mask, "mask", effort=EFFORT)
     assert len(seen) == 6 and len(found.explored.density.log_evidence) == 2
     assert found.explored.contacts > sum(each.contacts for each in seen)  # of modes too
@@ -129,7 +129,7 @@ def test_registration_moves_a_mode_within_its_radius(posterior):
 
 
 def test_modes_that_hold_more_than_everything_are_not_believed(localizer, touch, monkeypatch):
-    monkeypatch.setattr(sampler, "weighed", lambda found, log_measure, contacts, rng: (found, 5.0))
+    monkeypatch.setattr(two_runs, "weighed", lambda found, log_measure, contacts, rng: (found, 5.0))
     found = localizer.localize(touch.mask, "mask", effort=EFFORT)
     assert found.explored is None and "do not settle how likely" in found.warnings[-1]
 

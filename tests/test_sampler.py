@@ -11,7 +11,7 @@ from geomtact import Sensor
 from geomtact.contact_space.contact_maps import SHAPE, ContactMaps, located
 from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.mesh_file import load_mesh
-from geomtact.inference import explored, sampler
+from geomtact.inference import explored, sampler, two_runs
 from geomtact.inference.particles import Target, poses_of
 from geomtact.inference.sampler import explore
 from geomtact.scoring.contact_likelihood import POWERS, RATE, ContactQuery
@@ -133,7 +133,7 @@ def test_particles_stay_in_the_contact_pose_space(localizer, maps):
         assert ((particles.depth >= 0) & (particles.depth <= localizer.sensor.max_penetration)).all()
     assert run.density.weights.sum() == pytest.approx(1)
     assert run.contacts <= 1.25 * 3000
-    found = sampler._with_errors(run, 10_000, np.random.default_rng(1))
+    found = two_runs._with_errors(run, 10_000, np.random.default_rng(1))
     assert len(found.poses) == round(np.exp(found.density.log_inside) * sum(map(len, run.particles)))
     assert ((found.depth >= 0) & (found.depth <= localizer.sensor.max_penetration)).all()
 

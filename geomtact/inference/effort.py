@@ -14,7 +14,7 @@ class Effort:
     Attributes
     ----------
     modes : that are refined
-    contacts : of the last attempt to resolve the pose within the cells of the grid (see ``inference.sampler``), of one mask that
+    contacts : of the last attempt to resolve the pose within the cells of the grid (see ``inference.two_runs``), of one mask that
         is not of a known face. The first attempt has a sixteenth, and settles most touches; the second has a quarter. Half as
         many more weigh the modes. 0 leaves the cells as they are
     thorough : whether each mode is refined by all registrations or by one

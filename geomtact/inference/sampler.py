@@ -12,8 +12,6 @@ observed one, and moves turn the object about that point of the membrane.
 
 from __future__ import annotations
 
-import functools
-import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,10 +22,8 @@ from scipy.special import ndtr, ndtri
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located, sample_pitch
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
-from geomtact.inference.explored import Density, Explored
-from geomtact.inference.mode_mass import weighed
+from geomtact.inference.explored import Density
 from geomtact.inference.particles import Particles, Target, poses_of
-from geomtact.inference.systematic_errors import NODES, drawn
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array, exp, inverse, log, transform
 
@@ -47,11 +43,6 @@ _ALONG = 1.0  # largest multiple of a difference
 _TURN = 0.1  # rad, standard deviation of the first moves; they differ by a factor of ten from pose to pose
 _EXPONENTS = np.geomspace(2e-4, 1, 40)  # of the likelihood, that the first step may have
 _HALVINGS = 30
-_POSES, _FOR_EACH = (300, 600), 20  # poses that are kept in the end, at least and at most, and contacts for each
-_AGREE = 1.0  # nats: mean difference of two log evidences, by the weights of the powers, above which no run is believed; hand-set
-_MORE = 4  # times as many contacts are cut in each attempt after the first
-_LEFT_OUT = 3  # powers that an attempt may leave out, before the last
-_WEIGHING = 0.5  # contacts that weigh the modes, for each that finds them
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,83 +66,6 @@ class Run:
     def log_evidence(self) -> tuple[float, ...]:
         """Of each posterior."""
         return self.density.log_evidence
-
-
-def explore_twice(
-    index: Index,
-    query: ContactQuery,
-    coarse: Array,
-    contacts: int,
-    rng: np.random.Generator,
-    log_prior: NDArray[np.floating] | None = None,
-) -> Explored:
-    """As :func:`explore`, with its modes, by two runs that share a sixteenth of the ``contacts`` and have to agree on the
-    evidence.
-
-    Where they do not, one has missed what the other found; where the modes hold more than everything, both have. Then the largest
-    powers of the likelihood are left out until they agree, three of them at most. If that does not help, both are repeated with a
-    quarter of the contacts, and then with all, where as many powers are left out as need be.
-
-    Raises
-    ------
-    InputError
-        No pose that was drawn touches the sensor, or the runs agree on nothing.
-    """
-    cut, all_powers = 0, len(POWERS)
-    for asked in (contacts // _MORE**2, contacts // _MORE, contacts):
-        one, other = explore(index, query, coarse, asked // 2, rng, log_prior, runs=2)
-        cut += one.contacts + other.contacts
-        least = 2 if asked == contacts else all_powers - _LEFT_OUT
-        for powers in range(all_powers, least - 1, -1):
-            run = replace(_pooled(one, other, powers, rng), contacts=cut)
-            apart = float(run.density.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
-            if apart < _AGREE:
-                found = _with_errors(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
-                found, log_sum = weighed(found, run.log_measure, round(_WEIGHING * asked), rng)
-                if log_sum < 0:
-                    return found
-                cut = found.contacts
-    raise InputError(
-        f"{index.mesh.name}: {cut:,} contacts do not settle how likely the observed one is; allow more by Effort(contacts=)"
-    )
-
-
-def _pooled(one: Run, other: Run, powers: int, rng: np.random.Generator) -> Run:
-    """Two runs as one: of each posterior by the smallest ``powers`` the particles of both, by how likely each run makes the
-    contact."""
-    particles, evidence = [], []
-    each = zip(one.particles, other.particles, one.log_evidence, other.log_evidence, strict=True)
-    for first, second, a, b in itertools.islice(each, powers):
-        evidence.append(float(np.logaddexp(a, b) - np.log(2)))
-        share, n = float(np.exp(a - np.logaddexp(a, b))), len(first) + len(second)
-        of_first = _systematic(np.ones(len(first)), round(share * n), rng)
-        of_second = _systematic(np.ones(len(second)), n - round(share * n), rng)
-        particles.append(first.take(of_first).joined(second.take(of_second)))
-    measure = float(np.logaddexp(one.log_measure, other.log_measure) - np.log(2))
-    density = replace(one.density, log_evidence=tuple(evidence))
-    return replace(one, density=density, particles=tuple(particles), log_measure=measure)
-
-
-def _with_errors(run: Run, n: int, rng: np.random.Generator) -> Explored:
-    """Up to ``n`` poses of a ``run`` with errors, drawn by ``rng``: those that are in the contact pose space.
-
-    Raises
-    ------
-    InputError
-        None is.
-    """
-    density, target = run.density, run.density.target
-    mass = np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(run.particles, density.weights, strict=True)])
-    each = functools.reduce(Particles.joined, run.particles).take(_systematic(mass, min(len(mass), n), rng))
-    T = density.with_errors(poses_of(each.poses, each.depth, target.index.mesh.centre), drawn(len(each), rng))
-    moved = target.at(T)
-    inside = np.flatnonzero(np.isfinite(moved.log_target(1)))
-    if not len(inside):
-        raise InputError(f"{target.index.mesh.name}: no pose that was found touches the sensor; allow more contacts")
-    density = replace(density, log_inside=float(np.log(len(inside) / len(each))))
-    contacts = run.contacts + len(each) + NODES * len(inside)
-    T = T[inside]
-    return Explored(density, T, moved.depth[inside], density.at(T), contacts)
 
 
 def explore(
@@ -245,10 +159,10 @@ def _effective(log_weight: Array) -> Array:
 def _resampled(log_weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """``n`` rows by their weight for each run of ``log_weight`` (runs, m), one run after the other."""
     weight = np.exp(log_weight - log_weight.max(1, keepdims=True))
-    return np.concatenate([run * len(each) + _systematic(each, n, rng) for run, each in enumerate(weight)])
+    return np.concatenate([run * len(each) + systematic(each, n, rng) for run, each in enumerate(weight)])
 
 
-def _systematic(weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def systematic(weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """``n`` rows by their ``weight`` (m,), as evenly as can be (systematic resampling)."""
     total = np.cumsum(weight)
     return np.minimum(np.searchsorted(total, (np.arange(n) + rng.random()) / n * total[-1]), len(total) - 1)
@@ -332,7 +246,7 @@ def _draw(target: Target, share: Array, runs: int, n: int, rng: np.random.Genera
     is the uniform density over that of the draw, over n.
     """
     index = target.index
-    place = np.concatenate([_systematic(share, n, rng) for _ in range(runs)])
+    place = np.concatenate([systematic(share, n, rng) for _ in range(runs)])
     share = share / share.sum()
     drawn = transform(index.directions.draw(index.rotation[place], rng), np.zeros(3))
     rotation = index.directions.canonical(drawn)[:, :3, :3]

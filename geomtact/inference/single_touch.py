@@ -22,8 +22,8 @@ from geomtact.inference.outline_refinement import few_are_left, refine_by_outlin
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import lost_contact, prior_log_density, prior_log_mass
 from geomtact.inference.repeated_images import digest
-from geomtact.inference.sampler import explore_twice
 from geomtact.inference.search import SensorView
+from geomtact.inference.two_runs import explore_twice
 from geomtact.inference.views import Placed
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.scoring.fitted import FittedScorer

@@ -18,7 +18,7 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.effort import EFFORTS
 from geomtact.inference.explored import Density
 from geomtact.inference.particles import Target, poses_of
-from geomtact.inference.sampler import explore_twice
+from geomtact.inference.two_runs import explore_twice
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
