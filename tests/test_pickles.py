@@ -88,7 +88,7 @@ def test_a_pool_of_processes_localizes(flat_nut, a_touch, start):
 
 def test_without_a_cache_everything_is_in_the_pickle(flat_nut, a_touch):
     alone = replace(flat_nut, index=replace(flat_nut.index, folder=None))
-    assert len(pickle.dumps(alone)) > flat_nut.index.bits.nbytes
+    assert len(pickle.dumps(alone)) > flat_nut.index.deflated.nbytes
     mask = a_touch(flat_nut)[1]
     check_same(flat_nut.localize(mask), pickle.loads(pickle.dumps(alone)).localize(mask))
 

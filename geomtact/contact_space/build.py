@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from geomtact.contact_space import resolution as res
 from geomtact.contact_space.heightmap import CELL_PIXELS, NOTHING, HeightMap, Lattice, Window, allowed
-from geomtact.contact_space.index import pack
+from geomtact.contact_space.index import deflate, pack
 from geomtact.contact_space.resolution import MAX_POSES, Resolution
 from geomtact.errors import MeshError
 from geomtact.geometry.approach import Approach
@@ -148,12 +148,12 @@ def _join(turns: list[_Turn], directions: Directions, lattice: Lattice) -> dict[
     first = np.concatenate([[0], np.cumsum([len(t.cell) for t in turns])])
     some, n = turns[0], int(first[-1])
     p, words = some.bits.shape[:2]
+    bits = np.zeros((p, words, n), np.uint64)
     out: dict[str, NDArray] = {
         "rotation": np.zeros(n, np.int32),
         "shift": np.zeros((n, 2), np.float32),
         "height": np.zeros((p, n), np.float32),
         "weight": np.zeros((p, n), np.float32),
-        "bits": np.zeros((p, words, n), np.uint64),
         "area": np.zeros((p, n), np.uint16),
         "moments": np.zeros((some.moments.shape[0], p, n), np.float32),
         "table": np.zeros((len(turns), *lattice.cells), np.int32),
@@ -165,12 +165,13 @@ def _join(turns: list[_Turn], directions: Directions, lattice: Lattice) -> dict[
         out["shift"][part] = turn.shift
         out["height"][:, part] = turn.height
         out["weight"][:, part] = turn.weight * share[r]
-        out["bits"][:, :, part] = turn.bits
+        bits[:, :, part] = turn.bits
         out["area"][:, part] = turn.area
         out["moments"][:, :, part] = turn.moments
         table = np.full(lattice.cells, -1)
         table.flat[turn.cell] = np.arange(first[r], first[r + 1])
         out["table"][r] = _fill(table) if len(turn.cell) else -1
+    out["deflated"] = deflate(bits)
     out["weight"] /= out["weight"].sum(dtype=np.float64)
     out["moments"] = out["moments"].reshape(some.moments.shape[0], p * n)
     # a rotation that cannot touch at all borrows the places of the nearest one before it that can

@@ -76,10 +76,11 @@ class ContactMaps:
             path = None if index.folder is None else index.folder / f"maps-{_FORMAT}.npz"
             heights = None if path is None else _read(path)
             if heights is None:
-                heights = _cast(index)
+                images, low, step = _rounded(_cast(index))
                 if path is not None:
                     with contextlib.suppress(OSError):  # a read-only cache costs the casts each time, no more
-                        heights = _written(path, heights)
+                        _write(path, images, low, step)
+                heights = _heights(images, low, step)
             maps = _maps(heights, sample_pitch(index.sensor) / _PIXELS_PER_SAMPLE)
             _OPENED[index] = maps, np.swapaxes(facing(index.directions.vectors), 1, 2)
         return cls(index, *_OPENED[index])
@@ -162,12 +163,16 @@ def _maps(heights: NDArray[np.float32], pixel: float) -> Maps:
     return Maps(heights, np.stack([widest(each) for each in heights]), pixel)
 
 
-def _written(path: Path, heights: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Write ``heights`` (D, n, n) as 16-bit images; returns them as they will be read."""
+def _rounded(heights: NDArray[np.float32]) -> tuple[NDArray[np.uint16], float, float]:
+    """``heights`` (D, n, n) as 16-bit images, 0 where there is nothing; the least of them, and their step."""
     there = heights > NOTHING / 2
     low, high = float(heights[there].min()), float(heights[there].max())
     step = max(high - low, 1e-9) / _LEVELS
-    images = np.where(there, np.rint((np.where(there, heights, low) - low) / step) + 1, 0).astype(np.uint16)
+    return np.where(there, np.rint((np.where(there, heights, low) - low) / step) + 1, 0).astype(np.uint16), low, step
+
+
+def _write(path: Path, images: NDArray[np.uint16], low: float, step: float) -> None:
+    """Write what :func:`_rounded` gives."""
     coded = [cv2.imencode(".png", image)[1] for image in images]
 
     def write(temporary: Path) -> None:
@@ -181,7 +186,6 @@ def _written(path: Path, heights: NDArray[np.float32]) -> NDArray[np.float32]:
             )
 
     write_whole(path, write)
-    return _heights(images, low, step)
 
 
 def _heights(images: NDArray[np.uint16], low: float, step: float) -> NDArray[np.float32]:
@@ -193,7 +197,7 @@ def _decoded(png: NDArray[np.uint8]) -> NDArray[np.uint16]:
 
 
 def _read(path: Path) -> NDArray[np.float32] | None:
-    """What :func:`_written` wrote; None where there is nothing that can be read."""
+    """The heights that :func:`_write` wrote; None where there is nothing that can be read."""
     with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, cv2.error):
         with np.load(path, allow_pickle=False) as data:
             coded, ends, (low, step) = data["bytes"], data["ends"], data["scale"]

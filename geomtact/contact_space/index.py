@@ -7,6 +7,7 @@ place at one penetration. Every array is laid out penetration by penetration, so
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -44,7 +45,7 @@ class Index:
     shift : (n, 2) object's centre along x and y, sensor frame [m]: a point of the cell at which it touches
     height : (P, n) the centre's z at each penetration [m]
     weight : (P, n) share of the uniform measure in each pose's cell; sums to 1, 0 where the housing forbids it
-    bits : (P, words, n) uint64, the contact masks packed along the words
+    deflated : (m,) the contact masks, packed and compressed: see :func:`deflate`
     area : (P, n) number of contact pixels
     moments : (6, P n) moments of each mask (see ``sensing.moments``)
     table : (rotations, ny, nx) place of each lattice cell, the nearest one where the cell does not touch
@@ -60,13 +61,13 @@ class Index:
     shift: NDArray[np.float32]
     height: NDArray[np.float32]
     weight: NDArray[np.float32]
-    bits: NDArray[np.uint64]
+    deflated: NDArray[np.uint8]
     area: NDArray[np.uint16]
     moments: NDArray[np.float32]
     table: NDArray[np.int32]
     folder: Path | None = None
 
-    ARRAYS = ("rotation", "shift", "height", "weight", "bits", "area", "moments", "table")
+    ARRAYS = ("rotation", "shift", "height", "weight", "deflated", "area", "moments", "table")
 
     def __len__(self) -> int:
         return self.height.size
@@ -77,6 +78,12 @@ class Index:
     @property
     def places(self) -> int:
         return self.height.shape[1]
+
+    @cached_property
+    def bits(self) -> NDArray[np.uint64]:
+        """The contact masks (P, words, n), packed along the words."""
+        words = np.frombuffer(zlib.decompress(self.deflated.tobytes()), np.uint64)
+        return words.reshape(self.height.shape[0], -1, self.places)
 
     @property
     def bytes_per_pose(self) -> float:
@@ -254,7 +261,7 @@ class Index:
         return np.asarray(self._of_rotation[self.rotation] * self._of_lattice_cell, float)
 
     def uniform_density(self, T: ArrayLike) -> Array:
-        """Density (n,) of :attr:`cell_measure` at ``T`` (n, 4, 4), per rad and metre of each of ``symmetry.motions``."""
+        """Density (n,) of :attr:`cell_measure` at ``T`` (n, 4, 4), per rad and metre of each of ``directions.motions``."""
         volume = self.resolution.step**2 * self.sensor.max_penetration
         return self.directions.density(np.asarray(T, float)[:, :3, :3]) * self._of_lattice_cell / volume
 
@@ -311,7 +318,7 @@ class Index:
             shift=self.shift[places],
             height=self.height[:, places],
             weight=self.weight[:, places],
-            bits=self.bits[:, :, places],
+            deflated=deflate(self.bits[:, :, places]),
             area=self.area[:, places],
             moments=moments.reshape(len(moments), -1),
             table=np.zeros((0, 0, 0), np.int32),
@@ -333,6 +340,11 @@ class Index:
 def pack(masks: NDArray[np.bool_]) -> NDArray[np.uint64]:
     """Masks (..., h*w) as packed words (..., h*w/64)."""
     return np.packbits(masks, axis=-1).view(np.uint64)
+
+
+def deflate(bits: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """Packed masks (P, words, n) compressed by zlib, to a fifteenth or so."""
+    return np.frombuffer(zlib.compress(bits.tobytes(), 1), np.uint8)
 
 
 def unpack(words: NDArray[np.uint64], shape: tuple[int, int]) -> NDArray[np.bool_]:

@@ -1,6 +1,6 @@
 """The cache of built indexes: a folder an index, named by the hash of all that went into it.
 
-An entry is written under a temporary name and renamed, so it is whole or absent; its masks are memory-mapped when read.
+An entry is written under a temporary name and renamed, so it is whole or absent.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from geomtact.sensing.sensor import Sensor
 if TYPE_CHECKING:
     import filelock
 
-FORMAT = 10  # raise whenever a built index would differ
+FORMAT = 11  # raise whenever a built index would differ
 DEFAULT_LIMIT = 20 * 10**9
 _KEPT = 4  # indexes that a process has read for pickles and keeps
 _CHOOSING = 0.1  # share of the time that choosing the grid takes, about
@@ -244,11 +244,7 @@ def _read(folder: Path, mesh: Mesh, sensor: Sensor, approach: Approach | None) -
         meta = json.loads((folder / "meta.json").read_text("utf-8"))
         if meta["format"] != FORMAT:
             return None
-        # the masks, most of the bytes, stay on disk until they are asked for; a touch reads the rest every time
-        arrays = {
-            a: np.load(folder / f"{a}.npy", mmap_mode="r" if a == "bits" else None, allow_pickle=False)
-            for a in Index.ARRAYS
-        }
+        arrays = {a: np.load(folder / f"{a}.npy", allow_pickle=False) for a in Index.ARRAYS}
         s = meta["symmetry"]
         axis = None if s["axis"] is None else np.array(s["axis"])
         symmetry = Symmetry(s["kind"], np.array(s["elements"]), axis, np.array(s["centre"]))
