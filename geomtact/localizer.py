@@ -22,7 +22,6 @@ from geomtact.inference.sequence import track
 from geomtact.inference.single_touch import (
     drop_lost_contact_prior,
     explore_touch,
-    is_explored,
     refine_modes,
     touch_posterior,
 )
@@ -106,14 +105,12 @@ class Localizer(PreparedObject):
         views = read_views(image, T_world_sensor, self.sensors, kind, background)
         prior = opened(prior, self.cache_dir)
         each = self.by_sensor if self.others else [self] * len(views)
-        alone = len(views) == 1 and is_explored(self.index, views[0].observation, resolved)
         touches = [
             touch_posterior(
                 one.index,
                 one.scorer,
                 view,
                 prior if len(views) == 1 else None,
-                resolved.pixels and not alone,  # contacts stand for the pixels
                 Provenance(effort, one.scorer.name, one.max_poses),
                 seed,
             )

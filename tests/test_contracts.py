@@ -85,7 +85,7 @@ def test_every_score_is_reached_by_a_name(fit):
     while waiting:
         each = waiting.pop()
         reached.add(type(each).__name__)
-        inside = [getattr(each, name, None) for name in ("scorer", "exact_scorer", "scorers")]
+        inside = [getattr(each, name, None) for name in ("scorer", "scorers")]
         waiting += [one for some in inside for one in (some if isinstance(some, list | tuple) else [some]) if one]
     defined = {each.__name__ for each in implementations(geomtact.scoring, "score")}
     assert defined - reached <= ONLY_BY_WEIGHTS | INNER

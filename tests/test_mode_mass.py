@@ -15,29 +15,33 @@ MASS = np.array([0.3, 0.6, 0.05])
 COUNT = np.array([500, 40, 90])  # particles: not as the masses are
 
 
-@pytest.fixture(scope="module", params=slow_but(["bracket", "hex_nut", "damping_pin"], "bracket"))
+FACES = {"bracket, two faces": [((0, 0, 1), 0.0), ((0, 0, -1), 0.0)], "damping_pin, a side": [((1, 0, 0), 0.0)]}
+
+
+@pytest.fixture(scope="module", params=slow_but(["bracket", "hex_nut", "damping_pin", *FACES], "bracket", *FACES))
 def normal_modes(request, make_localizer):
     """Three places with normal densities, of which particles were drawn in other numbers, and half as wide."""
-    index, rng = make_localizer(request.param, "gelslim", max_poses=20_000).index, np.random.default_rng(0)
-    basis = index.directions.symmetry.motions
-    width = WIDTH[-len(basis) :] if len(basis) == 6 else np.append(WIDTH[:2], WIDTH[3:])
-    distance, hearts = PoseDistance(index.mesh, 128), index.poses([0])
-    for T in index.poses(rng.permutation(len(index))[:500]):
+    name, approach = request.param.partition(",")[0], FACES.get(request.param)
+    index, rng = make_localizer(name, "gelslim", max_poses=20_000, approach=approach).index, np.random.default_rng(0)
+    distance, hearts = PoseDistance(index.mesh, 128), index.poses(index.possible[:1])
+    for T in index.poses(rng.permutation(index.possible)[:500]):
         if len(hearts) < 3 and distance.mean(T, hearts).min() > 20e-3:
             hearts = np.concatenate([hearts, T[None]])
     assert len(hearts) == 3
+    bases = [index.directions.motions(heart[:3, :3]) for heart in hearts]
+    width = np.append(WIDTH[: len(bases[0]) - 3], WIDTH[3:])
 
     def log_normal(T):
         """Log density (n,) over the uniform one."""
         each = []
-        for heart, mass in zip(hearts, MASS, strict=True):
+        for heart, basis, mass in zip(hearts, bases, MASS, strict=True):
             off = log(inverse(heart) @ distance.aligned(heart, T)) @ np.linalg.pinv(basis) / width
             each.append(np.log(mass / np.prod(width)) - 0.5 * (np.square(off) + np.log(2 * np.pi)).sum(1))
         return np.logaddexp.reduce(each) - np.log(index.uniform_density(T))
 
     drawn = [
         heart @ exp(0.5 * width * rng.normal(size=(n, len(width))) @ basis)
-        for heart, n in zip(hearts, COUNT, strict=True)
+        for heart, basis, n in zip(hearts, bases, COUNT, strict=True)
     ]
     poses = np.concatenate(drawn)
     return hearts, SimpleNamespace(

@@ -467,7 +467,7 @@ def test_a_truncated_posterior_is_refused(plug, posteriors, tmp_path):
 @pytest.fixture(scope="module")
 def exact(ball, a_touch):
     """The posterior of one touch of a ball, every cell scored, without refinement."""
-    rows = ball.scorer.rows(ball.index, a_touch(ball)[1], pixels=True)
+    rows = ball.scorer.rows(ball.index, a_touch(ball)[1])
     return Posterior(ball.index, rows.cells, rows.log_prob)
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.space import ContactSpace
-from geomtact.sensing.contact import HALF
 from geomtact.sensing.elastic import elastic_contact, elastic_mask
 from geomtact.sensing.noise import Noise, perturb
 
@@ -48,28 +46,6 @@ def simulate_depth_map(space: ContactSpace, T: ArrayLike, elastic: bool = True) 
     depth, pitch, margin = _around(space, T, space.sensor.image_size_px[::-1])
     gel, window = _where_gel(depth, margin, space.sensor.max_penetration)
     return elastic_contact(gel, pitch)[1][window]
-
-
-def sinking(space: ContactSpace, T: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """How deep (h, w) an elastic gel's contact with the object at ``T`` (4, 4) ends, in shares of the deepest penetration: on the
-    contact's outline, next to each pixel of the window."""
-    depth, pitch, margin = _around(space, T, shape)
-    gel, window = _where_gel(depth, margin, space.sensor.max_penetration)
-    touched = elastic_mask(gel, pitch).astype(np.uint8)
-    beside = np.ones((3, 3), np.uint8)
-    outline = cv2.dilate(touched, beside) != cv2.erode(touched, beside, borderValue=1)
-    deepest = float(gel[window].max())
-    if not outline.any() or deepest <= 0:  # what touches does so beside the window
-        return np.full(shape, HALF, np.float32)
-    # on either side of it, by as much of each as there is near by
-    on, deep = outline.astype(np.float32), np.maximum(gel, 0)
-    ends = cv2.GaussianBlur(on * deep, (0, 0), 1.0) / np.maximum(cv2.GaussianBlur(on, (0, 0), 1.0), 1e-6)
-    _, labels = cv2.distanceTransformWithLabels(
-        1 - outline.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    there = np.zeros(labels.max() + 1, np.float32)
-    there[labels[outline]] = ends[outline]
-    return np.asarray(cv2.GaussianBlur(there[labels[window]], (0, 0), 1.5) / deepest)
 
 
 def _around(

@@ -219,12 +219,25 @@ class Directions:
             new = at_polar(new @ self.symmetry.axis, a[: len(new)], self.symmetry.axis)
         return np.concatenate([new, a[len(new) :]])
 
+    def motions(self, R: ArrayLike) -> Array:
+        """Directions (d, 6) of xi, in T exp(xi^), that change where an object turned by ``R`` (3, 3) is and may be allowed: on an
+        exact face it turns about the sensor's axis alone."""
+        R, sym = np.asarray(R, float), self.symmetry
+        if self.cells is not None or sym.kind == "sphere":
+            return sym.motions
+        about_axis = np.concatenate([R[2], np.cross(sym.centre, R[2])])
+        turns = self.periods[self.lookup(transform(R, np.zeros(3))[None])[1][0]] > 0
+        return np.concatenate([about_axis[None][: int(turns)], np.eye(6)[3:]])
+
     def density(self, R: ArrayLike) -> Array:
         """Density (n,) of the uniform distribution of allowed rotations at ``R`` (n, 3, 3), modulo the symmetry, per rad of
-        each direction that changes how the object is turned; on exact faces it is as of all rotations."""
+        each direction of :meth:`motions` that turns the object."""
         R, cones = np.asarray(R, float), self.cones
-        if cones is None or cones[0][1] == 0 or self.symmetry.kind == "sphere":
+        if cones is None or self.symmetry.kind == "sphere":
             return np.full(len(R), self.symmetry.density)
+        if self.cells is None:
+            k = self.lookup(transform(R, np.zeros(3)))[1]
+            return np.asarray(self.weights[k] / np.where(self.periods[k] > 0, self.periods[k], 1.0))
         share = allowed(-np.einsum("nj,kji->nki", R[:, 2], self._images), cones).mean(1)
         return np.asarray(self.symmetry.density * share / self._allowed_share)
 

@@ -14,20 +14,15 @@ class Effort:
     Attributes
     ----------
     modes : that are refined
-    contacts : of the last attempt to resolve the pose within the cells of the grid (see ``inference.two_runs``), of one mask that
-        is not of a known face. The first attempt has a sixteenth, and settles most touches; the second has a quarter. Half as
-        many more weigh the modes. 0 leaves the cells as they are
+    contacts : of the last attempt to resolve the pose within the cells of the grid (see ``inference.two_runs``), of one mask. The
+        first attempt has a sixteenth, and settles most touches; the second has a quarter. Half as many more weigh the modes. 0
+        leaves the cells as they are
     thorough : whether each mode is refined by all registrations or by one
-    pixels : whether the score of cells counts the pixels too, where no contacts are to resolve them
-    outlines : whether, of one mask that no contacts resolve, the outline refines the modes where few enough cells are left (see
-        ``refine_by_outline``); these are registered in every way, as those of several sensors or of heights by FilterReg
     """
 
     modes: int
     contacts: int = 0
     thorough: bool = True
-    pixels: bool = False
-    outlines: bool = False
 
     def __post_init__(self) -> None:
         if self.modes < 0:
@@ -39,7 +34,7 @@ class Effort:
 EFFORTS = {
     "fast": Effort(0),
     "balanced": Effort(5, 160_000, thorough=False),
-    "exact": Effort(25, 640_000, pixels=True, outlines=True),
+    "exact": Effort(25, 640_000),
 }
 
 

@@ -26,7 +26,6 @@ class Diagnostics:
         ``unexplained_nats``, and None with measured depths
     settled_power : largest power of the likelihood that the contacts settle within the cells: 1 is all of it; None where the
         posterior is that of the cells
-    refined_by_outline : whether the outline was compared with those of rigid and elastic gels
     frame : number of the frame in a sequence, from 1; None outside of one
     surprise_nats : log of how likely the posterior of the frame before made this frame, relative to chance; None where
         nothing was compared
@@ -38,7 +37,6 @@ class Diagnostics:
     unexplained_nats: float | None = None
     misfit_nats: float | None = None
     settled_power: float | None = None
-    refined_by_outline: bool = False
     frame: int | None = None
     surprise_nats: float | None = None
     is_skipped: bool = False

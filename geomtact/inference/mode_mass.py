@@ -15,7 +15,6 @@ from scipy.special import gammaln
 
 from geomtact.contact_space.contact_maps import sample_pitch
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.explored import Explored
 from geomtact.inference.systematic_errors import drawn
 from geomtact.se3 import Array, exp, inverse, log
@@ -41,19 +40,21 @@ def weighed(explored: Explored, log_measure: float, contacts: int, rng: np.rando
     distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
     count = int(np.clip(contacts // (_ROUNDS * _DRAWS), *_MODES))
     hearts, members = _grown(explored, distance, radius, count)
-    basis = explored.index.directions.symmetry.motions
+    directions = explored.index.directions
+    bases = [directions.motions(heart[:3, :3]) for heart in explored.poses[hearts]]
     pitch = _SAMPLES * sample_pitch(explored.index.sensor)
-    least = np.where(basis[:, :3].any(1), pitch / mesh.radius_rms, pitch)
     modes = []
-    for heart, near in zip(explored.poses[hearts], members, strict=True):
+    for heart, basis, near in zip(explored.poses[hearts], bases, members, strict=True):
         motions = log(inverse(heart) @ distance.aligned(heart, explored.poses[near])) @ np.linalg.pinv(basis)
-        modes.append(_Mode(heart, least, [_Student.of(motions, explored.weight[near], least)]))
+        least = np.where(basis[:, :3].any(1), pitch / mesh.radius_rms, pitch)
+        modes.append(_Mode(heart, basis, least, [_Student.of(motions, explored.weight[near], least)]))
     for _ in range(_ROUNDS):
-        motions = np.stack([mode.students[-1].draw(_DRAWS, rng) for mode in modes])
-        T = np.stack([mode.heart @ exp(each @ basis) for mode, each in zip(modes, motions, strict=True)])
-        moved = density.with_errors(T, drawn(len(modes) * _DRAWS, rng).reshape(*motions.shape[:2], -1))
+        draws = [mode.students[-1].draw(_DRAWS, rng) for mode in modes]
+        xi = np.stack([each @ mode.basis for mode, each in zip(modes, draws, strict=True)])
+        T = np.stack([mode.heart for mode in modes])[:, None] @ exp(xi)
+        moved = density.with_errors(T, drawn(len(modes) * _DRAWS, rng).reshape(*xi.shape[:2], -1))
         near = np.stack([distance.within(mode.heart, each, radius) for mode, each in zip(modes, moved, strict=True)])
-        turn = np.linalg.norm(motions @ basis[:, :3], axis=-1)
+        turn = np.linalg.norm(xi[..., :3], axis=-1)
         # beyond these turns a placement is met again
         near &= (turn < np.pi) & np.stack(
             [_is_nearest(distance, mode.heart, each) for mode, each in zip(modes, T, strict=True)]
@@ -61,9 +62,9 @@ def weighed(explored: Explored, log_measure: float, contacts: int, rng: np.rando
         found = np.full(near.shape, -np.inf)
         particles = density.target.at(T[near])
         log_density = density.without_errors(particles) + np.log(explored.index.uniform_density(T[near]))
-        log_density += _log_volume(turn[near], explored.index.directions.symmetry)
+        log_density += _log_volume(turn[near], len(modes[0].basis) - 3)
         found[near] = np.where(np.isfinite(particles.log_likelihood), log_density, -np.inf)
-        for mode, each, log_densities in zip(modes, motions, found, strict=True):
+        for mode, each, log_densities in zip(modes, draws, found, strict=True):
             mode.add(each, log_densities)
     log_mass = np.array([mode.log_integral + log_measure for mode in modes]) - density.log_inside
     most = max(float(log_mass.max()), 0.0)
@@ -84,10 +85,11 @@ def _is_nearest(distance: PoseDistance, heart: Array, T: Array) -> NDArray[np.bo
     return np.asarray(np.abs(distance.aligned(heart, T) - T).max((1, 2)) < 1e-9)
 
 
-def _log_volume(turn: Array, symmetry: Symmetry) -> Array:
-    """Log (n,) of the uniform measure of a small volume of motions that turn by ``turn`` (n,) [rad], over that at no turn."""
-    half = np.sinc(turn / (2 * np.pi)) ** 2  # of the shifts, and of turns about three axes
-    of_turns = np.sinc(turn / np.pi) if symmetry.axis is not None else half
+def _log_volume(turn: Array, axes: int) -> Array:
+    """Log (n,) of the uniform measure of a small volume of motions that turn by ``turn`` (n,) [rad], about some of so many
+    ``axes``, over that at no turn."""
+    half = np.sinc(turn / (2 * np.pi)) ** 2  # of the shifts
+    of_turns = {2: np.sinc(turn / np.pi), 3: half}.get(axes, np.ones_like(turn))
     return np.asarray(np.log(np.maximum(half * of_turns, 1e-300)))
 
 
@@ -127,12 +129,14 @@ class _Mode:
     Attributes
     ----------
     heart : (4, 4), from which motions are
+    basis : (d, 6) that their coordinates are along, turns first
     least : (d,) standard deviations [rad, m] of the covariance that is known before
     students : that were drawn from, and the next one
     motions, log_density : of all draws
     """
 
     heart: Array
+    basis: Array
     least: Array
     students: list[_Student]
     motions: list[Array] = field(default_factory=list)

@@ -7,29 +7,23 @@ from typing import Any, TypeVar
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import CacheError
-from geomtact.scoring.fitted import FittedScorer, fitted_scorer
+from geomtact.scoring.fitted import fitted_scorer
 from geomtact.scoring.probability import Calibration
 
 _Kind = TypeVar("_Kind")
-Fit = tuple[Calibration, Calibration | None]
-
-
-def fit_of(scorer: FittedScorer) -> Fit:
-    """What distinguishes a score from another of its name."""
-    return scorer.calibration, scorer.exact_calibration
 
 
 @lru_cache(4)
-def reopened(kind: type[_Kind], index: Index, scorer: str, fit: Fit, *rest: Any) -> _Kind:
+def reopened(kind: type[_Kind], index: Index, scorer: str, calibration: Calibration, *rest: Any) -> _Kind:
     """``kind(index, scorer, *rest)`` with the score of that name, read from the cache entry of ``index``.
 
     Raises
     ------
     CacheError
-        The score there was fitted otherwise than ``fit``.
+        The score there has another ``calibration``.
     """
     fitted = fitted_scorer(scorer, index, index.folder)
-    if fit_of(fitted) != fit:
+    if fitted.calibration != calibration:
         raise CacheError(
             f"cache entry {index.folder}: its score {scorer!r} is not the one that was pickled; prepare the object again, and "
             "pickle it again"

@@ -19,7 +19,7 @@ from geomtact.geometry.approach import Approach
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.mode_refiner import ModeRefiner
-from geomtact.inference.pickled import fit_of, reopened
+from geomtact.inference.pickled import reopened
 from geomtact.progress import Progress
 from geomtact.scoring.fitted import FittedScorer, fitted_scorer
 from geomtact.se3 import check_pose
@@ -54,7 +54,7 @@ class PreparedObject:
         parts = tuple(getattr(self, field.name) for field in fields(self))
         if self.index.folder is None:
             return type(self), parts
-        return reopened, (type(self), self.index, self.scorer.name, fit_of(self.scorer), *parts[2:])
+        return reopened, (type(self), self.index, self.scorer.name, self.scorer.calibration, *parts[2:])
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.mesh.name} on {self.sensor.name}, {len(self.index):,} poses, {self.scorer.name})"

@@ -20,7 +20,6 @@ from geomtact.inference.mode_refiner import ModeRefiner, refined_at
 from geomtact.inference.posterior import Posterior
 from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
-from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread, moved
 from geomtact.registration.protocol import Problem
 from geomtact.scoring.likelihood import cast_log_likelihood, depth_map_log_likelihood
@@ -35,7 +34,6 @@ _DRAWS = 8  # poses drawn within each cell
 _POINTS = 60  # largest number of points of an outline, for observable directions
 _ROUGH_POINTS = 20  # largest number of points of an outline, to register all searched cells
 _HOPEFUL = 4  # number of poses per cell that the third and later sensors evaluate
-_THOROUGH = 25  # number of cells that ICP registers too
 _ROUNDS, _AROUND = 3, 12  # rounds of the last search, each for the better half of the cells, and poses per cell in each
 _REFINED_PER_MODE = 5  # number of cells, for each requested mode, whose pose is registered by all points
 _FIRST_WIDTH = 0.25  # standard deviation of the first motions around a pose, as a share of the grid's spread
@@ -136,13 +134,6 @@ class Candidates:
         """Of each cell, the pose (n, 4, 4) of the highest log_likelihood, and that log_likelihood (n,)."""
         return self.T[np.arange(len(self.T)), self.log_likelihood.argmax(1)], self.log_likelihood.max(1)
 
-    def with_others(self, rows: NDArray[np.int64], others: Candidates) -> Candidates:
-        """The best of each cell alone, in its place those of ``others`` (m, 1) in the cells ``rows`` (m,)."""
-        best = np.arange(len(self.T)), self.log_likelihood.argmax(1)
-        T, depth, log_likelihood = (each[best][:, None].copy() for each in (self.T, self.depth, self.log_likelihood))
-        T[rows], depth[rows], log_likelihood[rows] = others.T, others.depth, others.log_likelihood
-        return Candidates(T, depth, log_likelihood, self.hidden)
-
 
 class Search:
     """Poses of the object in the first sensor's frame at which one sensor or several would show what they do, in cells that
@@ -207,15 +198,10 @@ class Search:
         measured = (view for view in self.views if view.has_height)
         return sum((view.depth_likelihood(view.depths(T)) for view in measured), start=np.zeros(len(T)))
 
-    def registered(self, candidates: Candidates, thorough: bool = False) -> list[Candidates]:
-        """What was tried, and what registration makes of the best for each cell; if ``thorough``, ICP too of the most hopeful."""
-        best, log_likelihood = candidates.best()
-        found = [candidates, self.candidates(self.filterreg.refine(self.rough, best).T[:, None], candidates.hidden)]
-        if thorough:
-            some = np.sort(np.argsort(-log_likelihood, kind="stable")[:_THOROUGH])
-            again = Icp(self.first.surface, self.spread).refine(self.rough, best[some]).T
-            found.append(candidates.with_others(some, self.candidates(again[:, None], candidates.hidden[some])))
-        return found
+    def registered(self, candidates: Candidates) -> list[Candidates]:
+        """What was tried, and what registration makes of the best for each cell."""
+        best, _ = candidates.best()
+        return [candidates, self.candidates(self.filterreg.refine(self.rough, best).T[:, None], candidates.hidden)]
 
     def around_the_best(self, candidates: list[Candidates]) -> list[Candidates]:
         """What was tried, and others around the best in the better half of the cells, in the better half of those nearer, and
@@ -246,11 +232,7 @@ class Search:
             (depth > 0) & (depth <= self.first.space.sensor.max_penetration) & (log_likelihood > -np.inf)
         )
         # only the best of all those get their exact depth, which takes longer
-        return self.by_cell(*self._best(T[some], depth[some], log_likelihood[some])[1:])
-
-    def by_cell(self, T: Array, log_likelihood: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """The possible cells (m,) of those poses ``T`` (n, 4, 4) that touch, the likeliest pose (m, 4, 4) in each, and its log
-        likelihood (m,)."""
+        _, T, log_likelihood = self._best(T[some], depth[some], log_likelihood[some])
         depth = self.first.space.penetration(T)
         touching = np.isfinite(depth)
         home, T, log_likelihood = self._best(T[touching], depth[touching], log_likelihood[touching])
@@ -258,7 +240,7 @@ class Search:
         return home[possible], T[possible], log_likelihood[possible]
 
     def _best(self, T: Array, depth: Array, log_likelihood: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """As :meth:`by_cell`, for poses ``T`` (n, 4, 4) at the given ``depth`` (n,) in any cells."""
+        """As :meth:`best_of_each_cell`, of poses ``T`` (n, 4, 4) at the given ``depth`` (n,) in any cells."""
         order = np.argsort(-log_likelihood, kind="stable")
         home, row = np.unique(self.index.lookup(T[order], depth[order]), return_index=True)
         return home, T[order[row]], log_likelihood[order[row]]

@@ -18,7 +18,6 @@ from geomtact.inference.effort import Effort
 from geomtact.inference.facts import Diagnostics, Provenance, ViewRecord
 from geomtact.inference.joint_refinement import refine_jointly
 from geomtact.inference.mode_refiner import ModeRefiner
-from geomtact.inference.outline_refinement import few_are_left, refine_by_outline
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import lost_contact, prior_log_density, prior_log_mass
 from geomtact.inference.repeated_images import digest
@@ -28,7 +27,6 @@ from geomtact.inference.views import Placed
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.scoring.fitted import FittedScorer
 from geomtact.sensing.contact import Contact, SoftMask
-from geomtact.sensing.reading import Observation
 
 LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
 
@@ -39,7 +37,7 @@ _CONTRADICTION_NATS = 5.0
 
 
 def touch_posterior(
-    index: Index, scorer: FittedScorer, placed: Placed, prior: Any, pixels: bool, provenance: Provenance, seed: int
+    index: Index, scorer: FittedScorer, placed: Placed, prior: Any, provenance: Provenance, seed: int
 ) -> tuple[Posterior, LogMass]:
     """The posterior of one image on the cells of ``index``, not refined, and the log prior mass of every cell (M,).
 
@@ -48,7 +46,6 @@ def touch_posterior(
     Parameters
     ----------
     prior : as of ``Localizer.localize``, opened
-    pixels : whether the score counts them too
     """
     observation, T_frame_sensor, frame = placed.observation, placed.T_frame_sensor, placed.frame
     contact, warnings = observation.contact, [*index.mesh.warnings, *observation.warnings]
@@ -72,7 +69,7 @@ def touch_posterior(
     with timed(timing, "score"):
         if prior is not None:
             log_prior = prior_log_mass(index, prior, T_frame_sensor, frame)
-        rows = scorer.rows(index, shown, log_prior, pixels, above)
+        rows = scorer.rows(index, shown, log_prior, above)
     with timed(timing, "posterior"):
         log_prob = rows.log_prob
         model = scorer.evidence_model
@@ -102,19 +99,13 @@ def touch_posterior(
     return posterior, log_prior
 
 
-def is_explored(index: Index, observation: Observation, effort: Effort) -> bool:
-    """Whether the posterior of this image alone is resolved within the cells: of a mask, and not on known faces. There an elastic
-    gel's contacts err too much for single poses, and outlines are compared with those of solved gels instead."""
-    return effort.contacts > 0 and observation.contact.height is None and not index.space.on_known_faces
-
-
 def explore_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer, effort: Effort) -> Posterior:
     """The ``posterior`` of one mask, resolved within the cells by the contacts of ``effort``.
 
-    It is as it was where :func:`is_explored` says no. ``log_prior`` is as of :func:`touch_posterior`.
+    It is as it was without contact, or with depths. ``log_prior`` is as of :func:`touch_posterior`.
     """
     observation, index = posterior.observation, posterior.index
-    if observation is None or not posterior.contact or not is_explored(index, observation, effort):
+    if observation is None or not posterior.contact or observation.contact.height is not None or not effort.contacts:
         return posterior
     with timed(posterior.timing_ms, "explore"):
         mask = observation.contact.soft_mask
@@ -148,22 +139,19 @@ def drop_lost_contact_prior(posterior: Posterior, prior: Any) -> tuple[Posterior
 def refine_modes(posterior: Posterior, log_prior: LogMass, refiner: ModeRefiner, effort: Effort) -> Posterior:
     """The ``posterior`` of one image with its leading modes refined below the grid.
 
-    Masks are registered mode by mode. With depths, or where few cells are left, a search over cells refines and reweights.
+    Masks are registered mode by mode. With depths, a search over cells refines and reweights.
     ``log_prior`` is as of :func:`touch_posterior`.
     """
     if not posterior.contact or posterior.observation is None:
         return posterior
     with timed(posterior.timing_ms, "refine"):
         contact = posterior.observation.contact
-        has_height = contact.height is not None
         if posterior.explored is not None:
             return refiner.register(posterior, contact, effort.modes)
-        if not effort.modes or not (has_height or (effort.outlines and few_are_left(posterior))):
+        if contact.height is None or not effort.modes:
             return refiner.refine(posterior, contact, effort.modes, effort.thorough)
         view = SensorView(refiner, contact, np.eye(4))
-        if has_height:
-            return refine_jointly(posterior, [view], effort.modes, posterior.seed, log_prior)
-        return refine_by_outline(posterior, view, effort.modes, posterior.seed, log_prior)
+        return refine_jointly(posterior, [view], effort.modes, posterior.seed, log_prior)
 
 
 def _scored(contact: Contact) -> tuple[SoftMask, float]:

@@ -28,7 +28,6 @@ from scipy.stats import beta
 from geomtact.contact_space.contact_maps import SHAPE
 from geomtact.kernels.contact_energy import BLOCK, SHARES, Samples
 from geomtact.kernels.gel_likelihood import gel_log_likelihood
-from geomtact.scoring.outline import from_outline
 from geomtact.se3 import Array
 from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
@@ -116,6 +115,19 @@ def _log_shares() -> Array:
 
 
 _LOG_SHARE = _log_shares()
+
+
+def from_outline(mask: NDArray[np.bool_], pitch: float) -> NDArray[np.float32]:
+    """How far (H, W) [m] each pixel is outside the outline of ``mask``, negative inside; the window's border is no outline."""
+    image = mask.astype(np.uint8)
+    far = float(np.hypot(*mask.shape))
+    off = [
+        cv2.distanceTransform(side, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
+        if not side.all()
+        else np.full(mask.shape, far, np.float32)
+        for side in (1 - image, image)
+    ]
+    return np.asarray(pitch * np.where(mask, -off[1], off[0]), np.float32)
 
 
 def _samples(touched: NDArray[np.bool_], pitch: float, sensor: Sensor) -> Samples:

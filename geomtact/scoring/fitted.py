@@ -82,32 +82,22 @@ class FittedScorer:
     name : as requested
     scorer, calibration : of the cells
     evidence_model : gives the likelihood of a touch, given the object
-    exact_scorer, exact_calibration : of one that counts the pixels too; None where the score goes without
     """
 
     name: str
     scorer: Scorer
     calibration: Calibration
     evidence_model: EvidenceModel
-    exact_scorer: Scorer | None = None
-    exact_calibration: Calibration | None = None
 
     def rows(
-        self,
-        index: Index,
-        mask: SoftMask,
-        log_prior: NDArray[np.floating] | None = None,
-        pixels: bool = False,
-        above: float = 0.0,
+        self, index: Index, mask: SoftMask, log_prior: NDArray[np.floating] | None = None, above: float = 0.0
     ) -> Rows:
         """Scores of every single cell that has mass.
 
-        ``log_prior`` (N,) is the log mass of all cells, the uniform's where it is None; with ``pixels`` their overlap counts too.
-        ``mask`` is the contact of the object drawn back by ``above`` [m]: a contour line of the depth map.
+        ``log_prior`` (N,) is the log mass of all cells, the uniform's where it is None. ``mask`` is the contact of the object
+        drawn back by ``above`` [m]: a contour line of the depth map.
         """
         scorer, calibration = self.scorer, self.calibration
-        if pixels and self.exact_scorer is not None and self.exact_calibration is not None:
-            scorer, calibration = self.exact_scorer, self.exact_calibration
         cells, prior = index.possible, index.log_possible_weight
         if log_prior is not None:
             cells = np.flatnonzero(np.isfinite(log_prior))
@@ -233,15 +223,10 @@ def _fit(name: str, scorers: dict[str, Scorer], index: Index, touches: Calibrati
         candidates = {each: scorers[each] for each in (ENCODER, "moments", "iou")}
         # on a large grid a further score must gain more, for its time
         data["weights"], _ = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
-        more = {**candidates, "likelihood": scorers["likelihood"]}
-        data["exact_weights"], exact = choose(comparison, more, least=0.02, start=data["weights"])
-        data["exact"] = asdict(exact)
     # only the moments have learned from some of the touches
     touches = held_out if "moments" in data["weights"] else touches
     calibration = fit_calibration(_weighed(data["weights"], scorers), index, touches)
     data["calibration"] = asdict(calibration)
-    if name == DEFAULT_SCORER and data["exact_weights"] == data["weights"]:
-        data["exact"] = data["calibration"]
     return data
 
 
@@ -251,17 +236,11 @@ def _from_json(name: str, data: dict[str, Any], scorers: dict[str, Scorer]) -> F
     m = data["moments"]
     moments = Moments(np.array(m["bias"]), np.array(m["covariance"]), m["freedom"])
     scorers = {**_limited(scorers, data["nearest"]), "moments": moments}
-    exact_scorer, exact_calibration = None, None
-    if "exact" in data:
-        exact_scorer = _weighed(data["exact_weights"], scorers)
-        exact_calibration = Calibration(**data["exact"])
     return FittedScorer(
         name,
         _weighed(data["weights"], scorers),
         Calibration(**data["calibration"]),
         EvidenceModel(moments, tuple(data["usual"])),
-        exact_scorer,
-        exact_calibration,
     )
 
 

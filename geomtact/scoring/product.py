@@ -78,21 +78,17 @@ class Comparison:
 
 
 def choose(
-    comparison: Comparison, candidates: Mapping[str, Scorer], least: float, start: Mapping[str, float] | None = None
+    comparison: Comparison, candidates: Mapping[str, Scorer], least: float
 ) -> tuple[dict[str, float], Calibration]:
     """The scores that together gain most, with the weight of each, and their calibration.
 
-    One more is added while it gains ``least`` nats.
-
-    The first of the candidates is preferred as long as none gains ``least`` more; ``start`` is a choice to go on from.
+    One more is added while it gains ``least`` nats. The first of the candidates is preferred while none gains ``least`` more.
     """
     scores = {name: comparison.scores(scorer) for name, scorer in candidates.items()}
     alone = {name: comparison.calibrated(each) for name, each in scores.items()}
-    if start is None:
-        first = next(iter(candidates))
-        best = max(alone, key=lambda name: alone[name].gain)
-        start = {best if alone[best].gain > alone[first].gain + least else first: 1.0}
-    chosen = dict(start)
+    first = next(iter(candidates))
+    best = max(alone, key=lambda name: alone[name].gain)
+    chosen = {best if alone[best].gain > alone[first].gain + least else first: 1.0}
 
     def together(weights: Mapping[str, float]) -> Calibration:
         n = len(comparison.masks)

@@ -29,8 +29,7 @@ from geomtact.inference.sampler import Run, explore
 from geomtact.inference.systematic_errors import drawn
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
-from geomtact.scoring.contact_likelihood import POWERS, SCALE_ERROR, SHIFT_ERROR, ContactQuery
-from geomtact.scoring.outline import from_outline
+from geomtact.scoring.contact_likelihood import POWERS, SCALE_ERROR, SHIFT_ERROR, ContactQuery, from_outline
 from geomtact.se3 import Array
 from geomtact.sensing.noise import CLEAN, MODERATE
 from geomtact.versions import versions

@@ -106,7 +106,7 @@ def _judge(
     import tempfile
 
     from tools.studies.choices import study as choices
-    from tools.studies.scores.study import bytes_read
+    from tools.studies.scores.study import bytes_per_pose
 
     localizers: dict[str, Localizer] = {}
     spent: dict[tuple[Any, ...], float | None] = {}
@@ -118,7 +118,7 @@ def _judge(
             part["ways"][name] = {
                 "choice": way.choice,
                 "poses": len(localizers[name].index),
-                "bytes_per_pose": bytes_read(localizers[name], "balanced"),
+                "bytes_per_pose": bytes_per_pose(localizers[name].scorer.scorer, localizers[name].index),
                 "prepare_s": spent[way.prepared],
             }
         for kind in done:

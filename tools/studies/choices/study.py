@@ -105,7 +105,7 @@ _THESIS_POSES = 150_000  # of its discretisation (6.1.2)
 # what is modelled: (the variant without it, the variant with it), both of which count nats from the same uniform
 MODELLED = {
     "balanced, not fast": ("fast", DEFAULT),
-    "outlines, pixels and 25 modes (exact)": (DEFAULT, "exact"),
+    "640,000 contacts and 25 modes (exact)": (DEFAULT, "exact"),
     "a mode refined": ("no mode refined", "1 mode"),
     "5 modes refined": ("1 mode", DEFAULT),
     "15 modes refined": (DEFAULT, "15 modes"),
@@ -122,7 +122,7 @@ MODELLED = {
     "missing patches": ("calibrated without gaps", DEFAULT),
     "elastic gels, in calibrating": ("calibrated on rigid gels", DEFAULT),
     "5 modes refined, of a known side": ("this side, 1 mode", "this side alone"),
-    "outlines (exact), of a known side": ("this side alone", "this side, exact"),
+    "exact, of a known side": ("this side alone", "this side, exact"),
 }
 
 

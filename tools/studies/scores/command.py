@@ -194,7 +194,7 @@ def _judge(
     def keep(outcomes: list) -> None:
         entry = {
             "settings": described,
-            "bytes_per_pose": scores.bytes_read(localizer, effort),
+            "bytes_per_pose": scores.bytes_per_pose(localizer.scorer.scorer, localizer.index),
             "prepare_s": seconds,
             "outcomes": [asdict(o) for o in outcomes],
         }

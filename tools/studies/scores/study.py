@@ -86,13 +86,6 @@ def prepare(
     return localizer, PrepareTimes(index_s, describe_s, calibrate_s)
 
 
-def bytes_read(localizer: Localizer, effort: str) -> float:
-    """Bytes a pose that the localizer's score reads for a touch at ``effort``."""
-    fitted, index = localizer.scorer, localizer.index
-    exact = fitted.exact_scorer if effort == "exact" else None
-    return bytes_per_pose(exact or fitted.scorer, index)
-
-
 def bytes_per_pose(scorer: Scorer, index: Index) -> float:
     """Bytes that ``scorer`` reads of every pose to compare a touch with it; all that is stored, for one unknown here."""
     if isinstance(scorer, Product):
