@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import kstest
+from speed import slow_but
 
 from geomtact import GaussianPrior, Posterior
 from geomtact.contact_space.contact_maps import located
@@ -19,16 +20,19 @@ from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.sensing.reading import read_observation
 
 EFFORT = Effort(3, contacts=96_000)  # 6,000 at first
+SCENES = {"anywhere": (None, 20_000), "on a known face": ([((0, 0, 1), 0.0)], 8_000)}  # approach and poses
 
 
-@pytest.fixture(scope="module")
-def localizer(make_localizer):
-    return make_localizer("bracket", "gelslim", max_poses=20_000)
+@pytest.fixture(scope="module", params=slow_but(SCENES, "anywhere"))
+def localizer(request, make_localizer):
+    approach, max_poses = SCENES[request.param]
+    return make_localizer("bracket", "gelslim", approach=approach, max_poses=max_poses)
 
 
 @pytest.fixture(scope="module")
 def touch(localizer):
-    return random_touches(localizer.space, 1, 3)[0]
+    """It leaves enough open for uniform poses to meet its density."""
+    return random_touches(localizer.space, 1, 7 if localizer.space.on_known_faces else 3)[0]
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +165,8 @@ def test_a_prior_counts_once(localizer, touch, posterior):
 def test_a_narrow_prior_is_resolved_alike_by_any_seed(localizer, touch):
     """A first attempt with a sixteenth of the contacts may miss what is left of it, in both of its runs."""
     near = GaussianPrior(touch.T_sensor_object, np.diag([0.02] * 3 + [1e-3] * 3) ** 2)
-    found = [localizer.localize(touch.mask, "mask", effort=EFFORT, prior=near, seed=seed) for seed in (0, 1)]
+    effort = replace(EFFORT, contacts=4 * EFFORT.contacts)
+    found = [localizer.localize(touch.mask, "mask", effort=effort, prior=near, seed=seed) for seed in (0, 1)]
     evidence = [each.explored.density.log_evidence for each in found]
     powers = min(map(len, evidence))
     one, other = (np.array(each[:powers]) for each in evidence)

@@ -21,6 +21,7 @@ from geomtact.errors import ImageError, InputError, UsageError
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.distribution import cell_log_density
+from geomtact.inference.effort import Effort
 from geomtact.inference.motion import GaussianTwist, UniformBall
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.sensing.image_file import ImageFile, write_image
@@ -30,6 +31,8 @@ from tools.studies.track.trajectories import random_trajectory
 
 STILL = GaussianTwist(0.0, 0.0)
 KINDS = ("pin", "ball", "cone", "flat_nut")  # an axis, a sphere, cones of approach, and a face with a housing
+
+CELLS = Effort(5, thorough=False)  # as a sequence uses them
 
 
 def track(localizer, frames, *args, **options):
@@ -143,7 +146,7 @@ def test_frames_of_a_still_object_multiply(flat_nut, creeping):
 
 def test_one_frame_is_a_touch(flat_nut, creeping):
     mask = creeping[0][0].masks[0]
-    (first,), single = track(flat_nut, [mask], effort="balanced"), flat_nut.localize(mask)
+    (first,), single = track(flat_nut, [mask], effort="balanced"), flat_nut.localize(mask, effort=CELLS)
     possible = flat_nut.index.possible
     np.testing.assert_allclose(cell_log_density(first, possible), cell_log_density(single, possible), atol=1e-4)
     assert first.modes(1)[0].probability == pytest.approx(single.modes(1)[0].probability, abs=1e-4)
