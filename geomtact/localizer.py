@@ -92,7 +92,7 @@ class Localizer(PreparedObject):
         T_world_sensor : (4, 4), or one for each image (n, 4, 4): the posterior is then in the world frame
         prior : None, a Posterior, its path, a pair (poses, log weights), a GaussianPrior or a log density
         effort : "fast", "balanced" or "exact", or an Effort
-        seed : of the random choices made where credible levels tie, and in refining
+        seed : of all random choices: poses drawn within the cells, in refining, and where credible levels tie
         extrinsics_std : uncertainty of the sensors' poses relative to each other
 
         Raises

@@ -51,9 +51,9 @@ def normal_modes(request, make_localizer):
         log_density=log_normal(poses),
         contacts=0,
         density=SimpleNamespace(
-            target=SimpleNamespace(at=lambda T: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T)))),
-            without_errors=lambda particles: log_normal(particles.T),
-            with_errors=lambda T, errors: T,
+            target=SimpleNamespace(particles_at=lambda T: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T)))),
+            of_exact=lambda particles: log_normal(particles.T),
+            displaced=lambda T, errors: T,
             log_inside=0.0,
         ),
     )

@@ -78,7 +78,7 @@ def test_images_under_the_symmetry_are_equally_dense(localizer, maps):
     (run,) = explore(maps.index, query, coarse_of(localizer, touch.mask), 2000, np.random.default_rng(0))
     images = touch.T_sensor_object @ localizer.mesh.symmetry.elements
     assert len(images) > 1
-    density = run.density.at(images)
+    density = run.density.log_density(images)
     assert np.ptp(density) < 1e-3
 
 
@@ -133,7 +133,7 @@ def test_particles_stay_in_the_contact_pose_space(localizer, maps):
         assert ((particles.depth >= 0) & (particles.depth <= localizer.sensor.max_penetration)).all()
     assert run.density.weights.sum() == pytest.approx(1)
     assert run.contacts <= 1.25 * 3000
-    found = two_runs._with_errors(run, 10_000, np.random.default_rng(1))
+    found = two_runs._explored_from(run, 10_000, np.random.default_rng(1))
     assert len(found.poses) == round(np.exp(found.density.log_inside) * sum(map(len, run.particles)))
     assert ((found.depth >= 0) & (found.depth <= localizer.sensor.max_penetration)).all()
 
@@ -147,7 +147,7 @@ def test_the_density_at_a_particle_is_what_the_sampler_found(localizer, maps, mo
     off = []
     for particles in run.particles:
         T = poses_of(particles.poses, particles.depth, localizer.mesh.centre)
-        off.append(np.abs(run.density.at(T) - run.density.without_errors(particles)))
+        off.append(np.abs(run.density.log_density(T) - run.density.of_exact(particles)))
     assert np.quantile(off[-1], 0.9) < 0.01
     assert np.quantile(np.concatenate(off), 0.75) < 0.1
 

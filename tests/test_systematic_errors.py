@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from geomtact.inference.systematic_errors import NODES, drawn, nodes, with_errors, without_errors
+from geomtact.inference.systematic_errors import NODES, displaced, nodes, random_errors, undisplaced
 from geomtact.scoring.contact_likelihood import SCALE_ERROR, SHIFT_ERROR
 
 WIDTH = np.array([SCALE_ERROR] + 3 * [SHIFT_ERROR])
@@ -16,7 +16,7 @@ def share(errors):
 
 
 def test_errors_are_drawn_from_their_distribution():
-    of_all = share(drawn(20_000, np.random.default_rng(0)))
+    of_all = share(random_errors(20_000, np.random.default_rng(0)))
     assert all(kstest(each, "uniform").pvalue > 1e-3 for each in of_all.T)
 
 
@@ -35,11 +35,11 @@ def test_nodes_have_the_distribution():
 
 def test_errors_are_undone():
     rng = np.random.default_rng(1)
-    centre, errors, about = rng.normal(size=(50, 3)), drawn(50, rng), rng.normal(size=3)
-    np.testing.assert_allclose(without_errors(with_errors(centre, errors, about), errors, about), centre, atol=1e-12)
+    centre, errors, about = rng.normal(size=(50, 3)), random_errors(50, rng), rng.normal(size=3)
+    np.testing.assert_allclose(undisplaced(displaced(centre, errors, about), errors, about), centre, atol=1e-12)
 
 
 def test_a_larger_object_has_its_centre_farther_from_the_contact():
     centre, about = np.array([0.03, -0.02, 0.04]), np.array([0.003, 0.001, 0.0])
-    moved = with_errors(centre, np.array([np.log(1.01), 0, 0, 1e-4]), about)
+    moved = displaced(centre, np.array([np.log(1.01), 0, 0, 1e-4]), about)
     assert moved - about == pytest.approx(1.01 * (centre - about) + [0, 0, 1e-4])

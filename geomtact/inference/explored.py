@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
-from geomtact.inference.particles import Particles, Target, log_target, prior_at
-from geomtact.inference.systematic_errors import nodes, with_errors, without_errors
+from geomtact.inference.particles import Particles, Target, prior_at, tempered
+from geomtact.inference.systematic_errors import displaced, nodes, undisplaced
 from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
 from geomtact.se3 import Array, check_transforms, transform
 
@@ -55,28 +55,28 @@ class Density:
         """Log density (..., K) of each posterior over the prior, without errors, from the log likelihood and the log density of
         the coarse posterior (...)."""
         each = [
-            log_target(log_likelihood, log_coarse, power) - log_evidence
+            tempered(log_likelihood, log_coarse, power) - log_evidence
             for power, log_evidence in zip(POWERS, self.log_evidence, strict=False)
         ]
         return np.stack(each, -1)
 
-    def with_errors(self, T: Array, errors: Array) -> Array:
+    def displaced(self, T: Array, errors: Array) -> Array:
         """Poses ``T`` (..., 4, 4) with ``errors`` (..., 4)."""
         R, middle = T[..., :3, :3], self.index.mesh.centre
-        centre = with_errors(T[..., :3, 3] + R @ middle, errors, self.target.query.centroid)
+        centre = displaced(T[..., :3, 3] + R @ middle, errors, self.target.query.centroid)
         return transform(R, centre - R @ middle)
 
-    def without_errors(self, particles: Particles) -> Array:
+    def of_exact(self, particles: Particles) -> Array:
         """Log density (n,) of the mixture at ``particles`` (n,), if there were no errors."""
         each = self.by_power(particles.log_likelihood, particles.log_coarse) + np.log(self.weights)
         return np.asarray(particles.log_prior + np.logaddexp.reduce(each, -1))
 
-    def at(self, T: ArrayLike) -> Array:
+    def log_density(self, T: ArrayLike) -> Array:
         """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4) of the contact pose space."""
         return np.asarray(np.logaddexp.reduce(self.of_powers(T) + np.log(self.weights), -1)) - self.log_inside
 
     def of_powers(self, T: ArrayLike) -> Array:
-        """As :meth:`at` of each posterior (n, K), wherever its poses with errors are."""
+        """As :meth:`log_density` of each posterior (n, K), but not divided by the share that ``log_inside`` is the log of."""
         T = np.asarray(T, float).reshape(-1, 4, 4)
         parts = [self._of_powers(T[first : first + _PART]) for first in range(0, len(T), _PART)]
         return np.concatenate(parts) if parts else np.zeros((0, len(self.log_evidence)))
@@ -85,7 +85,7 @@ class Density:
         index, query, n = self.index, self.target.query, len(T)
         poses, membrane = located(index, T)
         errors, log_weight = nodes()
-        centre = without_errors(np.column_stack([poses.centre, membrane])[:, None], errors, query.centroid)
+        centre = undisplaced(np.column_stack([poses.centre, membrane])[:, None], errors, query.centroid)
         flat, rows = centre.reshape(-1, 3), np.repeat(np.arange(n), len(errors))
         place = index.place_of(index.rotation[poses.place[rows]].astype(np.int64), flat)
         reach = poses.reach[rows] + flat[:, 2] - membrane[rows]

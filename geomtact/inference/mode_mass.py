@@ -16,7 +16,7 @@ from scipy.special import gammaln
 from geomtact.contact_space.contact_maps import sample_pitch
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.explored import Explored
-from geomtact.inference.systematic_errors import drawn
+from geomtact.inference.systematic_errors import random_errors
 from geomtact.se3 import Array, exp, inverse, log
 
 # These choose where the density is looked at: they change how precise a mass is, not what is estimated.
@@ -25,7 +25,7 @@ _ROUNDS, _DRAWS = 3, 150  # of poses, for each mode
 _WIDER = 1.6  # standard deviations of the draws over those of the poses before
 _TAIL = 5  # degrees of freedom of the draws, which are of Student's distribution
 _EFFECTIVE = 20  # draws that decide about the next round's, at least
-_KNOWN, _SAMPLES = 3, 0.5  # a covariance counts as much as so many draws, of that many samples of the window
+_KNOWN, _SAMPLES = 3, 0.5  # a covariance whose width is so many samples of the window counts as much as so many draws
 _POINTS = 128  # of the surface, for distances
 
 
@@ -33,8 +33,8 @@ def weighed(explored: Explored, log_measure: float, contacts: int, rng: np.rando
     """``explored`` with its leading modes, as many as ``contacts`` contacts weigh, and the log of the sum of their masses as it
     was found.
 
-    Each is the poses within the mode radius of its densest particle. If they have more than everything, then the evidence misses
-    what they hold, and their masses are those of shares of them.
+    Each is the poses within the mode radius of its densest particle. If their masses add up to more than 1, the evidence is too
+    small; then they are scaled to add up to 1.
     """
     density, mesh = explored.density, explored.index.mesh
     distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
@@ -52,7 +52,7 @@ def weighed(explored: Explored, log_measure: float, contacts: int, rng: np.rando
         draws = [mode.students[-1].draw(_DRAWS, rng) for mode in modes]
         xi = np.stack([each @ mode.basis for mode, each in zip(modes, draws, strict=True)])
         T = np.stack([mode.heart for mode in modes])[:, None] @ exp(xi)
-        moved = density.with_errors(T, drawn(len(modes) * _DRAWS, rng).reshape(*xi.shape[:2], -1))
+        moved = density.displaced(T, random_errors(len(modes) * _DRAWS, rng).reshape(*xi.shape[:2], -1))
         near = np.stack([distance.within(mode.heart, each, radius) for mode, each in zip(modes, moved, strict=True)])
         turn = np.linalg.norm(xi[..., :3], axis=-1)
         # beyond these turns a placement is met again
@@ -60,13 +60,14 @@ def weighed(explored: Explored, log_measure: float, contacts: int, rng: np.rando
             [_is_nearest(distance, mode.heart, each) for mode, each in zip(modes, T, strict=True)]
         )
         found = np.full(near.shape, -np.inf)
-        particles = density.target.at(T[near])
-        log_density = density.without_errors(particles) + np.log(explored.index.uniform_density(T[near]))
-        log_density += _log_volume(turn[near], len(modes[0].basis) - 3)
+        particles = density.target.particles_at(T[near])
+        log_density = density.of_exact(particles) + np.log(explored.index.uniform_density(T[near]))
+        log_density += _log_volume(turn[near], len(modes[0].basis) - 3)  # 0 or 1 turns, on a known face, give the same
         found[near] = np.where(np.isfinite(particles.log_likelihood), log_density, -np.inf)
         for mode, each, log_densities in zip(modes, draws, found, strict=True):
             mode.add(each, log_densities)
-    log_mass = np.array([mode.log_integral + log_measure for mode in modes]) - density.log_inside
+    # errors take the poses of a mode out of the contact pose space as often as all others
+    log_mass = np.array([mode.log_integral + log_measure for mode in modes])
     most = max(float(log_mass.max()), 0.0)
     mass = _shared_out(explored, members, np.exp(log_mass - most))
     log_sum = most + float(np.log(max(mass.sum(), 1e-300)))
@@ -80,8 +81,10 @@ def _is_nearest(distance: PoseDistance, heart: Array, T: Array) -> NDArray[np.bo
     """Whether each of ``T`` (n, 4, 4) is the nearest to ``heart`` of its images under the symmetry; turns about an axis are not
     looked at, because no motion makes them."""
     symmetry = distance.mesh.symmetry
-    if symmetry is None or symmetry.kind != "discrete":
+    if symmetry is None or len(symmetry.elements) == 1:
         return np.ones(len(T), bool)
+    if symmetry.axis is not None:  # a half turn swaps its ends
+        return np.asarray((T[:, :3, :3] @ symmetry.axis) @ (heart[:3, :3] @ symmetry.axis) > 0)
     return np.asarray(np.abs(distance.aligned(heart, T) - T).max((1, 2)) < 1e-9)
 
 
@@ -133,6 +136,7 @@ class _Mode:
     least : (d,) standard deviations [rad, m] of the covariance that is known before
     students : that were drawn from, and the next one
     motions, log_density : of all draws
+    log_integral : log of the integral of the density about it, from the draws so far
     """
 
     heart: Array

@@ -79,23 +79,23 @@ class ModeRefiner:
         refined = refined_at(index, cells, poses[winner, np.arange(len(cells))], by, problem.length, winner > 0)
         return replace(reweight_cells(posterior, cells, LIKELIHOOD_POWER * likelihood), refined=refined)
 
-    def register(self, posterior: Posterior, contact: Contact, k: int) -> Posterior:
+    def register(self, posterior: Posterior, contact: Contact, k: int, thorough: bool = True) -> Posterior:
         """An explored ``posterior`` with the hearts of its ``k`` leading modes moved to where registration against ``contact``
-        finds a denser pose."""
+        finds a denser pose; ``thorough`` as of :meth:`refine`."""
         explored = posterior.explored
         if explored is None or not len(explored.hearts) or not k:
             return posterior
         rows = explored.hearts[:k]
         hearts = explored.settled(rows)
         problem = make_problem(cleaned(contact.soft_mask, self.space.sensor), self.space.sensor)
-        found = [refiner.refine(problem, hearts) for refiner in self.refiners(posterior.index, True)]
+        found = [refiner.refine(problem, hearts) for refiner in self.refiners(posterior.index, thorough)]
         T = np.stack([hearts, *(each.T for each in found)])
         density = np.full(T.shape[:2], -np.inf)
         density[0] = explored.log_density[rows]
         distance, radius = PoseDistance(self.space.mesh), mode_radius(self.space.mesh)
         near = np.stack([distance.within(heart, T[1:, i], radius) for i, heart in enumerate(hearts)], 1)
         near[near] = np.isfinite(self.space.penetration(T[1:][near]))
-        density[1:][near] = explored.density.at(T[1:][near])
+        density[1:][near] = explored.density.log_density(T[1:][near])
         best = density.argmax(0)
         # where no registration helped, the covariance is that of the first one
         by = [found[max(b - 1, 0)] for b in best]

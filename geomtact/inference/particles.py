@@ -41,7 +41,7 @@ class Particles:
         """Log (n,) of the density of the posterior by a power of the likelihood, up to a constant; -inf where nothing is
         touched."""
         touches = np.isfinite(self.log_likelihood)
-        return np.where(touches, self.log_prior + log_target(self.log_likelihood, self.log_coarse, power), -np.inf)
+        return np.where(touches, self.log_prior + tempered(self.log_likelihood, self.log_coarse, power), -np.inf)
 
     def take(self, rows: NDArray[np.int64]) -> Particles:
         """Those of ``rows`` (m,)."""
@@ -98,7 +98,7 @@ class Target:
         log_prior = prior_at(self.index, self.log_prior, poses.place, depth)
         return Particles(found, depth, log_likelihood, self.log_coarse[poses.place], log_prior)
 
-    def at(self, T: ArrayLike) -> Particles:
+    def particles_at(self, T: ArrayLike) -> Particles:
         """Poses ``T_sensor_object`` (n, 4, 4) as particles; those that are forbidden have no likelihood."""
         poses, membrane = located(self.index, np.asarray(T, float))
         return self.admitted(self.evaluated(poses, membrane))
@@ -125,7 +125,7 @@ def poses_of(poses: Placements, depth: Array, middle: Array) -> Array:
     return transform(poses.rotation, np.column_stack([poses.centre, height]) - poses.rotation @ middle)
 
 
-def log_target(log_likelihood: Array, log_coarse: Array, power: float) -> Array:
+def tempered(log_likelihood: Array, log_coarse: Array, power: float) -> Array:
     """Log density (n,) of the posterior by a power of the likelihood, up to a constant."""
     out = (1 - power) * log_coarse
     if power > 0:

@@ -246,7 +246,7 @@ class Posterior(CellDistribution):
         """Log density (n,) at poses ``T`` (n, 4, 4) in the sensor frame, which press ``depth`` (n,) [m] deep."""
         if self.explored is not None:
             # what is denser than all poses that were found was missed, and the evidence with it
-            return np.minimum(self.explored.density.at(T), self.explored.log_density.max())
+            return np.minimum(self.explored.density.log_density(T), self.explored.log_density.max())
         return cell_log_density(self, self.index.lookup(T, depth))
 
     def _draw_cells(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -142,13 +142,13 @@ def refine_modes(posterior: Posterior, log_prior: LogMass, refiner: ModeRefiner,
     Masks are registered mode by mode. With depths, a search over cells refines and reweights.
     ``log_prior`` is as of :func:`touch_posterior`.
     """
-    if not posterior.contact or posterior.observation is None:
+    if not posterior.contact or posterior.observation is None or not effort.modes:
         return posterior
     with timed(posterior.timing_ms, "refine"):
         contact = posterior.observation.contact
         if posterior.explored is not None:
-            return refiner.register(posterior, contact, effort.modes)
-        if contact.height is None or not effort.modes:
+            return refiner.register(posterior, contact, effort.modes, effort.thorough)
+        if contact.height is None:
             return refiner.refine(posterior, contact, effort.modes, effort.thorough)
         view = SensorView(refiner, contact, np.eye(4))
         return refine_jointly(posterior, [view], effort.modes, posterior.seed, log_prior)

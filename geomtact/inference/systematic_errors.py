@@ -23,7 +23,7 @@ _LIMIT = 40 * _WIDTHS
 _WIDER = np.array([4.0, 1.0, 1.0, 1.0])  # distribution of the nodes, so that some lie where errors are large
 
 
-def drawn(n: int, rng: np.random.Generator) -> Array:
+def random_errors(n: int, rng: np.random.Generator) -> Array:
     """Errors (n, 4): the log of how much larger the object is than its mesh, and by how much the contact lies beside where it
     was found along x, y and z, sensor frame [m]."""
     return _quantiles(rng.random((n, 4)), _WIDTHS)
@@ -32,20 +32,20 @@ def drawn(n: int, rng: np.random.Generator) -> Array:
 @cache
 def nodes() -> tuple[Array, Array]:
     """Errors (NODES, 4) spread evenly, and the log of their weights (NODES,), by which they have the distribution of
-    :func:`drawn`."""
+    :func:`random_errors`."""
     share = qmc.Sobol(4, scramble=False).random(NODES) + 0.5 / NODES
     errors = _quantiles(share, _WIDER * _WIDTHS)
     log_weight = (_log_density(errors, _WIDTHS) - _log_density(errors, _WIDER * _WIDTHS)).sum(1)
     return errors, log_weight - np.log(np.exp(log_weight).sum())
 
 
-def with_errors(centre: Array, errors: Array, about: Array) -> Array:
+def displaced(centre: Array, errors: Array, about: Array) -> Array:
     """Where the object's ``centre`` (..., 3) is with ``errors`` (..., 4), of a contact found ``about`` (3,) [m]."""
     return about + np.exp(errors[..., :1]) * (centre - about) + errors[..., 1:]
 
 
-def without_errors(centre: Array, errors: Array, about: Array) -> Array:
-    """Inverse of :func:`with_errors`."""
+def undisplaced(centre: Array, errors: Array, about: Array) -> Array:
+    """Inverse of :func:`displaced`."""
     return about + np.exp(-errors[..., :1]) * (centre - errors[..., 1:] - about)
 
 

@@ -1,7 +1,8 @@
 """The distribution of a pose from two runs of the sampler that have to agree.
 
 One run does not show what it has missed. So two are compared: where they disagree on the evidence, one has missed what the other
-found; where the modes hold more than everything, both have. Then more contacts are cut, or the sharpest powers are left out.
+found; where the masses of the modes add up to more than 1, both have. Then more contacts are cut, or the sharpest powers are left
+out.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from geomtact.inference.explored import Explored
 from geomtact.inference.mode_mass import weighed
 from geomtact.inference.particles import Particles, poses_of
 from geomtact.inference.sampler import Run, explore, systematic
-from geomtact.inference.systematic_errors import NODES, drawn
+from geomtact.inference.systematic_errors import NODES, random_errors
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
@@ -38,12 +39,12 @@ def explore_twice(
     rng: np.random.Generator,
     log_prior: NDArray[np.floating] | None = None,
 ) -> Explored:
-    """As :func:`explore`, with its modes, by two runs that share a sixteenth of the ``contacts`` and have to agree on the
-    evidence.
+    """The distribution of the pose with its modes, by two runs that share a sixteenth of the ``contacts`` and have to agree on
+    the evidence; arguments as of :func:`explore`.
 
-    Where they do not, one has missed what the other found; where the modes hold more than everything, both have. Then the largest
-    powers of the likelihood are left out until they agree, three of them at most. If that does not help, both are repeated with a
-    quarter of the contacts, and then with all, where as many powers are left out as need be.
+    Where they do not, the largest powers of the likelihood are left out until they do, ``_LEFT_OUT`` of them at most. If that
+    does not help, both are repeated with a quarter of the contacts, and then with all, where as many powers are left out as need
+    be.
 
     Raises
     ------
@@ -56,10 +57,10 @@ def explore_twice(
         cut += one.contacts + other.contacts
         least = 2 if asked == contacts else all_powers - _LEFT_OUT
         for powers in range(all_powers, least - 1, -1):
-            run = replace(_pooled(one, other, powers, rng), contacts=cut)
+            run = replace(pooled(one, other, powers, rng), contacts=cut)
             apart = float(run.density.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
             if apart < _AGREE:
-                found = _with_errors(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
+                found = _explored_from(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
                 found, log_sum = weighed(found, run.log_measure, round(_WEIGHING * asked), rng)
                 if log_sum < 0:
                     return found
@@ -69,7 +70,7 @@ def explore_twice(
     )
 
 
-def _pooled(one: Run, other: Run, powers: int, rng: np.random.Generator) -> Run:
+def pooled(one: Run, other: Run, powers: int, rng: np.random.Generator) -> Run:
     """Two runs as one: of each posterior by the smallest ``powers`` the particles of both, by how likely each run makes the
     contact."""
     particles, evidence = [], []
@@ -85,7 +86,7 @@ def _pooled(one: Run, other: Run, powers: int, rng: np.random.Generator) -> Run:
     return replace(one, density=density, particles=tuple(particles), log_measure=measure)
 
 
-def _with_errors(run: Run, n: int, rng: np.random.Generator) -> Explored:
+def _explored_from(run: Run, n: int, rng: np.random.Generator) -> Explored:
     """Up to ``n`` poses of a ``run`` with errors, drawn by ``rng``: those that are in the contact pose space.
 
     Raises
@@ -96,12 +97,12 @@ def _with_errors(run: Run, n: int, rng: np.random.Generator) -> Explored:
     density, target = run.density, run.density.target
     mass = np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(run.particles, density.weights, strict=True)])
     each = functools.reduce(Particles.joined, run.particles).take(systematic(mass, min(len(mass), n), rng))
-    T = density.with_errors(poses_of(each.poses, each.depth, target.index.mesh.centre), drawn(len(each), rng))
-    moved = target.at(T)
+    T = density.displaced(poses_of(each.poses, each.depth, target.index.mesh.centre), random_errors(len(each), rng))
+    moved = target.particles_at(T)
     inside = np.flatnonzero(np.isfinite(moved.log_target(1)))
     if not len(inside):
         raise InputError(f"{target.index.mesh.name}: no pose that was found touches the sensor; allow more contacts")
     density = replace(density, log_inside=float(np.log(len(inside) / len(each))))
     contacts = run.contacts + len(each) + NODES * len(inside)
     T = T[inside]
-    return Explored(density, T, moved.depth[inside], density.at(T), contacts)
+    return Explored(density, T, moved.depth[inside], density.log_density(T), contacts)

@@ -222,7 +222,7 @@ def _fit(name: str, scorers: dict[str, Scorer], index: Index, touches: Calibrati
         comparison = Comparison(index, held_out)
         candidates = {each: scorers[each] for each in (ENCODER, "moments", "iou")}
         # on a large grid a further score must gain more, for its time
-        data["weights"], _ = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
+        data["weights"] = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
     # only the moments have learned from some of the touches
     touches = held_out if "moments" in data["weights"] else touches
     calibration = fit_calibration(_weighed(data["weights"], scorers), index, touches)

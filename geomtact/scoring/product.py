@@ -1,6 +1,6 @@
 """Several scores combined, each with a weight that is fitted to one index.
 
-On a coarse grid the network alone gains most; on a fine one, with a known contact face, moments or pixels add information.
+On a coarse grid the network alone gains most; on a fine one, with a known contact face, moments or overlap add information.
 The choice is made on simulated touches, so that no score is computed that adds nothing.
 """
 
@@ -62,25 +62,20 @@ class Comparison:
         drawn *= (1 - weight[:, len(some) :].sum()) / drawn.sum()
         self._weight = weight.ravel()
         self._true = level * len(places) + len(some) + np.arange(len(true))
-        self._scores: dict[str, list[NDArray[np.float32]]] = {}
 
     def scores(self, scorer: Scorer) -> list[NDArray[np.float32]]:
-        """Scores (m,) of every touch; those of one name are worked out once."""
-        if scorer.name not in self._scores:
-            if isinstance(scorer, VectorScorer):
-                scorer = replace(scorer, stored=scorer.stored[self._ids.ravel()])
-            self._scores[scorer.name] = [scorer.score(self._index, mask).ravel() for mask in self.masks]
-        return self._scores[scorer.name]
+        """Scores (m,) of every touch."""
+        if isinstance(scorer, VectorScorer):
+            scorer = replace(scorer, stored=scorer.stored[self._ids.ravel()])
+        return [scorer.score(self._index, mask).ravel() for mask in self.masks]
 
     def calibrated(self, scores: Sequence[NDArray[np.float32]]) -> Calibration:
         """The calibration of ``scores``, one array (m,) per touch."""
         return fit_to_scores(lambda i: scores[i], self._true, self._weight)
 
 
-def choose(
-    comparison: Comparison, candidates: Mapping[str, Scorer], least: float
-) -> tuple[dict[str, float], Calibration]:
-    """The scores that together gain most, with the weight of each, and their calibration.
+def choose(comparison: Comparison, candidates: Mapping[str, Scorer], least: float) -> dict[str, float]:
+    """The scores that together gain most, with the weight of each.
 
     One more is added while it gains ``least`` nats. The first of the candidates is preferred while none gains ``least`` more.
     """
@@ -107,4 +102,4 @@ def choose(
         if calibrated[best_trial].gain < reached.gain + least:
             break
         chosen, reached = trials[best_trial], calibrated[best_trial]
-    return chosen, reached
+    return chosen

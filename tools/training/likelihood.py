@@ -21,7 +21,7 @@ from scipy.special import logsumexp
 from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.touches import Touch, random_touches
 from geomtact.files import write_text
-from geomtact.inference.particles import Particles, log_target
+from geomtact.inference.particles import Particles, tempered
 from geomtact.inference.sampler import Run, explore
 from geomtact.kernels.contact_energy import SHARES
 from geomtact.localizer import Localizer
@@ -138,7 +138,7 @@ def _at_truth(maps: ContactMaps, query: ContactQuery, touch: Touch) -> tuple[NDA
 def _mixture(run: Run, ll: Array, lc: Array) -> Array:
     """Log density (n,) of the poses of all powers but 0 together, each the same share."""
     each = [
-        log_target(ll, lc, power) - evidence for power, evidence in zip(POWERS[1:], run.log_evidence[1:], strict=True)
+        tempered(ll, lc, power) - evidence for power, evidence in zip(POWERS[1:], run.log_evidence[1:], strict=True)
     ]
     return np.asarray(logsumexp(each, 0)) - np.log(len(each))
 

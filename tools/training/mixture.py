@@ -26,7 +26,8 @@ from geomtact.files import write_text
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.particles import poses_of
 from geomtact.inference.sampler import Run, explore
-from geomtact.inference.systematic_errors import drawn
+from geomtact.inference.systematic_errors import random_errors
+from geomtact.inference.two_runs import pooled
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.contact_likelihood import POWERS, SCALE_ERROR, SHIFT_ERROR, ContactQuery, from_outline
@@ -36,10 +37,9 @@ from geomtact.versions import versions
 from tools.training.examples import SENSORS, drawn_object, resumed
 
 SIZES = (0.5, 5.0)  # longest side of an object, in long sides of the window
-FACES = 3  # every so manieth object is touched on a known face
+FACES = 3  # one object of so many is touched on a known face
 MAX_POSES = 400_000  # of the grid
-CONTACTS = 10_000  # of the sampler
-LONGEST = 0.3  # m: outlines beyond are as this long
+CONTACTS, REFERENCE = 10_000, 80_000  # of the sampler, and of the run that says how far its density is off
 KEPT = 80  # poses of each posterior, at most
 _LARGER = 0.01  # objects are as much larger or smaller than their meshes, at most
 _SCALE = 0.02  # pixels are as much larger or smaller than stated, at most
@@ -51,7 +51,7 @@ _LEAST = -60.0  # nats: a lower log density at a true pose is as bad as this
 
 _SINGLE = ("log_outline", "elastic", "badly_found")
 
-SCHEMA = "geomtact/mixture/3"
+SCHEMA = "geomtact/mixture/4"
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 
 
@@ -65,6 +65,7 @@ class Example:
     at_particles : (n, K) at poses of all powers that are in the contact pose space
     sizes : (K,) how many of these each has
     inside : (K,) which share of its poses that is
+    excess : (K,) log of the integral of each density, by the evidence of a run with ``REFERENCE`` contacts
     log_outline : log of the outline's length over ``OUTLINE``
     elastic : whether the gel was
     badly_found : whether the contact was
@@ -74,6 +75,7 @@ class Example:
     at_particles: Array
     sizes: Array
     inside: Array
+    excess: Array
     log_outline: float
     elastic: bool
     badly_found: bool
@@ -95,8 +97,9 @@ def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
     for touch, badly_found in _touches(localizer, touches, rng):
         query = ContactQuery.of(touch.mask, sensor)
         coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
-        (run,) = explore(localizer.index, query, coarse, CONTACTS, rng)
-        yield _example(run, touch, badly_found, rng)
+        run = pooled(*explore(localizer.index, query, coarse, CONTACTS // 2, rng, runs=2), len(POWERS), rng)
+        (reference,) = explore(localizer.index, query, coarse, REFERENCE, rng)
+        yield _example(run, reference, touch, badly_found, rng)
 
 
 def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator[tuple[Touch, bool]]:
@@ -136,14 +139,14 @@ def _scaled(mask: NDArray[np.bool_], by: float) -> NDArray[np.bool_]:
     return np.asarray(cv2.warpAffine(image, moved, size, borderMode=cv2.BORDER_REPLICATE) > 127)
 
 
-def _example(run: Run, touch: Touch, badly_found: bool, rng: np.random.Generator) -> Example:
+def _example(run: Run, reference: Run, touch: Touch, badly_found: bool, rng: np.random.Generator) -> Example:
     density, target = run.density, run.density.target
     at_particles, sizes, inside = [], [], []
     for particles in run.particles:
         some = particles.take(rng.permutation(len(particles))[:KEPT])
         poses = poses_of(some.poses, some.depth, target.index.mesh.centre)
-        poses = density.with_errors(poses, drawn(len(some), rng))
-        poses = poses[np.isfinite(target.at(poses).log_likelihood)]
+        poses = density.displaced(poses, random_errors(len(some), rng))
+        poses = poses[np.isfinite(target.particles_at(poses).log_likelihood)]
         at_particles.append(density.of_powers(poses))
         sizes.append(len(poses))
         inside.append(len(poses) / len(some))
@@ -152,6 +155,7 @@ def _example(run: Run, touch: Touch, badly_found: bool, rng: np.random.Generator
         np.concatenate(at_particles),
         np.array(sizes),
         np.array(inside),
+        np.subtract(reference.log_evidence, run.log_evidence),
         target.query.log_outline,
         touch.elastic,
         badly_found,
@@ -161,7 +165,9 @@ def _example(run: Run, touch: Touch, badly_found: bool, rng: np.random.Generator
 def _save(path: Path, examples: Sequence[Example]) -> None:
     n = max(len(e.at_particles) for e in examples)
     padded = [np.pad(e.at_particles, ((0, n - len(e.at_particles)), (0, 0))) for e in examples]
-    columns = {name: np.stack([getattr(e, name) for e in examples]) for name in ("at_truth", "sizes", "inside")}
+    columns = {
+        name: np.stack([getattr(e, name) for e in examples]) for name in ("at_truth", "sizes", "inside", "excess")
+    }
     single = {name: np.array([getattr(e, name) for e in examples]) for name in _SINGLE}
     with open(path, "wb") as file:
         np.savez(file, allow_pickle=False, at_particles=np.stack(padded).astype(np.float32), **columns, **single)
@@ -171,7 +177,8 @@ def _load(path: Path) -> list[Example]:
     with np.load(path, allow_pickle=False) as data:
         rows = zip(*(data[name] for name in Example.__dataclass_fields__), strict=True)
         return [
-            Example(t, p[: s.sum()].astype(float), s, i, float(o), bool(e), bool(b)) for t, p, s, i, o, e, b in rows
+            Example(t, p[: s.sum()].astype(float), s, i, x, float(o), bool(e), bool(b))
+            for t, p, s, i, x, o, e, b in rows
         ]
 
 
@@ -184,7 +191,7 @@ class Fit:
     intercept, slope : (K,) the weights are the softmax of intercept + slope log(outline / OUTLINE)
     n : touches
     gain, expected_gain : means [nats], at the true poses, where it is at most that of the densest particle, and under the
-        posteriors themselves
+        posteriors themselves; the first is of the density divided by its integral
     coverage : share of the touches whose true pose is in the regions of ``LEVELS``: of all, rigid, elastic ones
     """
 
@@ -197,10 +204,11 @@ class Fit:
 
 
 def fit(examples: Sequence[Example]) -> Fit:
-    """The weights that maximise the mean log density at the true poses."""
+    """The weights that maximise the mean log density at the true poses, divided by its integral."""
     truth = np.maximum(np.stack([e.at_truth for e in examples]), _LEAST)
     outline = np.array([e.log_outline for e in examples])
     inside = np.stack([e.inside for e in examples])
+    excess = np.stack([e.excess for e in examples])
     k = truth.shape[1]
 
     def log_weights(z: Array) -> Array:
@@ -210,7 +218,7 @@ def fit(examples: Sequence[Example]) -> Fit:
 
     def loss(z: Array) -> float:
         log_weight = log_weights(z)
-        gain = logsumexp(truth + log_weight, axis=1) - logsumexp(log_weight, axis=1, b=inside)
+        gain = logsumexp(truth + log_weight, axis=1) - logsumexp(log_weight + excess, axis=1, b=inside)
         # as if each power alone explained one touch more: no power is ruled out by those that were drawn
         return float(_PENALTY * (z[k - 1 :] ** 2).sum() - (gain.sum() + log_weight.mean(0).sum()) / len(gain))
 
@@ -220,9 +228,11 @@ def fit(examples: Sequence[Example]) -> Fit:
         log_inside = logsumexp(log_weight, b=e.inside)
         density = logsumexp(e.at_particles + log_weight, axis=1) - log_inside
         mass = np.repeat(np.exp(log_weight - log_inside) * e.inside / np.maximum(e.sizes, 1), e.sizes)
-        gain.append(float(min(logsumexp(e.at_truth + log_weight) - log_inside, density.max(initial=-np.inf))))
+        at_truth = min(logsumexp(e.at_truth + log_weight) - log_inside, density.max(initial=-np.inf))
+        too_much = logsumexp(log_weight + e.excess, b=e.inside) - log_inside
+        gain.append(float(at_truth - too_much))
         expected.append(float(mass @ density))
-        level.append(float(mass @ (density > gain[-1])))
+        level.append(float(mass @ (density > at_truth)))
     elastic = np.array([e.elastic for e in examples])
     return Fit(
         tuple(np.append(z[: k - 1], 0).tolist()),
@@ -243,7 +253,14 @@ def fit_mixture(
     """Make examples in ``folder``, fit the weights of masks and of images to them, and write these to ``out``."""
     examples = make_examples(folder, objects, touches, seed, progress)
     found = {"mask": fit([e for e in examples if not e.badly_found]), "image": fit(examples)}
-    settings = {"objects": objects, "touches": touches, "seed": seed, "contacts": CONTACTS, "max_poses": MAX_POSES}
+    settings = {
+        "objects": objects,
+        "touches": touches,
+        "seed": seed,
+        "contacts": CONTACTS,
+        "reference": REFERENCE,
+        "max_poses": MAX_POSES,
+    }
     settings |= {"scale_error": SCALE_ERROR, "shift_error": SHIFT_ERROR}
     content = {"schema": SCHEMA, "settings": settings, "sensors": SENSORS, "powers": POWERS}
     fits = {source: asdict(each) for source, each in found.items()}

@@ -117,7 +117,7 @@ def _found(
         at = float(density[located(index, T)[0].place[0]])
         level = float(mass[density > at].sum())
         return _Found(at, float(mass @ density), level, False, contacts, 1, 0.0, False)
-    at, most = float(explored.density.at(T)[0]), float(explored.log_density.max())
+    at, most = float(explored.density.log_density(T)[0]), float(explored.log_density.max())
     first = explored.poses[explored.hearts[0]]
     held = bool(PoseDistance(index.mesh).within(first, T, mode_radius(index.mesh))[0])
     return _Found(
@@ -138,7 +138,7 @@ def _root(
     """Rank of the true cell, coarse gain and gain within the cell, and the share of the cell that touches."""
     true = int(index.lookup(touch.T_sensor_object[None], np.array([touch.penetration]))[0])
     density = Density(Target(index, query, np.zeros(index.places), None), (0.0,) * len(POWERS))
-    inside = density.of_powers(_in_cell(density.target, true, rng))
+    inside = density.of_powers(in_cell(density.target, true, rng))
     return (
         int((log_mass > log_mass[true]).sum()),
         float(log_mass[true] - index.log_weight[true]),
@@ -154,7 +154,7 @@ def _gain(at_truth: Array, inside: Array, weights: Array) -> float:
     return float(logsumexp(at_truth[0] - mean, b=weights))
 
 
-def _in_cell(target: Target, cell: int, rng: np.random.Generator) -> Array:
+def in_cell(target: Target, cell: int, rng: np.random.Generator) -> Array:
     """Poses (n, 4, 4) drawn evenly in a cell, of those that touch."""
     T, depth = target.index.draw(np.full(_IN_CELL, cell), rng)
     drawn = target.evaluated(located(target.index, T)[0], depth=depth)
