@@ -99,7 +99,12 @@ def test_the_evidence_does_not_depend_on_the_budget(localizer, maps):
     query, coarse = ContactQuery.of(touch.mask, localizer.sensor), coarse_of(localizer, touch.mask)
 
     def evidence(contacts, runs):
-        return np.array([run.log_evidence[-3] for run in explore(maps.index, query, coarse, contacts, rng, runs=runs)])
+        return np.array(
+            [
+                run.log_evidence[POWERS.index(0.1)]
+                for run in explore(maps.index, query, coarse, contacts, rng, runs=runs)
+            ]
+        )
 
     rng = np.random.default_rng(0)
     ratio = np.exp(evidence(4000, 12) - evidence(60_000, 1))

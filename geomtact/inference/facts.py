@@ -24,7 +24,7 @@ class Diagnostics:
         inf where no pose suits all; None where no poses were searched
     misfit_nats : per contact, by how much the likeliest pose misses the masks beyond the usual error; as
         ``unexplained_nats``, and None with measured depths
-    settled_power : largest power of the likelihood that the contacts settle within the cells: 1 is all of it; None where the
+    settled_power : largest power of the likelihood that the contacts settle within the cells, 1 the sharpest; None where the
         posterior is that of the cells
     frame : number of the frame in a sequence, from 1; None outside of one
     surprise_nats : log of how likely the posterior of the frame before made this frame, relative to chance; None where

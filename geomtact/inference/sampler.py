@@ -41,7 +41,7 @@ _SMALL = 0.5  # share of the moves that are small motions
 _NEAR = 8  # poses among which the other one of a difference is drawn
 _ALONG = 1.0  # largest multiple of a difference
 _TURN = 0.1  # rad, standard deviation of the first moves; they differ by a factor of ten from pose to pose
-_EXPONENTS = np.geomspace(2e-4, 1, 40)  # of the likelihood, that the first step may have
+_EXPONENTS = np.geomspace(2e-4, POWERS[-1], 40)  # of the likelihood, that the first step may have
 _HALVINGS = 30
 
 
@@ -130,11 +130,11 @@ def explore(
         if power in POWERS:
             found[POWERS.index(power) :] = [particles]
             evidence[POWERS.index(power) :] = [log_evidence]
-        if power >= 1:
+        if power >= POWERS[-1]:
             break
         change = (particles.log_likelihood - particles.log_coarse).reshape(runs, n)
         after = min(each for each in POWERS if each > power)
-        step = min(_next_step(change, 1 - power), after - power)
+        step = _next_step(change, after - power)
         log_evidence = log_evidence + np.logaddexp.reduce(step * change, 1) - np.log(n)
         particles = particles.take(_resampled(step * change, n, rng))
         power = after if step == after - power else power + step

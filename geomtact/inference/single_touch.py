@@ -122,7 +122,8 @@ def explore_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer
         except InputError as error:
             warning = f"the pose is not resolved within the grid's cells: {error}"
             return replace(posterior, warnings=[*posterior.warnings, warning])
-    settled = replace(posterior.diagnostics, settled_power=POWERS[len(explored.density.log_evidence) - 1])
+    power = POWERS[len(explored.density.log_evidence) - 1] / POWERS[-1]
+    settled = replace(posterior.diagnostics, settled_power=power)
     return replace(posterior, explored=explored, diagnostics=settled)
 
 

@@ -35,13 +35,16 @@ from geomtact.sensing.sensor import Sensor
 
 # Fitted on procedural objects for the mean log density at the true pose: the shares by ``python -m tools.training likelihood``
 # (docs/results/contact-likelihood.json), errors and weights by ``python -m tools.training mixture`` (docs/results/mixture.json).
-RATE = 108e9  # nats for each m^3 of energy: three times the rate that fits best alone, so that some powers are sharper
+RATE = (
+    108e9  # nats for each m^3 of energy: three times the rate that fits best alone, which the largest power stands for
+)
 SHARE = (6.47, 13.18)  # of the beta distribution of an elastic contact's share of the depth
-POWERS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the likelihood, by the posteriors that are mixed; hand-set
+# Of the likelihood, by the posteriors that are mixed; hand-set. A sharper one would have no weight: its evidence is not found.
+POWERS = (0.0, 0.01, 0.03, 0.1, 0.3)
 # Their weights are the softmax of intercept + slope log(outline / OUTLINE): of a given mask, and of a contact found in an image,
 # perhaps badly.
-INTERCEPT = {"mask": (-4.52, -2.33, -1.91, 0.35, -0.16, 0.0), "image": (-2.24, -0.96, -0.4, 0.3, -0.18, 0.0)}
-SLOPE = {"mask": (-0.03, 0.82, 0.92, 0.56, 0.24, 0.0), "image": (1.15, 1.03, 0.94, 0.41, 0.22, 0.0)}
+INTERCEPT = {"mask": (-4.68, -3.09, -0.64, 0.63, 0.0), "image": (-2.48, 0.27, 0.93, 1.41, 0.0)}
+SLOPE = {"mask": (0.14, 0.56, 2.74, 2.82, 0.0), "image": (0.75, 2.56, 3.34, 2.85, 0.0)}
 SCALE_ERROR = 0.0025  # half width of the distribution of errors of the object's scale
 SHIFT_ERROR = 0.05e-3  # m: that of errors of where a contact is, along each axis
 OUTLINE = 15e-3  # m, the length of a usual outline
