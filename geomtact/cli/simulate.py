@@ -60,7 +60,11 @@ def simulate(
         ),
     ] = False,
     pose: Annotated[
-        Path | None, typer.Option(help='JSON with "T_sensor_object" (4x4, metres): simulate one touch at this pose.')
+        Path | None,
+        typer.Option(
+            help='JSON with "T_sensor_object" (4x4, object to sensor, metres): simulate one touch at this pose. The untouched '
+            "membrane is at z = 0, and what presses it at z < 0."
+        ),
     ] = None,
 ) -> None:
     """Simulate touches at known poses: write OBJECT_1.png (contact mask or tactile image), OBJECT_1.json (true pose), ...
