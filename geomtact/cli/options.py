@@ -48,8 +48,8 @@ Approaches = Annotated[
     typer.Option(
         "--approach",
         metavar="X,Y,Z[:DEGREES]",
-        help="Known contact face, such as 0,0,1: direction from the object to the sensor, in the object's frame. DEGREES allows all "
-        "directions within that angle. Repeat it for several faces; each of several sensors must touch one of them.",
+        help="Known contact face, such as 0,0,1: direction from the object to the sensor, in the object's frame. DEGREES allows "
+        "all directions within that angle. Repeat it for several faces; each of several sensors must touch one of them.",
         show_default=False,
     ),
 ]
