@@ -482,11 +482,11 @@ def test_the_pose_uncertainty_of_extrinsics_equals_their_propagated_errors(rng):
 def test_wrong_extrinsics_are_a_warning_and_right_ones_hardly_ever(plug):
     """Each sensor but the first is off by 5 mm in a random direction: a warning, unless the stated uncertainty covers it.
 
-    Were one right set of extrinsics in ten warned of, three of six would be once in 63 times.
+    Were one right set of extrinsics in ten warned of, five of twelve would be once in 230 times.
     """
     rng = np.random.default_rng(5)
     warned, last = {"right": 0, "off": 0, "known to be": 0}, {}
-    for scene in simultaneous_touches(plug.space, 6, 3, 9):
+    for scene in simultaneous_touches(plug.space, 12, 3, 9):
         masks = [touch.mask for touch in scene.touches]
         off = scene.T_world_sensor.copy()
         way = rng.normal(size=(2, 3))
@@ -502,7 +502,7 @@ def test_wrong_extrinsics_are_a_warning_and_right_ones_hardly_ever(plug):
             except NoPoseAgreesError:
                 continue
             warned[name] += any("agree badly" in warning for warning in posterior.warnings)
-    assert warned["right"] <= 2 and warned["off"] >= warned["right"] + 3 and warned["known to be"] == 0, warned
+    assert warned["right"] <= 4 and warned["off"] >= warned["right"] + 6 and warned["known to be"] == 0, warned
     exact = plug.localize(masks, "mask", T_world_sensor=off, extrinsics_std=ExtrinsicsStd())
     assert np.array_equal(exact.log_prob, last["off"].log_prob)
     # a mode is no more certain than the extrinsics

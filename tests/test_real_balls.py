@@ -206,7 +206,6 @@ def test_tactile_images_of_another_simulator_localize_the_marker(marker):
     assert np.mean(gains) > 0.3 and np.min(gains) > -3
 
 
-@pytest.mark.xfail(strict=True, reason="the network is too bold on another simulator's readings: see docs/method.md")
 def test_the_markers_featureless_side_gives_less_information_than_a_distinctive_touch(marker):
     localizer, read = marker
     touches = random_touches(localizer.space, 40, seed=0)
