@@ -226,8 +226,12 @@ class Directions:
         if self.cells is not None or sym.kind == "sphere":
             return sym.motions
         about_axis = np.concatenate([R[2], np.cross(sym.centre, R[2])])
-        turns = self.periods[self.lookup(transform(R, np.zeros(3))[None])[1][0]] > 0
+        turns = self.periods[self._direction_at(R[None])[0]] > 0
         return np.concatenate([about_axis[None][: int(turns)], np.eye(6)[3:]])
+
+    def _direction_at(self, R: Array) -> NDArray[np.int64]:
+        """The direction (n,) of rotations ``R`` (n, 3, 3)."""
+        return self.lookup(transform(R, np.zeros(3)))[1]
 
     def density(self, R: ArrayLike) -> Array:
         """Density (n,) of the uniform distribution of allowed rotations at ``R`` (n, 3, 3), modulo the symmetry, per rad of
@@ -236,7 +240,7 @@ class Directions:
         if cones is None or self.symmetry.kind == "sphere":
             return np.full(len(R), self.symmetry.density)
         if self.cells is None:
-            k = self.lookup(transform(R, np.zeros(3)))[1]
+            k = self._direction_at(R)
             return np.asarray(self.weights[k] / np.where(self.periods[k] > 0, self.periods[k], 1.0))
         share = allowed(-np.einsum("nj,kji->nki", R[:, 2], self._images), cones).mean(1)
         return np.asarray(self.symmetry.density * share / self._allowed_share)

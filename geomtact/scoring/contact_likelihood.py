@@ -35,9 +35,8 @@ from geomtact.sensing.sensor import Sensor
 
 # Fitted on procedural objects for the mean log density at the true pose: the shares by ``python -m tools.training likelihood``
 # (docs/results/contact-likelihood.json), errors and weights by ``python -m tools.training mixture`` (docs/results/mixture.json).
-RATE = (
-    108e9  # nats for each m^3 of energy: three times the rate that fits best alone, which the largest power stands for
-)
+# Nats for each m^3 of energy: three times the rate that fits best alone, so that the largest power stands for that one.
+RATE = 108e9
 SHARE = (6.47, 13.18)  # of the beta distribution of an elastic contact's share of the depth
 # Of the likelihood, by the posteriors that are mixed; hand-set. A sharper one would have no weight: its evidence is not found.
 POWERS = (0.0, 0.01, 0.03, 0.1, 0.3)
