@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from geomtact.errors import NoPoseAgreesError, UsageError
-from geomtact.inference.joint_refinement import UNEXPLAINED_NATS
+from geomtact.inference.effort import effort_of
 from geomtact.inference.posterior import Posterior
+from geomtact.inference.two_runs import UNEXPLAINED_NATS
 from geomtact.inference.views import read_views
 from geomtact.localizer import Localizer
 from geomtact.se3 import Array
@@ -90,6 +91,8 @@ def identify(
         raise UsageError(
             f"identify: expected a localizer for each object, got {type(localizers).__name__}; give a list of them"
         )
+    asked = effort_of(options.get("effort", "balanced"))
+    evidence = replace(asked, contacts=0)  # poses are resolved within the cells for the most probable object alone
     for i, localizer in enumerate(localizers):
         if log_weights is not None and i >= len(log_weights):
             raise UsageError(f"identify: expected a weight for each object, got {len(log_weights)} for more")
@@ -97,7 +100,7 @@ def identify(
             sensors = tuple(sensor.to_toml() for sensor in localizer.sensors)
             if sensors not in read:
                 read[sensors] = _read(localizer, image, **options)
-            posterior = localizer.localize(read[sensors], **options)
+            posterior = localizer.localize(read[sensors], **{**options, "effort": evidence})
         except NoPoseAgreesError as error:
             found.append((localizer.mesh.name, -np.inf, True))
             log_odds.append(-np.inf)
@@ -120,8 +123,12 @@ def identify(
         raise UsageError("identify: no object with a weight above 0 explains the images; give others a weight")
     probability = np.exp(log_odds - np.logaddexp.reduce(log_odds))
     order = np.argsort(-probability, kind="stable")
+    _, localizer, posterior = best
+    if asked.contacts:
+        sensors = tuple(sensor.to_toml() for sensor in localizer.sensors)
+        posterior = localizer.localize(read[sensors], **options)
     candidates = [Candidate(found[i][0], float(probability[i]), *found[i][1:]) for i in order]
-    return Identification(candidates, best[1], best[2])
+    return Identification(candidates, localizer, posterior)
 
 
 def _read(

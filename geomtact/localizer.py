@@ -18,10 +18,10 @@ from geomtact.inference.posterior import Posterior
 from geomtact.inference.preparation import PreparedObject, prepare_each
 from geomtact.inference.prior import opened, reference_of
 from geomtact.inference.repeated_images import counted_once
+from geomtact.inference.resolve import resolve_touch
 from geomtact.inference.sequence import track
 from geomtact.inference.single_touch import (
     drop_lost_contact_prior,
-    explore_touch,
     refine_modes,
     touch_posterior,
 )
@@ -119,13 +119,11 @@ class Localizer(PreparedObject):
         if len(views) == 1:
             posterior, log_prior = touches[0]
             posterior, prior = drop_lost_contact_prior(posterior, prior)
-            posterior = explore_touch(posterior, log_prior, self.scorer, resolved)
+            posterior = resolve_touch(posterior, log_prior, self.scorer, resolved)
             posterior = refine_modes(posterior, log_prior, self.mode_refiner, resolved)
         else:
             refiners = [one.mode_refiner for one in each]
-            posterior = fused_posterior(
-                [touch for touch, _ in touches], refiners, prior, resolved.modes, extrinsics_std
-            )
+            posterior = fused_posterior([touch for touch, _ in touches], refiners, prior, resolved, extrinsics_std)
         return counted_once(replace(posterior, reference=reference_of(prior, posterior)), prior)
 
     def track(

@@ -16,7 +16,7 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import sampler, two_runs
 from geomtact.inference.effort import Effort
 from geomtact.inference.particles import prior_at
-from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
 from geomtact.sensing.reading import read_observation
 
 EFFORT = Effort(3, contacts=96_000)  # 6,000 at first
@@ -69,7 +69,7 @@ def test_two_runs_pool_what_they_found(localizer, touch):
         assert [len(p) for p in both.particles] == [
             len(p) + len(q) for p, q in zip(one.particles[:powers], other.particles[:powers], strict=True)
         ]
-        np.testing.assert_allclose(both.density.weights[:-1], query.weights[: powers - 1])
+        np.testing.assert_allclose(both.density.weights[:-1], mixture_weights([query])[: powers - 1])
         assert both.density.weights.sum() == pytest.approx(1)
 
 

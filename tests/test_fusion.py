@@ -172,7 +172,8 @@ def test_a_mode_lies_in_the_cell_that_holds_its_mass(plug, k):
     touches = random_touches(plug.space, 6, 11)
     T_world_sensor = [se3.inverse(touch.T_sensor_object) for touch in touches]
     some = slice(k, k + 3)
-    posterior = plug.localize([touch.mask for touch in touches[some]], "mask", T_world_sensor=T_world_sensor[some])
+    masks = [touch.mask for touch in touches[some]]
+    posterior = plug.localize(masks, "mask", T_world_sensor=T_world_sensor[some], effort=CELLS)
     T = np.stack([refined.T for refined in posterior.refined.values()])
     depth = plug.space.penetration(T)
     assert np.isfinite(depth).all()
@@ -227,8 +228,8 @@ def test_sensors_out_of_reach_do_not_change_refinement(plug, order):
     far = [se3.transform(np.eye(3), [0, 0, z]) @ sensors[0] for z in (2.0, 3.0)]
     masks, T = [t.mask for t in touches], [*sensors, *far]
     masks += [np.zeros_like(masks[0])] * 2
-    alone = plug.localize(masks[:3], "mask", None, T[:3])
-    posterior = plug.localize([masks[i] for i in order], "mask", None, [T[i] for i in order])
+    alone = plug.localize(masks[:3], "mask", None, T[:3], effort=CELLS)
+    posterior = plug.localize([masks[i] for i in order], "mask", None, [T[i] for i in order], effort=CELLS)
     assert abs(np.exp(posterior.log_prob) - np.exp(alone.log_prob)).sum() < 1e-3
     assert posterior.entropy_nats == pytest.approx(alone.entropy_nats, abs=1e-3)
     for one, other in zip(alone.modes(3), posterior.modes(3), strict=True):

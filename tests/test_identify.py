@@ -106,7 +106,9 @@ def test_probabilities_are_evidence_times_weights(drawer):
 def test_unlike_all_are_outliers_or_unexplained_touches_of_each_object(drawer, said, unlike):
     def localizer(said):
         posterior = SimpleNamespace(contact=True, log_evidence=0.0, diagnostics=Diagnostics(**said))
-        return SimpleNamespace(mesh=drawer[0].mesh, sensors=[drawer[0].sensor], localize=lambda image: posterior)
+        return SimpleNamespace(
+            mesh=drawer[0].mesh, sensors=[drawer[0].sensor], localize=lambda image, effort=None: posterior
+        )
 
     image = np.zeros(drawer[0].sensor.image_size_px[::-1], bool)
 

@@ -51,9 +51,14 @@ def normal_modes(request, make_localizer):
         log_density=log_normal(poses),
         contacts=0,
         density=SimpleNamespace(
-            target=SimpleNamespace(particles_at=lambda T: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T)))),
+            target=SimpleNamespace(
+                particles_at=lambda T, errors: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T))),
+                displaced=lambda T, errors: T,
+                sensors=1,
+                others=(),
+            ),
             of_exact=lambda particles: log_normal(particles.T),
-            displaced=lambda T, errors: T,
+            log_density=lambda T: np.zeros(len(T)),
             log_inside=0.0,
         ),
     )
@@ -66,13 +71,13 @@ def weighed(normal_modes, monkeypatch):
     monkeypatch.setattr(
         mode_mass, "replace", lambda explored, **changes: SimpleNamespace(**{**vars(explored), **changes})
     )
-    return mode_mass.weighed(normal_modes[1], 0.0, 9000, np.random.default_rng(1))
+    return mode_mass.weighed(normal_modes[1], np.zeros((0, 4, 4)), 0.0, 9000, np.random.default_rng(1))
 
 
 def test_a_mass_is_the_integral_of_the_density(normal_modes, weighed):
     found, log_sum = weighed
     hearts, distance = normal_modes[0], PoseDistance(found.index.mesh, 128)
-    near = np.array([distance.mean(found.poses[heart], hearts) for heart in found.hearts]).argmin(1)
+    near = np.array([distance.mean(heart, hearts) for heart in found.hearts]).argmin(1)
     assert near.tolist() == [1, 0, 2]  # the most probable first
     np.testing.assert_allclose(found.masses, MASS[near], rtol=0.2)  # by 450 draws each
     assert np.exp(log_sum) == pytest.approx(MASS.sum(), rel=0.1)
@@ -81,18 +86,20 @@ def test_a_mass_is_the_integral_of_the_density(normal_modes, weighed):
 def test_modes_that_overlap_share_their_poses(normal_modes, weighed, monkeypatch):
     """Of narrower modes there are several about one place. Each pose counts once, and the leading mode has as much as alone."""
     monkeypatch.setattr(mode_mass, "mode_radius", lambda _: 0.6e-3)
-    found, log_sum = mode_mass.weighed(normal_modes[1], 0.0, 9000, np.random.default_rng(1))
+    found, log_sum = mode_mass.weighed(normal_modes[1], np.zeros((0, 4, 4)), 0.0, 9000, np.random.default_rng(1))
     assert len(found.hearts) > 3 and (np.diff(found.masses) <= 0).all()
     assert found.masses.sum() < 1.1 and np.exp(log_sum) == pytest.approx(found.masses.sum(), rel=1e-6)
-    leading = normal_modes[1].poses[found.hearts[0]]
+    leading = found.hearts[0]
     monkeypatch.setattr(
-        mode_mass, "_grown", lambda explored, distance, radius, count: (found.hearts[:1], [near(distance, radius)])
+        mode_mass,
+        "_grown",
+        lambda explored, further, distance, radius, count: (found.hearts[:1], [near(distance, radius)]),
     )
 
     def near(distance, radius):
         return np.flatnonzero(distance.within(leading, normal_modes[1].poses, radius))
 
-    alone, _ = mode_mass.weighed(normal_modes[1], 0.0, 9000, np.random.default_rng(1))
+    alone, _ = mode_mass.weighed(normal_modes[1], np.zeros((0, 4, 4)), 0.0, 9000, np.random.default_rng(1))
     assert alone.masses[0] == pytest.approx(found.masses[0], rel=0.25)
 
 

@@ -6,7 +6,7 @@ the likelihood is made: at a pose, and at those that errors of the object's scal
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
-from geomtact.inference.particles import Particles, Target, prior_at, tempered
-from geomtact.inference.systematic_errors import displaced, nodes, undisplaced
+from geomtact.inference.particles import SURE, OtherSensor, Particles, Target, prior_at, tempered
+from geomtact.inference.systematic_errors import nodes, undisplaced
 from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
-from geomtact.se3 import Array, check_transforms, transform
+from geomtact.se3 import Array, check_pose, check_transforms
 
 _PART = 512  # poses whose density is made at a time
 
@@ -48,7 +48,7 @@ class Density:
     @cached_property
     def weights(self) -> Array:
         """Weight of each posterior; the last one has those of the powers that are left out too."""
-        weights, last = self.target.query.weights, len(self.log_evidence) - 1
+        weights, last = self.target.weights, len(self.log_evidence) - 1
         return np.append(weights[:last], weights[last:].sum())
 
     def by_power(self, log_likelihood: Array, log_coarse: Array) -> Array:
@@ -60,15 +60,15 @@ class Density:
         ]
         return np.stack(each, -1)
 
-    def displaced(self, T: Array, errors: Array) -> Array:
-        """Poses ``T`` (..., 4, 4) with ``errors`` (..., 4)."""
-        R, middle = T[..., :3, :3], self.index.mesh.centre
-        centre = displaced(T[..., :3, 3] + R @ middle, errors, self.target.query.centroid)
-        return transform(R, centre - R @ middle)
+    @property
+    def _sure(self) -> NDArray[np.bool_]:
+        """Under which of the powers (K,) no sensor may be missed."""
+        return np.array(POWERS[: len(self.log_evidence)]) >= SURE
 
     def of_exact(self, particles: Particles) -> Array:
-        """Log density (n,) of the mixture at ``particles`` (n,), if there were no errors."""
+        """Log density (n,) of the mixture at ``particles`` (n,), if there were no errors but theirs."""
         each = self.by_power(particles.log_likelihood, particles.log_coarse) + np.log(self.weights)
+        each[np.ix_(particles.missed, self._sure)] = -np.inf
         return np.asarray(particles.log_prior + np.logaddexp.reduce(each, -1))
 
     def log_density(self, T: ArrayLike) -> Array:
@@ -95,7 +95,13 @@ class Density:
         prior = prior_at(index, self.target.log_prior, place, cut.reach - flat[:, 2])
         # volumes with errors are larger
         each = (each + prior[:, None]).reshape(n, len(errors), -1) + (log_weight - 3 * errors[:, 0])[:, None]
-        return np.asarray(np.logaddexp.reduce(each, 1))
+        out = np.asarray(np.logaddexp.reduce(each, 1))
+        powers = np.array(POWERS[: len(self.log_evidence)])[self._sure]
+        for other in self.target.others:
+            found, missed = other.log_likelihood(np.repeat(T, len(errors), 0), np.tile(errors, (n, 1)))
+            found = np.where(missed > 0, -np.inf, found).reshape(n, len(errors), 1)
+            out[:, self._sure] += np.logaddexp.reduce(powers * found + log_weight[:, None], 1)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +115,9 @@ class Explored:
     depth : penetration (n,) [m]
     log_density : at the poses (n,)
     contacts : that were cut
-    hearts : (m,) rows of ``poses``, the densest of each leading mode, the most probable mode first
+    hearts : (m, 4, 4) the densest pose that was found of each leading mode, the most probable mode first
     masses : (m,) of these modes
+    unexplained_nats : as of ``facts.Diagnostics``, None for one sensor; it is not saved
     """
 
     density: Density
@@ -118,8 +125,9 @@ class Explored:
     depth: Array
     log_density: Array
     contacts: int
-    hearts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    hearts: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     masses: Array = field(default_factory=lambda: np.zeros(0))
+    unexplained_nats: float | None = None
 
     @property
     def index(self) -> Index:
@@ -141,25 +149,28 @@ class Explored:
 
         Instead of the few that no depth makes touch by the mesh, others are drawn again.
         """
-        T, touches = self._settled(rng.choice(len(self.weight), n, p=self.weight))
+        rows = rng.choice(len(self.weight), n, p=self.weight)
+        T, touches = self._settled(self.poses[rows], self.depth[rows])
         if touches.any():
             T[~touches] = T[rng.choice(np.flatnonzero(touches), n - int(touches.sum()))]
         return self.index.directions.any_image(T, rng)
 
-    def settled(self, rows: NDArray[np.int64]) -> Array:
-        """Poses T_sensor_object (n, 4, 4) of the particles ``rows`` (n,).
+    def settled_hearts(self, k: int) -> Array:
+        """The first ``k`` hearts T_sensor_object (n, 4, 4).
 
         Height maps miss what lies between their pixels, so that a pose may touch by them and not quite by the mesh, or press a
         little too deep: it is moved along z.
         """
-        return self._settled(rows)[0]
+        T = self.hearts[:k]
+        return self._settled(T, self.density.target.particles_at(T).depth)[0]
 
-    def _settled(self, rows: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
-        """:meth:`settled`, and which (n,) of them touch by the mesh."""
-        T, space = self.poses[rows], self.index.space
+    def _settled(self, T: Array, depth: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Poses ``T`` (n, 4, 4), ``depth`` (n,) deep by height maps, as of :meth:`settled_hearts`; and which (n,) touch by the
+        mesh."""
+        T, space = T.copy(), self.index.space
         touches = np.isfinite(space.penetration(T))
         off = np.flatnonzero(~touches)
-        settled, ok = space.settle(T[off], self.depth[rows[off]])
+        settled, ok = space.settle(T[off], depth[off])
         T[off[ok]], touches[off[ok]] = settled[ok], True
         return T, touches
 
@@ -177,18 +188,21 @@ class Explored:
             "contacts": np.array(self.contacts),
             "hearts": self.hearts,
             "masses": self.masses,
-            "touched": target.query.touched,
-            "source": np.array(target.query.source),
+            **_of_query(target.query),
+            "others": np.array(len(target.others)),
+            **{f"other_{i}_{k}": v for i, other in enumerate(target.others) for k, v in _of_other(other).items()},
         }
 
     @classmethod
-    def of_arrays(cls, index: Index, arrays: Mapping[str, NDArray[Any]]) -> Explored:
-        """Inverse of :meth:`arrays`.
+    def of_arrays(
+        cls, index: Index, arrays: Mapping[str, NDArray[Any]], open_index: Callable[[str, str], Index]
+    ) -> Explored:
+        """Inverse of :meth:`arrays`; ``open_index`` gives the index of another sensor, by its TOML and the index's key.
 
         Raises
         ------
-        KeyError, ValueError, PoseError
-            They are not what it gives.
+        KeyError, ValueError, GeomtactError
+            They are not what it gives, or the index of another sensor cannot be opened.
         """
         T, log_coarse = check_transforms(arrays["T"]), arrays["log_coarse"].astype(float)
         log_prior = arrays["log_prior"] if len(arrays["log_prior"]) else None
@@ -196,26 +210,54 @@ class Explored:
             arrays["log_density"]
         ):
             raise ValueError("particles of different number")
-        if len(arrays["hearts"]) != len(arrays["masses"]) or not (arrays["hearts"] < len(T)).all():
-            raise ValueError("modes that are not of its particles")
+        hearts = check_transforms(arrays["hearts"])
+        if len(hearts) != len(arrays["masses"]):
+            raise ValueError("modes without their masses")
         if len(log_coarse) != index.places or (log_prior is not None and len(log_prior) != len(index)):
             raise ValueError("densities that are not of its grid")
-        source = str(arrays["source"])
-        if source not in INTERCEPT:
-            raise ValueError(f"a contact of another source: {source}")
-        target = Target(
-            index, ContactQuery.showing(arrays["touched"].astype(bool), index.sensor, source), log_coarse, log_prior
-        )
+        others = []
+        for i in range(int(arrays["others"])):
+            its = {k: arrays[f"other_{i}_{k}"] for k in ("touched", "source", "sensor", "index", "T_sensor_first")}
+            on = open_index(str(its["sensor"]), str(its["index"]))
+            others.append(OtherSensor(on, _query(its, on), check_pose(its["T_sensor_first"], "T_sensor_first")))
+        target = Target(index, _query(arrays, index), log_coarse, log_prior, tuple(others))
         return cls(
             Density(target, tuple(arrays["log_evidence"].tolist()), float(arrays["log_inside"])),
             T,
             arrays["depth"],
             arrays["log_density"],
             int(arrays["contacts"]),
-            arrays["hearts"],
+            hearts,
             arrays["masses"],
         )
 
     def credible_level(self, log_density: float) -> float:
         """Mass of the poses that are denser than ``log_density``."""
         return float(self.weight @ (self.log_density > log_density))
+
+
+def _of_query(query: ContactQuery) -> dict[str, NDArray[Any]]:
+    return {"touched": query.touched, "source": np.array(query.source)}
+
+
+def _of_other(other: OtherSensor) -> dict[str, NDArray[Any]]:
+    return {
+        **_of_query(other.query),
+        "sensor": np.array(other.index.sensor.to_toml()),
+        "index": np.array(other.index.key),
+        "T_sensor_first": other.T_sensor_first,
+    }
+
+
+def _query(arrays: Mapping[str, NDArray[Any]], index: Index) -> ContactQuery:
+    """Inverse of :func:`_of_query`, of a contact on the sensor of ``index``.
+
+    Raises
+    ------
+    ValueError
+        It is of no known source.
+    """
+    source = str(arrays["source"])
+    if source not in INTERCEPT:
+        raise ValueError(f"a contact of another source: {source}")
+    return ContactQuery.showing(arrays["touched"].astype(bool), index.sensor, source)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.contact_space.index import Index
 from geomtact.contact_space.resolution import MAX_POSES
 from geomtact.contact_space.store import open_index
 from geomtact.errors import GeomtactError, InputError
@@ -31,7 +32,7 @@ _OFF = 1e-3  # largest deviation of the sum of probabilities from 1; hand-set
 WITHOUT_PRIOR = (
     "this file lacks the prior and other sensors: it holds only that one sensor without contact rules poses out"
 )
-_FORMAT = "geomtact/posterior/8"
+_FORMAT = "geomtact/posterior/9"
 _BROKEN = (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError)
 
 
@@ -163,9 +164,16 @@ def load(path: str | Path, cache_dir: str | Path | None = None) -> CellDistribut
     index = open_index(mesh, sensor, meta["approach"], max_poses, cache_dir, key=str(data["index_key"]))
     if poses != len(index):
         raise InputError(f"{path}: its poses are not those of this version's grid; localize again")
+
+    def of_sensor(toml: str, key: str) -> Index:
+        other = Sensor.from_toml(toml, str(path))
+        if other == sensor:
+            return index
+        return open_index(mesh, other, meta["approach"], max_poses, cache_dir, key=key)
+
     try:
         held = {name.removeprefix("explored_"): value for name, value in data.items() if name.startswith("explored_")}
-        explored = Explored.of_arrays(index, held) if held else None
+        explored = Explored.of_arrays(index, held, of_sensor) if held else None
     except (*_BROKEN, GeomtactError) as error:
         raise _not_saved(path, error) from None
     return CellDistribution(

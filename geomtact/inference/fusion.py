@@ -10,7 +10,6 @@ the poses at which the object would touch it.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -24,13 +23,16 @@ from geomtact.contact_space.cell_transfer import CellTransfer, ExtrinsicsStd
 from geomtact.errors import NoPoseAgreesError
 from geomtact.inference.densities import NoContactDensity
 from geomtact.inference.distribution import Refined, cell_densities
+from geomtact.inference.effort import Effort
 from geomtact.inference.extrinsics import extrinsics_covariance
 from geomtact.inference.facts import Diagnostics
 from geomtact.inference.joint_refinement import refine_jointly
 from geomtact.inference.mode_refiner import ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
-from geomtact.inference.search import SensorView
+from geomtact.inference.resolve import resolve_touches
+from geomtact.inference.search import SensorView, joint_problem
+from geomtact.inference.timing import timed
 from geomtact.log_mass import normalised
 from geomtact.se3 import Array, inverse
 
@@ -132,17 +134,19 @@ def fused_posterior(
     touches: Sequence[Posterior],
     mode_refiners: Sequence[ModeRefiner],
     prior: Any,
-    modes: int,
+    effort: Effort,
     extrinsics_std: ExtrinsicsStd | None = None,
 ) -> Posterior:
     """The posterior of all sensors together, on the cells of the first that has contact, its leading modes refined.
+
+    Masks are resolved within the cells, where the sensors' poses are known.
 
     Parameters
     ----------
     touches : posteriors of the single sensors under the uniform prior, not refined, in the world frame
     mode_refiners : of the object on each sensor
     prior : as in ``Localizer.localize``
-    modes : how many are refined
+    effort : how many modes are refined, and by how many contacts the pose is resolved
 
     Raises
     ------
@@ -153,12 +157,11 @@ def fused_posterior(
         return _without_contact(touches, prior)
     first = next(touch for touch in touches if touch.contact)
     timing = {stage: sum(t.timing_ms.get(stage, 0.0) for t in touches) for stage in ("read", "score", "posterior")}
-    began = time.perf_counter()
     log_prior = None
-    if prior is not None:
-        log_prior = prior_log_mass(first.index, prior, first.T_frame_sensor, first.frame)
-    fused = fuse(touches, log_prior, extrinsics_std)
-    timing["fuse"] = 1e3 * (time.perf_counter() - began)
+    with timed(timing, "fuse"):
+        if prior is not None:
+            log_prior = prior_log_mass(first.index, prior, first.T_frame_sensor, first.frame)
+        fused = fuse(touches, log_prior, extrinsics_std)
     against = disagreement(fused, prior is not None)
     posterior = replace(
         first,
@@ -168,8 +171,10 @@ def fused_posterior(
         timing_ms=timing,
         **_of_all(touches, None if against is None else [against]),
     )
-    if not modes:
+    if not effort.modes:
         return posterior
+    others = [touch.T_frame_sensor for touch in touches if touch.contact and touch is not first]
+    uncertain = bool(others) and extrinsics_std not in (None, ExtrinsicsStd())
     views = [
         SensorView(
             mode_refiner,
@@ -178,13 +183,18 @@ def fused_posterior(
         )
         for touch, mode_refiner in zip(touches, mode_refiners, strict=True)
     ]
-    began = time.perf_counter()
-    posterior = refine_jointly(posterior, views, modes, first.seed, log_prior)
-    timing["refine"] = 1e3 * (time.perf_counter() - began)
-    others = [touch.T_frame_sensor for touch in touches if touch.contact and touch is not first]
-    if others and extrinsics_std not in (None, ExtrinsicsStd()):
+    if not uncertain:
+        posterior = resolve_touches(posterior, touches, log_prior, effort)
+    with timed(timing, "refine"):
+        if posterior.explored is not None:
+            refiner = mode_refiners[posterior.provenance.base]
+            posterior = refiner.register(posterior, joint_problem(views), effort.modes, effort.thorough)
+        else:
+            posterior = refine_jointly(posterior, views, effort.modes, first.seed, log_prior)
+    if uncertain:
+        assert extrinsics_std is not None
         posterior = replace(posterior, refined=_widened(posterior, np.stack(others), extrinsics_std))
-    elif others and against is None:
+    elif others and against is None and posterior.explored is None:
         warnings = poor_agreement(posterior.diagnostics.unexplained_nats, prior is not None)
         posterior = replace(posterior, warnings=posterior.warnings + warnings)
     return posterior

@@ -1,6 +1,6 @@
-"""The masses of the leading modes of an explored posterior, by importance sampling.
+"""The masses of the leading modes of an explored posterior: of one touch by importance sampling.
 
-A touch may fit hundreds of places, of which particles find some. Those that are found hold all particles, so that a count says
+It may fit hundreds of places, of which particles find some. Those that are found hold all particles, so that a count says
 how often a place was found, not how probable it is. But the density is known: so its integral about a mode is made instead, from
 poses that are drawn round by round as the poses before them say (Cappe et al. 2008).
 """
@@ -29,36 +29,33 @@ _KNOWN, _SAMPLES = 3, 0.5  # a covariance whose width is so many samples of the 
 _POINTS = 128  # of the surface, for distances
 
 
-def weighed(explored: Explored, log_measure: float, contacts: int, rng: np.random.Generator) -> tuple[Explored, float]:
-    """``explored`` with its leading modes, as many as ``contacts`` contacts weigh, and the log of the sum of their masses as it
-    was found.
+def weighed(
+    explored: Explored, further: Array, log_measure: float, contacts: int, rng: np.random.Generator
+) -> tuple[Explored, float]:
+    """``explored``, of one sensor, with its leading modes, as many as ``contacts`` contacts weigh, and the log of the sum of
+    their masses as it was found.
 
-    Each is the poses within the mode radius of its densest particle. If their masses add up to more than 1, the evidence is too
-    small; then they are scaled to add up to 1.
+    Each is the poses within the mode radius of its densest pose, of the particles and the ``further`` ones (c, 4, 4). If their
+    masses add up to more than 1, the evidence is too small; then they are scaled to add up to 1.
     """
     density, mesh = explored.density, explored.index.mesh
     distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
     count = int(np.clip(contacts // (_ROUNDS * _DRAWS), *_MODES))
-    hearts, members = _grown(explored, distance, radius, count)
-    directions = explored.index.directions
-    bases = [directions.motions(heart[:3, :3]) for heart in explored.poses[hearts]]
-    pitch = _SAMPLES * sample_pitch(explored.index.sensor)
-    modes = []
-    for heart, basis, near in zip(explored.poses[hearts], bases, members, strict=True):
-        motions = log(inverse(heart) @ distance.aligned(heart, explored.poses[near])) @ np.linalg.pinv(basis)
-        least = np.where(basis[:, :3].any(1), pitch / mesh.radius_rms, pitch)
-        modes.append(_Mode(heart, basis, least, [_Student.of(motions, explored.weight[near], least)]))
+    hearts, members = _grown(explored, further, distance, radius, count)
+    modes = _modes(explored, hearts, members, distance)
     for _ in range(_ROUNDS):
         draws = [mode.students[-1].draw(_DRAWS, rng) for mode in modes]
         xi = np.stack([each @ mode.basis for mode, each in zip(modes, draws, strict=True)])
         T = np.stack([mode.heart for mode in modes])[:, None] @ exp(xi)
-        moved = density.displaced(T, random_errors(len(modes) * _DRAWS, rng).reshape(*xi.shape[:2], -1))
-        near = np.stack([distance.within(mode.heart, each, radius) for mode, each in zip(modes, moved, strict=True)])
+        errors = random_errors(len(modes) * _DRAWS, rng).reshape(*xi.shape[:2], -1)
+        moved = density.target.displaced(T, errors)
+        near = np.array(
+            [distance.within(mode.heart, each, radius) for mode, each in zip(modes, moved, strict=True)], bool
+        )
         turn = np.linalg.norm(xi[..., :3], axis=-1)
         # beyond these turns a placement is met again
-        near &= (turn < np.pi) & np.stack(
-            [_is_nearest(distance, mode.heart, each) for mode, each in zip(modes, T, strict=True)]
-        )
+        nearest = [_is_nearest(distance, mode.heart, each) for mode, each in zip(modes, T, strict=True)]
+        near &= np.array(turn < np.pi, bool) & np.array(nearest, bool)
         found = np.full(near.shape, -np.inf)
         particles = density.target.particles_at(T[near])
         log_density = density.of_exact(particles) + np.log(explored.index.uniform_density(T[near]))
@@ -75,6 +72,38 @@ def weighed(explored: Explored, log_measure: float, contacts: int, rng: np.rando
     order = np.argsort(-mass, kind="stable")
     contacts = explored.contacts + _ROUNDS * _DRAWS * len(modes)
     return replace(explored, hearts=hearts[order], masses=mass[order], contacts=contacts), log_sum
+
+
+def counted(explored: Explored, further: Array, draws: float) -> Explored:
+    """``explored``, of several sensors, with its leading modes; ``further`` is as of :func:`weighed`.
+
+    The mass of a mode is the share of the poses near it: of several contacts there are few modes, and an integral about one would
+    be over the errors of all contacts too. All poses come from so many independent ``draws``: one more would have found a mode
+    that was missed with a probability of 1 / (draws + 1) (the rule of succession), which is left out.
+    """
+    mesh = explored.index.mesh
+    hearts, members = _grown(explored, further, PoseDistance(mesh, _POINTS), mode_radius(mesh), _MODES[1])
+    free, mass = np.ones(len(explored.poses), bool), np.zeros(len(hearts))
+    for i, near in enumerate(members):
+        mass[i] = explored.weight[near[free[near]]].sum()
+        free[near] = False
+    order = np.argsort(-mass, kind="stable")
+    return replace(explored, hearts=hearts[order], masses=mass[order] * draws / (draws + 1))
+
+
+def _modes(explored: Explored, hearts: Array, members: list[NDArray[np.int64]], distance: PoseDistance) -> list[_Mode]:
+    """Modes at ``hearts`` (m, 4, 4), which the rows ``members`` of the poses are near."""
+    pitch, directions = _SAMPLES * sample_pitch(explored.index.sensor), explored.index.directions
+    modes = []
+    for heart, rows in zip(hearts, members, strict=True):
+        basis = directions.motions(heart[:3, :3])
+        poses, weight = explored.poses[rows], explored.weight[rows]
+        if not len(rows):
+            poses, weight = heart[None], np.ones(1)
+        motions = log(inverse(heart) @ distance.aligned(heart, poses)) @ np.linalg.pinv(basis)
+        least = np.where(basis[:, :3].any(1), pitch / explored.index.mesh.radius_rms, pitch)
+        modes.append(_Mode(heart, basis, least, [_Student.of(motions, weight, least)]))
+    return modes
 
 
 def _is_nearest(distance: PoseDistance, heart: Array, T: Array) -> NDArray[np.bool_]:
@@ -97,22 +126,24 @@ def _log_volume(turn: Array, axes: int) -> Array:
 
 
 def _grown(
-    explored: Explored, distance: PoseDistance, radius: float, count: int
-) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
-    """The densest particle of each of ``count`` modes, densest first, and the particles near it."""
-    covered = np.zeros(len(explored.poses), bool)
+    explored: Explored, further: Array, distance: PoseDistance, radius: float, count: int
+) -> tuple[Array, list[NDArray[np.int64]]]:
+    """The densest pose (m, 4, 4) of each of ``count`` modes, densest first, and the particles near it."""
+    poses = np.concatenate([explored.poses, further])
+    log_density = np.concatenate([explored.log_density, explored.density.log_density(further)])
+    covered = np.zeros(len(poses), bool)
     hearts: list[int] = []
     members: list[NDArray[np.int64]] = []
-    for row in np.argsort(-explored.log_density, kind="stable").tolist():
+    for row in np.argsort(-log_density, kind="stable").tolist():
         if len(hearts) == count:
             break
         if not covered[row]:
-            near = distance.within(explored.poses[row], explored.poses, radius)
+            near = distance.within(poses[row], poses, radius)
             near[row] = True
             covered |= near
             hearts.append(row)
-            members.append(np.flatnonzero(near))
-    return np.array(hearts, np.int64), members
+            members.append(np.flatnonzero(near[: len(explored.poses)]))
+    return poses[hearts], members
 
 
 def _shared_out(explored: Explored, members: list[NDArray[np.int64]], mass: Array) -> Array:
@@ -120,7 +151,8 @@ def _shared_out(explored: Explored, members: list[NDArray[np.int64]], mass: Arra
     out, free = mass.copy(), np.ones(len(explored.poses), bool)
     for i in np.argsort(-mass, kind="stable"):
         weight = explored.weight[members[i]]
-        out[i] *= weight[free[members[i]]].sum() / weight.sum()
+        if len(weight):
+            out[i] *= weight[free[members[i]]].sum() / weight.sum()
         free[members[i]] = False
     return out
 

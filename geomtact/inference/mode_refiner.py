@@ -20,7 +20,7 @@ from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread
-from geomtact.registration.protocol import Refinement, Refiner, Surface
+from geomtact.registration.protocol import Problem, Refinement, Refiner, Surface
 from geomtact.scoring.likelihood import cast_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array
@@ -79,19 +79,17 @@ class ModeRefiner:
         refined = refined_at(index, cells, poses[winner, np.arange(len(cells))], by, problem.length, winner > 0)
         return replace(reweight_cells(posterior, cells, LIKELIHOOD_POWER * likelihood), refined=refined)
 
-    def register(self, posterior: Posterior, contact: Contact, k: int, thorough: bool = True) -> Posterior:
-        """An explored ``posterior`` with the hearts of its ``k`` leading modes moved to where registration against ``contact``
-        finds a denser pose; ``thorough`` as of :meth:`refine`."""
+    def register(self, posterior: Posterior, problem: Problem, k: int, thorough: bool = True) -> Posterior:
+        """An explored ``posterior`` with the hearts of its ``k`` leading modes moved to where registration against all contacts,
+        the ``problem``, finds a denser pose; ``thorough`` as of :meth:`refine`."""
         explored = posterior.explored
         if explored is None or not len(explored.hearts) or not k:
             return posterior
-        rows = explored.hearts[:k]
-        hearts = explored.settled(rows)
-        problem = make_problem(cleaned(contact.soft_mask, self.space.sensor), self.space.sensor)
+        hearts = explored.settled_hearts(k)
         found = [refiner.refine(problem, hearts) for refiner in self.refiners(posterior.index, thorough)]
         T = np.stack([hearts, *(each.T for each in found)])
         density = np.full(T.shape[:2], -np.inf)
-        density[0] = explored.log_density[rows]
+        density[0] = explored.density.log_density(explored.hearts[:k])
         distance, radius = PoseDistance(self.space.mesh), mode_radius(self.space.mesh)
         near = np.stack([distance.within(heart, T[1:, i], radius) for i, heart in enumerate(hearts)], 1)
         near[near] = np.isfinite(self.space.penetration(T[1:][near]))
@@ -100,8 +98,9 @@ class ModeRefiner:
         # where no registration helped, the covariance is that of the first one
         by = [found[max(b - 1, 0)] for b in best]
         each = [one if one.converged[i] else None for i, one in enumerate(by)]
-        chosen = T[best, np.arange(len(rows))]
-        return replace(posterior, refined=refined_at(posterior.index, rows, chosen, each, problem.length, best > 0))
+        numbers = np.arange(len(hearts))
+        refined = refined_at(posterior.index, numbers, T[best, numbers], each, problem.length, best > 0)
+        return replace(posterior, refined=refined)
 
     def _best(self, mask: NDArray[np.bool_], poses: Array) -> tuple[NDArray[np.int64], Array]:
         """At which of the poses (c, n, 4, 4) ``mask`` is most likely, for each of n modes, the first where none touches;

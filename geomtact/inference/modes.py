@@ -83,22 +83,18 @@ def modes_within(posterior: CellDistribution, k: int) -> list[Mode]:
     assert explored is not None
     out, distance = [], PoseDistance(posterior.index.mesh, _POINTS)
     radius, free = mode_radius(posterior.index.mesh), np.ones(len(explored.poses), bool)
-    for row, mass in zip(explored.hearts[:k].tolist(), explored.masses[:k].tolist(), strict=True):
-        members = np.flatnonzero(free & distance.within(explored.poses[row], explored.poses, radius))
-        members = np.union1d(members, [row])
+    hearts = explored.settled_hearts(k)
+    for number, (heart, mass) in enumerate(zip(hearts, explored.masses[:k].tolist(), strict=True)):
+        members = np.flatnonzero(free & distance.within(explored.hearts[number], explored.poses, radius))
         free[members] = False
-        heart = explored.settled(np.array([row]))[0]
-        found = posterior.refined.get(row)
+        found = posterior.refined.get(number)
         if found is None:
             covariance = posterior.index.cell_covariance(heart)
             found = Refined(heart, covariance, np.zeros((0, 6)), posterior.index.mesh.radius_rms, False)
         # a covariance of few particles is that of registration or of a cell, more or less
         fixed = _REGISTERED if len(found.observable) else _OF_CELL
         near = log(inverse(found.T) @ distance.aligned(found.T, explored.poses[members]))
-        weight = explored.weight[members] / explored.weight[members].sum()
-        n = 1 / float(weight @ weight)
-        spread = (near * weight[:, None]).T @ near
-        found = replace(found, covariance=(n * spread + fixed * found.covariance) / (n + fixed))
+        found = replace(found, covariance=(near.T @ near + fixed * found.covariance) / (len(near) + fixed))
         found = carried(found, nearest_images(posterior, found.T[None])[0])
         T = posterior.T_frame_sensor @ found.T
         out.append(Mode(T, mass, found.covariance, found.observable, found.length, found.moved))

@@ -1,4 +1,9 @@
-"""Poses that may be the object's, and what decides how probable each is: the contact that is cut there, and the prior."""
+"""Poses that may be the object's, and what decides how probable each is: the contacts that are cut there, and the prior.
+
+A pose that misses a sensor which shows contact is impossible. But hardly any pose at which one sensor is touched as observed
+touches the others. So under small powers of the likelihood poses may miss, the less likely the farther: they lead to poses that
+touch.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geomtact.contact_space.cell_transfer import MISSED_CONTACT_SHARE
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
-from geomtact.scoring.contact_likelihood import ContactQuery
+from geomtact.inference.systematic_errors import displaced, errors_of, undisplaced
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
 from geomtact.se3 import Array, transform
+
+SURE = POWERS[1]  # of the likelihood: from this power on, no pose may miss a sensor that shows contact
+_MISS = (
+    2.5e7  # nats/m^2 of a distance by which a pose misses; it changes where poses are drawn, not how probable they are
+)
+_FARTHEST = 50e-3  # m: the largest such distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +39,11 @@ class Particles:
     log_likelihood : (n,)
     log_coarse : (n,) log density of the coarse posterior, without the prior
     log_prior : (n,) log density of the prior
+    missed : (n,) whether another sensor that shows contact is not touched, or too deeply
+    draw : (n,) from which draw of the sampler each comes
+    by_sensor : (n, S) log likelihood by each of S sensors, the first one first; S is 0 where there is one sensor alone
+    errors : (n, S, 4) of the contact on each, by the shares of all errors that are smaller (see ``systematic_errors``); those of
+        one sensor alone do not matter here
     """
 
     poses: Placements
@@ -33,14 +51,18 @@ class Particles:
     log_likelihood: Array
     log_coarse: Array
     log_prior: Array
+    missed: NDArray[np.bool_]
+    draw: NDArray[np.int64]
+    by_sensor: Array
+    errors: Array
 
     def __len__(self) -> int:
         return len(self.depth)
 
     def log_target(self, power: float) -> Array:
         """Log (n,) of the density of the posterior by a power of the likelihood, up to a constant; -inf where nothing is
-        touched."""
-        touches = np.isfinite(self.log_likelihood)
+        touched, and for powers of ``SURE`` and more where a sensor is missed."""
+        touches = np.isfinite(self.log_likelihood) & ~(self.missed & (power >= SURE))
         return np.where(touches, self.log_prior + tempered(self.log_likelihood, self.log_coarse, power), -np.inf)
 
     def take(self, rows: NDArray[np.int64]) -> Particles:
@@ -68,24 +90,84 @@ class Particles:
 
 
 @dataclass(frozen=True, eq=False)
+class OtherSensor:
+    """A sensor on the object beside the one in whose cells poses are.
+
+    Attributes
+    ----------
+    index, query : all touches of the object on it, and the observed contact, or that there is none
+    T_sensor_first : (4, 4) of the first sensor in its frame
+    """
+
+    index: Index
+    query: ContactQuery
+    T_sensor_first: Array
+
+    def log_likelihood(self, T: Array, errors: Array) -> tuple[Array, Array]:
+        """Log likelihood (n,) of what it shows, with the object at ``T`` (n, 4, 4) in the first sensor's frame and ``errors``
+        (n, 4) of the contact; and by how much a contact that it shows is missed (n,) [m]."""
+        query, sensor = self.query, self.index.sensor
+        T = shifted(self.T_sensor_first @ T, self.index.mesh.centre, lambda c: undisplaced(c, errors, query.centroid))
+        poses, membrane = located(self.index, T)
+        cut = ContactMaps.of(self.index).compare(query.samples, query.area, poses, membrane)
+        depth = np.where(np.isfinite(cut.reach), cut.reach - membrane, -_FARTHEST)
+        if not query.touched.any():
+            # the largest power stands for the whole likelihood
+            return np.where(depth > 0, np.log(MISSED_CONTACT_SHARE) / POWERS[-1], 0.0), np.zeros(len(T))
+        missed = np.clip(np.maximum(-depth, depth - sensor.max_penetration), 0, _FARTHEST)
+        log_likelihood = np.full(len(T), query.log_likelihood_of_nothing)
+        touches = np.isfinite(cut.energy[:, 0])
+        log_likelihood[touches] = query.log_likelihood(cut.energy[touches])
+        missed[~touches] = np.maximum(missed[~touches], 1e-6)
+        return log_likelihood, missed
+
+
+@dataclass(frozen=True, eq=False)
 class Target:
     """What a pose is judged by.
 
     Attributes
     ----------
-    index, query : all touches of the object, and the observed contact
+    index, query : all touches of the object on the first sensor that shows contact, and that contact
     log_coarse : (n,) log density of the coarse posterior at the places of the index, without the prior
     log_prior : (N,) log density of the prior in the cells of the index; None for the uniform
+    others : the other sensors
     """
 
     index: Index
     query: ContactQuery
     log_coarse: Array
     log_prior: NDArray[np.floating] | None
+    others: tuple[OtherSensor, ...] = ()
 
-    def evaluated(self, poses: Placements, membrane: Array | None = None, depth: Array | None = None) -> Particles:
-        """n poses as particles, the membrane's apex ``membrane`` (n,) beyond their centre or ``depth`` (n,) deep. Those that do
-        not touch or press too deep have no likelihood; see :meth:`admits`."""
+    @property
+    def sensors(self) -> int:
+        """How many there are."""
+        return 1 + len(self.others)
+
+    @property
+    def weights(self) -> Array:
+        """Weights (K,) of the posteriors by powers of the likelihood."""
+        return mixture_weights([self.query, *(other.query for other in self.others)])
+
+    def displaced(self, T: Array, errors: Array) -> Array:
+        """Where the object is (..., 4, 4) whose contact on the first sensor is that at ``T`` (..., 4, 4) without ``errors``
+        (..., 4)."""
+        return shifted(T, self.index.mesh.centre, lambda c: displaced(c, errors, self.query.centroid))
+
+    def evaluated(
+        self,
+        poses: Placements,
+        membrane: Array | None = None,
+        depth: Array | None = None,
+        errors: Array | None = None,
+    ) -> Particles:
+        """n poses as particles, the membrane's apex ``membrane`` (n,) beyond their centre or ``depth`` (n,) deep, with ``errors``
+        (n, S, 4) of the contacts as of :class:`Particles`, by default none. Those that do not touch the first sensor or press too
+        deep have no likelihood; see :meth:`admits`."""
+        n = len(poses.reach)
+        if errors is None:
+            errors = np.full((n, self.sensors if self.others else 0, 4), 0.5)
         cut = ContactMaps.of(self.index).compare(self.query.samples, self.query.area, poses, membrane, depth)
         found = replace(poses, reach=cut.reach.astype(float))
         if depth is None:
@@ -96,12 +178,26 @@ class Target:
         log_likelihood = np.full(len(depth), -np.inf)
         log_likelihood[ok] = self.query.log_likelihood(cut.energy[ok])
         log_prior = prior_at(self.index, self.log_prior, poses.place, depth)
-        return Particles(found, depth, log_likelihood, self.log_coarse[poses.place], log_prior)
+        missed, by_sensor = np.zeros(n, bool), np.full(errors.shape[:2], -np.inf)
+        if self.others and ok.any():
+            by_sensor[:, 0] = log_likelihood
+            T = poses_of(found, depth, self.index.mesh.centre)[ok]
+            T = self.displaced(T, errors_of(errors[ok, 0]))
+            for number, other in enumerate(self.others, 1):
+                its, by = other.log_likelihood(T, errors_of(errors[ok, number]))
+                by_sensor[ok, number] = its
+                log_likelihood[ok] += its - _MISS * by**2
+                missed[ok] |= by > 0
+        log_coarse = self.log_coarse[poses.place]
+        return Particles(found, depth, log_likelihood, log_coarse, log_prior, missed, np.arange(n), by_sensor, errors)
 
-    def particles_at(self, T: ArrayLike) -> Particles:
-        """Poses ``T_sensor_object`` (n, 4, 4) as particles; those that are forbidden have no likelihood."""
+    def particles_at(self, T: ArrayLike, errors: Array | None = None) -> Particles:
+        """Poses ``T_sensor_object`` (n, 4, 4) as particles, with ``errors`` as of :meth:`evaluated`.
+
+        Those that are forbidden have no likelihood.
+        """
         poses, membrane = located(self.index, np.asarray(T, float))
-        return self.admitted(self.evaluated(poses, membrane))
+        return self.admitted(self.evaluated(poses, membrane, errors=errors))
 
     def admitted(self, particles: Particles) -> Particles:
         """``particles`` (n,), without a likelihood where the approach or the sensor's housing forbids them."""
@@ -123,6 +219,13 @@ def poses_of(poses: Placements, depth: Array, middle: Array) -> Array:
     """T_sensor_object (n, 4, 4) of an object with its centre at ``middle`` (3,), that presses ``depth`` (n,) [m] deep."""
     height = np.where(np.isfinite(poses.reach), poses.reach, depth) - depth
     return transform(poses.rotation, np.column_stack([poses.centre, height]) - poses.rotation @ middle)
+
+
+def shifted(T: Array, middle: Array, moved: Callable[[Array], Array]) -> Array:
+    """``T`` (..., 4, 4) with the object's centre, which is at ``middle`` (3,) in its frame, ``moved`` from where it is
+    (..., 3)."""
+    R = T[..., :3, :3]
+    return transform(R, moved(T[..., :3, 3] + R @ middle) - R @ middle)
 
 
 def tempered(log_likelihood: Array, log_coarse: Array, power: float) -> Array:

@@ -12,6 +12,7 @@ observed one, and moves turn the object about that point of the membrane.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.explored import Density
-from geomtact.inference.particles import Particles, Target, poses_of
+from geomtact.inference.particles import SURE, OtherSensor, Particles, Target, poses_of
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array, exp, inverse, log, transform
 
@@ -33,6 +34,10 @@ _ALIGNED = 0.7  # share of the draws whose centre is aligned
 _WIDTH = 1.5  # standard deviation of aligned centres, in samples of the window
 _CUTS = 3  # contacts that are cut for a draw, at most
 _DRAWS = 4  # draws for each pose that is kept
+# Poses that are kept, by the power that was reached, of several sensors: hardly any touch all of them at first.
+_POWERS_OF_SEVERAL = 3  # by larger ones, runs too often miss the true mode
+_OF_SEVERAL = (16, 8, 6)
+_OF_SEVERAL_COST = 12  # contacts that this takes, over those of one such pose all the way
 _MOVES = 2  # of every pose at each step
 _STEPS = 11  # that are usual, for the budget
 _KEPT = 0.6  # share of the poses that the weights of a step leave effective
@@ -41,6 +46,7 @@ _SMALL = 0.5  # share of the moves that are small motions
 _NEAR = 8  # poses among which the other one of a difference is drawn
 _ALONG = 1.0  # largest multiple of a difference
 _TURN = 0.1  # rad, standard deviation of the first moves; they differ by a factor of ten from pose to pose
+_SHARE_DECADES = 2  # over which changes of errors are spread
 _EXPONENTS = np.geomspace(2e-4, POWERS[-1], 40)  # of the likelihood, that the first step may have
 _HALVINGS = 30
 
@@ -55,12 +61,14 @@ class Run:
     particles : of each posterior by a power of the likelihood, poses without errors drawn from it, equally probable
     contacts : that were cut
     log_measure : log of the uniform measure of poses that touch over that of the cells that hold them
+    best : (S,) the largest log likelihood by each of several sensors of all poses that were tried; S is 0 for one sensor alone
     """
 
     density: Density
     particles: tuple[Particles, ...]
     contacts: int
     log_measure: float
+    best: Array
 
     @property
     def log_evidence(self) -> tuple[float, ...]:
@@ -75,30 +83,36 @@ def explore(
     contacts: int,
     rng: np.random.Generator,
     log_prior: NDArray[np.floating] | None = None,
+    others: Sequence[OtherSensor] = (),
     runs: int = 1,
 ) -> tuple[Run, ...]:
-    """The distribution of the pose, found ``runs`` times from about ``contacts`` contacts each, all at once.
+    """The distribution of the pose, found ``runs`` times from about ``contacts`` contacts on each sensor, all at once.
 
     Parameters
     ----------
     coarse : (n,) mass of the places of the index in a coarse posterior; a share of the uniform one is mixed in
     log_prior : (N,) log density of the prior in the cells of the index, relative to the uniform; None for the uniform
+    others : the other sensors that touch the object, or do not
 
     Raises
     ------
     InputError
-        No pose that was drawn touches the sensor.
+        No pose that was drawn touches the sensor, or none that was found touches all that show contact.
     """
     cells = index.weight.astype(float) / index.weight.sum(dtype=float)
     measure = cells.sum(0)
     share = (1 - _UNIFORM) * coarse / coarse.sum() + _UNIFORM * measure
     log_coarse = np.log(share / measure).astype(np.float32).astype(float)  # as files hold it
-    target = Target(index, query, log_coarse, log_prior)
+    target = Target(index, query, log_coarse, log_prior, tuple(others))
     known = 0.0  # log of the mean of the coarse density under the prior
     if log_prior is not None:
         share = share / measure * (cells * np.exp(log_prior.reshape(cells.shape))).sum(0)
         known = float(np.log(share.sum()))
-    n = max(contacts // (_DRAWS * _CUTS + _MOVES * _STEPS), 20)
+    usual = _DRAWS * _CUTS + _MOVES * _STEPS
+    numbers = [max(contacts // usual, 20)] * len(POWERS)
+    if others:
+        numbers = [max(int(contacts / usual * more / _OF_SEVERAL_COST), 20) for more in _OF_SEVERAL]
+    n = numbers[0]
     drawn, log_weight, cut = _draw(target, share, runs, _DRAWS * n, rng)
     # the evidence of the coarse posterior is known: what is left is an error of the measure, which all poses of a run share
     whole = np.logaddexp.reduce(log_weight + drawn.log_target(0).reshape(runs, -1), 1)
@@ -110,40 +124,55 @@ def explore(
         """Log weights (runs, m) of the draws in the posterior by that power."""
         return log_weight + drawn.log_target(exponent).reshape(runs, -1)
 
+    powers = POWERS[:_POWERS_OF_SEVERAL] if others else POWERS
     # the first exponent is the largest that leaves enough draws effective: a distinctive contact begins low
-    effective = np.array([_effective(by_power(exponent)) for exponent in _EXPONENTS])
+    exponents = _EXPONENTS[powers[-1] >= _EXPONENTS]
+    effective = np.array([_effective(by_power(exponent)) for exponent in exponents])
     enough = (effective >= np.minimum(n, effective.max(0))).all(1)
     enough[0] = True
-    power = float(_EXPONENTS[np.flatnonzero(enough)[-1]])
+    power = float(exponents[np.flatnonzero(enough)[-1]])
     # the posteriors by powers of at most this one are those of the draws
     found, evidence = [], []
-    for each in (*(each for each in POWERS if each < power), power):
+    for each in (*(each for each in powers if each < power), power):
         weight = by_power(each)
         evidence.append(np.logaddexp.reduce(weight, 1))
         found.append(drawn.take(_resampled(weight, n, rng)))
     particles, log_evidence, size = found[-1], evidence[-1], 1.0
+    faster = target.sensors**2  # several contacts narrow sooner
+    best = drawn.by_sensor.max(0, initial=-np.inf)
     while True:
         for _ in range(_MOVES):
             particles, accepted = _moved(target, particles, runs, power, size, rng)
-            size = float(np.clip(size * np.exp(accepted - _ACCEPTED), 1e-3, 1))
-            cut += runs * n
-        if power in POWERS:
-            found[POWERS.index(power) :] = [particles]
-            evidence[POWERS.index(power) :] = [log_evidence]
-        if power >= POWERS[-1]:
+            size = float(np.clip(size * np.exp(faster * (accepted - _ACCEPTED)), 1e-3, 1))
+            best = np.maximum(best, particles.by_sensor.max(0, initial=-np.inf))
+            cut += runs * n * target.sensors
+        if power in powers:
+            found[powers.index(power) :] = [particles]
+            evidence[powers.index(power) :] = [log_evidence]
+            if n != numbers[powers.index(power)]:
+                n = numbers[powers.index(power)]
+                particles = particles.take(_resampled(np.zeros((runs, len(particles) // runs)), n, rng))
+        if power >= powers[-1]:
             break
         change = (particles.log_likelihood - particles.log_coarse).reshape(runs, n)
-        after = min(each for each in POWERS if each > power)
+        after = min(each for each in powers if each > power)
         step = _next_step(change, after - power)
         log_evidence = log_evidence + np.logaddexp.reduce(step * change, 1) - np.log(n)
         particles = particles.take(_resampled(step * change, n, rng))
         power = after if step == after - power else power + step
+        if others and power == SURE:
+            touches = np.where(particles.missed, -np.inf, 0.0).reshape(runs, n)
+            if not np.isfinite(touches).any(1).all():
+                raise InputError(f"{index.mesh.name}: no pose that was found touches all sensors; allow more contacts")
+            log_evidence = log_evidence + np.logaddexp.reduce(touches, 1) - np.log(n)
+            particles = particles.take(_resampled(touches, n, rng))
     return tuple(
         Run(
             Density(target, tuple(float(each[run]) for each in evidence)),
-            tuple(each.take(np.arange(run * n, (run + 1) * n)) for each in found),
+            tuple(each.take(np.arange(len(each)).reshape(runs, -1)[run]) for each in found),
             cut // runs,
             float(known - whole[run]),
+            best,
         )
         for run in range(runs)
     )
@@ -208,7 +237,9 @@ def _moved(
         moved[~nudged] = _differences(T[others], run[others], run[some[~nudged]], rng) @ moved[~nudged]
         now = particles.take(some)
         poses, membrane = located(target.index, moved)
-        new = target.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane)
+        errors = _nudged_errors(now.errors, rng)
+        new = target.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane, errors=errors)
+        new = replace(new, draw=now.draw)
         images = _log_images(target, poses.rotation) - _log_images(target, now.poses.rotation)
         gain = new.log_target(power) - now.log_target(power) + images
         taken = np.flatnonzero(np.log(rng.random(len(some))) < gain)
@@ -217,6 +248,18 @@ def _moved(
         accepted[some[taken[allowed]]] = True
         particles = particles.put(some[taken[allowed]], new.take(np.flatnonzero(allowed)))
     return particles, float(accepted[small].mean()) if small.any() else _ACCEPTED
+
+
+def _nudged_errors(shares: Array, rng: np.random.Generator) -> Array:
+    """``shares`` (n, S, 4) of errors, of one sensor a pose changed a little; round the ends, so that they stay uniform."""
+    n, sensors, d = shares.shape
+    if not sensors:
+        return shares
+    step = 10 ** -(_SHARE_DECADES * rng.random((n, 1))) * rng.normal(size=(n, d))
+    out = shares.copy()
+    row, changed = np.arange(n), rng.integers(sensors, size=n)
+    out[row, changed] = (out[row, changed] + step) % 1
+    return out
 
 
 def _log_images(target: Target, R: Array) -> Array:
@@ -258,9 +301,10 @@ def _draw(target: Target, share: Array, runs: int, n: int, rng: np.random.Genera
     about, cut = _aligned(target, poses, step)
     centre, density = _centres(about, middle, step, _WIDTH * sample_pitch(index.sensor), rng)
     depth = index.sensor.max_penetration * rng.random(len(place))
-    particles = target.admitted(target.evaluated(replace(poses, centre=centre), depth=depth))
+    errors = rng.random((len(place), target.sensors if target.others else 0, 4))
+    particles = target.admitted(target.evaluated(replace(poses, centre=centre), depth=depth, errors=errors))
     log_weight = np.log(index.cell_measure[place]) - np.log(share[place]) - np.log(density * n)
-    return particles, log_weight.reshape(runs, n), cut + len(place)
+    return particles, log_weight.reshape(runs, n), cut + len(place) * target.sensors
 
 
 def _differences(T: Array, run: NDArray[np.int64], of: NDArray[np.int64], rng: np.random.Generator) -> Array:

@@ -135,6 +135,16 @@ class Candidates:
         return self.T[np.arange(len(self.T)), self.log_likelihood.argmax(1)], self.log_likelihood.max(1)
 
 
+def joint_problem(views: Sequence[SensorView], max_points: int = _POINTS) -> Problem:
+    """All contacts of ``views`` together, in the first sensor's frame, with so many points of each outline at most."""
+    touching = [(view, view.contact) for view in views if view.contact is not None]
+    problems = [
+        make_problem(view.soft_mask, view.refiner.space.sensor, contact.height, max_points=max_points)
+        for view, contact in touching
+    ]
+    return Problem.joined(problems, np.stack([inverse(view.T_sensor_first) for view, _ in touching]))
+
+
 class Search:
     """Poses of the object in the first sensor's frame at which one sensor or several would show what they do, in cells that
     ``posterior`` does not rule out.
@@ -151,17 +161,9 @@ class Search:
         self.posterior, self.index, self.rng = posterior, posterior.index, rng
         index = self.index
         self.views = sorted(views, key=lambda view: view.contact is None)
-        touching = [(view, view.contact) for view in views if view.contact is not None]
-        self.base, self.n_contacts = self.views[0], len(touching)
+        self.base, self.n_contacts = self.views[0], sum(view.contact is not None for view in views)
         self.first = self.base.refiner
-        T_first_sensor = np.stack([inverse(view.T_sensor_first) for view, _ in touching])
-        self.problem, self.rough = (
-            Problem.joined(
-                [make_problem(v.soft_mask, v.refiner.space.sensor, c.height, max_points=points) for v, c in touching],
-                T_first_sensor,
-            )
-            for points in (_POINTS, _ROUGH_POINTS)
-        )
+        self.problem, self.rough = (joint_problem(views, points) for points in (_POINTS, _ROUGH_POINTS))
         self.spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
         self.filterreg = FilterReg(self.first.surface, self.spread)
         self.best = np.full(len(views), -np.inf)

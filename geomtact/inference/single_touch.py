@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
-from geomtact.errors import InputError
-from geomtact.inference.distribution import cell_densities
 from geomtact.inference.effort import Effort
 from geomtact.inference.facts import Diagnostics, Provenance, ViewRecord
 from geomtact.inference.joint_refinement import refine_jointly
@@ -21,14 +15,14 @@ from geomtact.inference.mode_refiner import ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import lost_contact, prior_log_density, prior_log_mass
 from geomtact.inference.repeated_images import digest
+from geomtact.inference.resolve import LogMass
 from geomtact.inference.search import SensorView
-from geomtact.inference.two_runs import explore_twice
+from geomtact.inference.timing import timed
 from geomtact.inference.views import Placed
-from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.registration.contact_problem import make_problem
 from geomtact.scoring.fitted import FittedScorer
 from geomtact.sensing.contact import Contact, SoftMask
-
-LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
+from geomtact.sensing.moments import cleaned
 
 _HOLLOW = 0.01  # share of the surface in hollows wider than the window, above which the user is warned; hand-set
 # Gain in an image's log evidence without the prior, above which the user is warned [nats]. Derived: by Markov's inequality at
@@ -99,34 +93,6 @@ def touch_posterior(
     return posterior, log_prior
 
 
-def explore_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer, effort: Effort) -> Posterior:
-    """The ``posterior`` of one mask, resolved within the cells by the contacts of ``effort``.
-
-    It is as it was without contact, or with depths. ``log_prior`` is as of :func:`touch_posterior`.
-    """
-    observation, index = posterior.observation, posterior.index
-    if observation is None or not posterior.contact or observation.contact.height is not None or not effort.contacts:
-        return posterior
-    with timed(posterior.timing_ms, "explore"):
-        mask = observation.contact.soft_mask
-        density = None
-        if log_prior is None:
-            coarse = (cell_densities(posterior).reshape(index.weight.shape) * index.weight).sum(0, dtype=float)
-        else:
-            coarse = np.exp(scorer.log_mass(index, mask)).sum(0)
-            density = np.where(index.log_weight > -np.inf, log_prior - np.maximum(index.log_weight, -1e3), -np.inf)
-        source = "mask" if observation.method is None else "image"
-        query, rng = ContactQuery.of(mask, posterior.sensor, source), np.random.default_rng(posterior.seed)
-        try:
-            explored = explore_twice(index, query, coarse, effort.contacts, rng, density)
-        except InputError as error:
-            warning = f"the pose is not resolved within the grid's cells: {error}"
-            return replace(posterior, warnings=[*posterior.warnings, warning])
-    power = POWERS[len(explored.density.log_evidence) - 1] / POWERS[-1]
-    settled = replace(posterior.diagnostics, settled_power=power)
-    return replace(posterior, explored=explored, diagnostics=settled)
-
-
 def drop_lost_contact_prior(posterior: Posterior, prior: Any) -> tuple[Posterior, Any]:
     """``posterior`` and ``prior``; without the prior where it requires contact but the image shows none."""
     if posterior.contact or not lost_contact(prior, posterior.sensor, posterior.T_frame_sensor):
@@ -148,7 +114,8 @@ def refine_modes(posterior: Posterior, log_prior: LogMass, refiner: ModeRefiner,
     with timed(posterior.timing_ms, "refine"):
         contact = posterior.observation.contact
         if posterior.explored is not None:
-            return refiner.register(posterior, contact, effort.modes, effort.thorough)
+            problem = make_problem(cleaned(contact.soft_mask, posterior.sensor), posterior.sensor)
+            return refiner.register(posterior, problem, effort.modes, effort.thorough)
         if contact.height is None:
             return refiner.refine(posterior, contact, effort.modes, effort.thorough)
         view = SensorView(refiner, contact, np.eye(4))
@@ -197,11 +164,3 @@ def _hollows(share: float) -> list[str]:
         f"{100 * share:.0f} % of the object's surface lies in hollows wider than the sensor's window, and touches inside them "
         "are mistaken for others: touch from outside, or localize on a mesh of that wall alone"
     ]
-
-
-@contextmanager
-def timed(timing_ms: dict[str, float], stage: str) -> Iterator[None]:
-    """Write the time that the block takes into ``timing_ms`` under ``stage``."""
-    start = time.perf_counter()
-    yield
-    timing_ms[stage] = 1e3 * (time.perf_counter() - start)

@@ -26,7 +26,12 @@ _WIDER = np.array([4.0, 1.0, 1.0, 1.0])  # distribution of the nodes, so that so
 def random_errors(n: int, rng: np.random.Generator) -> Array:
     """Errors (n, 4): the log of how much larger the object is than its mesh, and by how much the contact lies beside where it
     was found along x, y and z, sensor frame [m]."""
-    return _quantiles(rng.random((n, 4)), _WIDTHS)
+    return errors_of(rng.random((n, 4)))
+
+
+def errors_of(shares: Array) -> Array:
+    """Errors (..., 4) as of :func:`random_errors`, below which ``shares`` (..., 4) of them lie along each axis; none at 0.5."""
+    return _quantiles(shares, _WIDTHS)
 
 
 @cache
@@ -50,7 +55,7 @@ def undisplaced(centre: Array, errors: Array, about: Array) -> Array:
 
 
 def _quantiles(share: Array, width: Array) -> Array:
-    """Errors (n, 4) below which ``share`` (n, 4) of the distributions of ``width`` (4,) lie."""
+    """Errors (..., 4) below which ``share`` (..., 4) of the distributions of ``width`` (4,) lie."""
     return np.asarray(width * np.tan((2 * share - 1) * np.arctan(_LIMIT / width)))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,17 +18,23 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.explored import Explored
-from geomtact.inference.mode_mass import weighed
-from geomtact.inference.particles import Particles, poses_of
+from geomtact.inference.mode_mass import counted, weighed
+from geomtact.inference.particles import OtherSensor, Particles, poses_of
 from geomtact.inference.sampler import Run, explore, systematic
-from geomtact.inference.systematic_errors import NODES, random_errors
+from geomtact.inference.systematic_errors import NODES, errors_of, random_errors
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
 _POSES, _FOR_EACH = (300, 600), 20  # poses that are kept in the end, at least and at most, and contacts for each
-_AGREE = 1.0  # nats: mean difference of two log evidences, by the weights of the powers, above which no run is believed; hand-set
+# nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
+# believed; hand-set
+_AGREE = 1.0
+# nats a contact: by as much the likeliest pose may explain contacts less than the best pose of each sensor alone; hand-set, and
+# also a limit of the search of cells and of identification
+UNEXPLAINED_NATS = 8.0
 _MORE = 4  # times as many contacts are cut in each attempt after the first
 _LEFT_OUT = 3  # powers that an attempt may leave out, before the last
+_SHARPEST = 100  # poses beside these from which modes may grow
 _WEIGHING = 0.5  # contacts that weigh the modes, for each that finds them
 
 
@@ -38,30 +45,40 @@ def explore_twice(
     contacts: int,
     rng: np.random.Generator,
     log_prior: NDArray[np.floating] | None = None,
+    others: Sequence[OtherSensor] = (),
 ) -> Explored:
-    """The distribution of the pose with its modes, by two runs that share a sixteenth of the ``contacts`` and have to agree on
-    the evidence; arguments as of :func:`explore`.
+    """The distribution of the pose with its modes, by two runs that share a sixteenth of the ``contacts`` of each sensor, or a
+    quarter where there are several, and have to agree on the evidence; arguments as of :func:`explore`.
 
     Where they do not, the largest powers of the likelihood are left out until they do, ``_LEFT_OUT`` of them at most. If that
-    does not help, both are repeated with a quarter of the contacts, and then with all, where as many powers are left out as need
-    be.
+    does not help, both are repeated with four times the contacts, until these are all; then as many powers are left out as need
+    be. So are runs of several sensors that found no pose which explains all contacts.
 
     Raises
     ------
     InputError
         No pose that was drawn touches the sensor, or the runs agree on nothing.
     """
-    cut, all_powers = 0, len(POWERS)
-    for asked in (contacts // _MORE**2, contacts // _MORE, contacts):
-        one, other = explore(index, query, coarse, asked // 2, rng, log_prior, runs=2)
+    cut = 0
+    attempts = (contacts // _MORE, contacts) if others else (contacts // _MORE**2, contacts // _MORE, contacts)
+    for asked in attempts:
+        one, other = explore(index, query, coarse, asked // 2, rng, log_prior, others, runs=2)
         cut += one.contacts + other.contacts
-        least = 2 if asked == contacts else all_powers - _LEFT_OUT
+        unexplained = _unexplained(one, other) if others else None
+        if unexplained is not None and unexplained > UNEXPLAINED_NATS:
+            continue
+        all_powers = len(one.log_evidence)
+        least = 2 if asked == attempts[-1] else max(len(POWERS) - _LEFT_OUT, 2)
         for powers in range(all_powers, least - 1, -1):
             run = replace(pooled(one, other, powers, rng), contacts=cut)
             apart = float(run.density.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
-            if apart < _AGREE:
+            if apart < _AGREE * run.density.target.sensors:
                 found = _explored_from(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
-                found, log_sum = weighed(found, run.log_measure, round(_WEIGHING * asked), rng)
+                further = _sharpest(one, other)
+                if others:
+                    found = counted(found, further, _draws_left(one, powers) + _draws_left(other, powers))
+                    return replace(found, unexplained_nats=unexplained)
+                found, log_sum = weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
                 if log_sum < 0:
                     return found
                 cut = found.contacts
@@ -71,13 +88,15 @@ def explore_twice(
 
 
 def pooled(one: Run, other: Run, powers: int, rng: np.random.Generator) -> Run:
-    """Two runs as one: of each posterior by the smallest ``powers`` the particles of both, by how likely each run makes the
-    contact."""
+    """Two runs as one: of each posterior by the smallest ``powers`` the particles of both, of one sensor by how likely each run
+    makes the contact. With several sensors that is mostly chance, where runs agree, and both count alike."""
     particles, evidence = [], []
     each = zip(one.particles, other.particles, one.log_evidence, other.log_evidence, strict=True)
     for first, second, a, b in itertools.islice(each, powers):
         evidence.append(float(np.logaddexp(a, b) - np.log(2)))
         share, n = float(np.exp(a - np.logaddexp(a, b))), len(first) + len(second)
+        if one.density.target.others:
+            share = 0.5
         of_first = systematic(np.ones(len(first)), round(share * n), rng)
         of_second = systematic(np.ones(len(second)), n - round(share * n), rng)
         particles.append(first.take(of_first).joined(second.take(of_second)))
@@ -97,12 +116,39 @@ def _explored_from(run: Run, n: int, rng: np.random.Generator) -> Explored:
     density, target = run.density, run.density.target
     mass = np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(run.particles, density.weights, strict=True)])
     each = functools.reduce(Particles.joined, run.particles).take(systematic(mass, min(len(mass), n), rng))
-    T = density.displaced(poses_of(each.poses, each.depth, target.index.mesh.centre), random_errors(len(each), rng))
+    errors = errors_of(each.errors[:, 0]) if target.others else random_errors(len(each), rng)
+    T = target.displaced(poses_of(each.poses, each.depth, target.index.mesh.centre), errors)
     moved = target.particles_at(T)
-    inside = np.flatnonzero(np.isfinite(moved.log_target(1)))
+    inside = np.flatnonzero(np.isfinite(moved.log_target(0)))
     if not len(inside):
         raise InputError(f"{target.index.mesh.name}: no pose that was found touches the sensor; allow more contacts")
     density = replace(density, log_inside=float(np.log(len(inside) / len(each))))
-    contacts = run.contacts + len(each) + NODES * len(inside)
+    contacts = run.contacts + target.sensors * (len(each) + NODES * len(inside))
     T = T[inside]
     return Explored(density, T, moved.depth[inside], density.log_density(T), contacts)
+
+
+def _sharpest(one: Run, other: Run) -> Array:
+    """The poses (n, 4, 4) that explain the contacts best, of those that two runs found by the largest power."""
+    target, found = one.density.target, one.particles[-1].joined(other.particles[-1])
+    best = np.argsort(-found.log_target(POWERS[len(one.log_evidence) - 1]), kind="stable")[:_SHARPEST]
+    some = found.take(best)
+    T = poses_of(some.poses, some.depth, target.index.mesh.centre)
+    if target.others:
+        T = target.displaced(T, errors_of(some.errors[:, 0]))
+    return np.asarray(T[np.isfinite(target.particles_at(T).log_target(0))])
+
+
+def _draws_left(run: Run, powers: int) -> float:
+    """From how many draws, if all had as many, the particles by the last of so many ``powers`` come."""
+    count = np.unique(run.particles[powers - 1].draw, return_counts=True)[1]
+    return float(count.sum() ** 2 / np.square(count).sum())
+
+
+def _unexplained(one: Run, other: Run) -> float:
+    """Nats by which the likeliest pose that two runs found explains each of several contacts less than the best pose of each
+    sensor alone does, in the mean and by the largest power."""
+    found = one.particles[-1].joined(other.particles[-1])
+    together = found.log_likelihood[~found.missed].max(initial=-np.inf)
+    best = np.maximum(one.best, other.best)
+    return float(POWERS[-1] * (best.sum() - together) / len(best))

@@ -17,6 +17,7 @@ They are fitted like all else by the log score ("covariate-dependent stacking", 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -53,7 +54,7 @@ _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more
 
 @dataclass(frozen=True, eq=False)
 class ContactQuery:
-    """An observed contact, ready to be compared.
+    """An observed contact, or that there is none, ready to be compared.
 
     Attributes
     ----------
@@ -82,22 +83,31 @@ class ContactQuery:
         """From the contact ``touched`` (H, W) without specks."""
         pitch = float(np.sqrt(sensor.pixel_area(touched.shape)))
         count = touched.sum()
-        centroid = sensor.lift(np.stack(np.meshgrid(*sensor.pixel_centres(touched.shape)), -1)[touched]).mean(0)
+        points = sensor.lift(np.stack(np.meshgrid(*sensor.pixel_centres(touched.shape)), -1)[touched])
+        centroid = points.mean(0) if count else np.zeros(3)
         area = count * pitch**2 / sensor.pixel_area(sensor.along(SHAPE))
         # a straight line at any angle crosses 4 / pi times as many pairs of neighbours as its length has pixels
         crossed = (touched[:, 1:] != touched[:, :-1]).sum() + (touched[1:] != touched[:-1]).sum()
         log_outline = float(np.log(max(0.25 * np.pi * pitch * crossed, pitch) / OUTLINE))
         return cls(touched, _samples(touched, pitch, sensor), centroid, float(area), log_outline, source)
 
-    @property
-    def weights(self) -> Array:
-        """Weights (K,) of the posteriors by ``POWERS``."""
-        return np.asarray(softmax(np.array(INTERCEPT[self.source]) + np.array(SLOPE[self.source]) * self.log_outline))
-
     def log_likelihood(self, energy: NDArray[np.float32]) -> Array:
         """Log likelihood (n,) of the contact at poses whose contacts have ``energy`` (n, SHARES), up to a constant of the image;
         -inf where that is inf."""
         return gel_log_likelihood(energy, RATE, _LOG_SHARE)
+
+    @property
+    def log_likelihood_of_nothing(self) -> float:
+        """That of a pose that touches nothing."""
+        return RATE * self.samples.least
+
+
+def mixture_weights(queries: Sequence[ContactQuery]) -> Array:
+    """Weights (K,) of the posteriors by ``POWERS``, for contacts of several sensors as for one that is as long as all of them."""
+    shown = [query for query in queries if query.touched.any()]
+    source = "mask" if all(query.source == "mask" for query in shown) else "image"
+    log_outline = float(np.logaddexp.reduce([query.log_outline for query in shown]))
+    return np.asarray(softmax(np.array(INTERCEPT[source]) + np.array(SLOPE[source]) * log_outline))
 
 
 def share_cells() -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ from geomtact.inference.particles import Target, poses_of
 from geomtact.inference.two_runs import explore_twice
 from geomtact.localizer import Localizer
 from geomtact.log_mass import log_mean_exp
-from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
 from geomtact.se3 import Array
 
 ROOTS = (75_000, 300_000, 1_200_000)  # poses of the grids whose cells are opened
@@ -118,8 +118,7 @@ def _found(
         level = float(mass[density > at].sum())
         return _Found(at, float(mass @ density), level, False, contacts, 1, 0.0, False)
     at, most = float(explored.density.log_density(T)[0]), float(explored.log_density.max())
-    first = explored.poses[explored.hearts[0]]
-    held = bool(PoseDistance(index.mesh).within(first, T, mode_radius(index.mesh))[0])
+    held = bool(PoseDistance(index.mesh).within(explored.hearts[0], T, mode_radius(index.mesh))[0])
     return _Found(
         min(at, most),
         explored.expected_gain,
@@ -142,7 +141,7 @@ def _root(
     return (
         int((log_mass > log_mass[true]).sum()),
         float(log_mass[true] - index.log_weight[true]),
-        _gain(density.of_powers(touch.T_sensor_object), inside, query.weights),
+        _gain(density.of_powers(touch.T_sensor_object), inside, mixture_weights([query])),
         float(index.touching[true % index.places]),
     )
 

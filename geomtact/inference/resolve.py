@@ -1,0 +1,88 @@
+"""Poses resolved within the cells of the grid, by the contacts that are cut at them: of one sensor's mask, or of several."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geomtact.errors import InputError
+from geomtact.inference.distribution import cell_densities
+from geomtact.inference.effort import Effort
+from geomtact.inference.particles import OtherSensor
+from geomtact.inference.posterior import Posterior
+from geomtact.inference.timing import timed
+from geomtact.inference.two_runs import explore_twice
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.scoring.fitted import FittedScorer
+from geomtact.se3 import Array, inverse
+
+LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
+
+
+def resolve_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer, effort: Effort) -> Posterior:
+    """The ``posterior`` of one mask, resolved within the cells by the contacts of ``effort``.
+
+    It is as it was without contact, or with depths. ``log_prior`` is as of ``single_touch.touch_posterior``.
+    """
+    if log_prior is None or not _can_resolve([posterior], effort):
+        return _resolved(posterior, [posterior], None, None, effort)
+    assert posterior.observation is not None
+    # cells that the prior rules out have no mass in the posterior
+    coarse = np.exp(scorer.log_mass(posterior.index, posterior.observation.contact.soft_mask)).sum(0)
+    return _resolved(posterior, [posterior], coarse, log_prior, effort)
+
+
+def resolve_touches(
+    posterior: Posterior, touches: Sequence[Posterior], log_prior: LogMass, effort: Effort
+) -> Posterior:
+    """The ``posterior`` of several sensors' masks, resolved within the cells of the first with contact.
+
+    It is as it was with depths. ``touches`` and ``log_prior`` are as of ``fusion.fused_posterior``.
+    """
+    return _resolved(posterior, touches, None, log_prior, effort)
+
+
+def _can_resolve(touches: Sequence[Posterior], effort: Effort) -> bool:
+    shown = [touch.observation.contact for touch in touches if touch.contact and touch.observation]
+    return bool(effort.contacts and shown and all(contact.height is None for contact in shown))
+
+
+def _resolved(
+    posterior: Posterior, touches: Sequence[Posterior], coarse: Array | None, log_prior: LogMass, effort: Effort
+) -> Posterior:
+    """``coarse`` (n,) is the mass of the places without the prior, by default that of ``posterior``, divided by the prior."""
+    if not _can_resolve(touches, effort):
+        return posterior
+    index, prior = posterior.index, None
+    with timed(posterior.timing_ms, "explore"):
+        if log_prior is not None:
+            prior = np.where(index.log_weight > -np.inf, log_prior - np.maximum(index.log_weight, -1e3), -np.inf)
+        if coarse is None:
+            density = cell_densities(posterior)
+            if prior is not None:
+                density = np.where(prior > -np.inf, density * np.exp(-np.maximum(prior, -1e3)), 0)
+            coarse = (density.reshape(index.weight.shape) * index.weight).sum(0, dtype=float)
+        first = next(touch for touch in touches if touch.contact)
+        others = [
+            OtherSensor(touch.index, _query(touch), inverse(touch.T_frame_sensor) @ first.T_frame_sensor)
+            for touch in touches
+            if touch is not first
+        ]
+        rng = np.random.default_rng(posterior.seed)
+        try:
+            explored = explore_twice(index, _query(first), coarse, effort.contacts, rng, prior, others)
+        except InputError as error:
+            warning = f"the pose is not resolved within the grid's cells: {error}"
+            return replace(posterior, warnings=[*posterior.warnings, warning])
+    power = POWERS[len(explored.density.log_evidence) - 1] / POWERS[-1]
+    diagnostics = replace(posterior.diagnostics, settled_power=power, unexplained_nats=explored.unexplained_nats)
+    return replace(posterior, explored=explored, diagnostics=diagnostics)
+
+
+def _query(touch: Posterior) -> ContactQuery:
+    assert touch.observation is not None
+    source = "mask" if touch.observation.method is None else "image"
+    return ContactQuery.of(touch.observation.contact.soft_mask, touch.sensor, source)
