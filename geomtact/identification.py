@@ -92,7 +92,9 @@ def identify(
             f"identify: expected a localizer for each object, got {type(localizers).__name__}; give a list of them"
         )
     asked = effort_of(options.get("effort", "balanced"))
-    evidence = replace(asked, contacts=0)  # poses are resolved within the cells for the most probable object alone
+    evidence = replace(
+        asked, contacts=0, several=0
+    )  # poses are resolved within the cells for the most probable object alone
     for i, localizer in enumerate(localizers):
         if log_weights is not None and i >= len(log_weights):
             raise UsageError(f"identify: expected a weight for each object, got {len(log_weights)} for more")
@@ -124,7 +126,7 @@ def identify(
     probability = np.exp(log_odds - np.logaddexp.reduce(log_odds))
     order = np.argsort(-probability, kind="stable")
     _, localizer, posterior = best
-    if asked.contacts:
+    if evidence != asked:
         sensors = tuple(sensor.to_toml() for sensor in localizer.sensors)
         posterior = localizer.localize(read[sensors], **options)
     candidates = [Candidate(found[i][0], float(probability[i]), *found[i][1:]) for i in order]

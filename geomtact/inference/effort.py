@@ -18,23 +18,27 @@ class Effort:
         first attempt has a sixteenth, and settles most touches; the second has a quarter. Half as many more weigh the modes. 0
         leaves the cells as they are
     thorough : whether each mode is refined by all registrations or by one
+    several : contacts on each sensor where several are resolved together, of the last of two attempts; the first has a quarter.
+        0 leaves the cells as they are
     """
 
     modes: int
     contacts: int = 0
     thorough: bool = True
+    several: int = 0
 
     def __post_init__(self) -> None:
         if self.modes < 0:
             raise UsageError(f"Effort: expected 0 refined modes or more, got {self.modes}; give 0 for none")
-        if self.contacts < 0:
-            raise UsageError(f"Effort: expected 0 contacts or more, got {self.contacts}; give 0 for none")
+        for contacts in (self.contacts, self.several):
+            if contacts < 0:
+                raise UsageError(f"Effort: expected 0 contacts or more, got {contacts}; give 0 for none")
 
 
 EFFORTS = {
     "fast": Effort(0),
     "balanced": Effort(5, 160_000, thorough=False),
-    "exact": Effort(25, 640_000),
+    "exact": Effort(25, 640_000, several=160_000),
 }
 
 

@@ -47,7 +47,8 @@ def resolve_touches(
 
 def _can_resolve(touches: Sequence[Posterior], effort: Effort) -> bool:
     shown = [touch.observation.contact for touch in touches if touch.contact and touch.observation]
-    return bool(effort.contacts and shown and all(contact.height is None for contact in shown))
+    contacts = effort.contacts if len(touches) == 1 else effort.several
+    return bool(contacts and shown and all(contact.height is None for contact in shown))
 
 
 def _resolved(
@@ -73,7 +74,8 @@ def _resolved(
         ]
         rng = np.random.default_rng(posterior.seed)
         try:
-            explored = explore_twice(index, _query(first), coarse, effort.contacts, rng, prior, others)
+            contacts = effort.several if others else effort.contacts
+            explored = explore_twice(index, _query(first), coarse, contacts, rng, prior, others)
         except InputError as error:
             warning = f"the pose is not resolved within the grid's cells: {error}"
             return replace(posterior, warnings=[*posterior.warnings, warning])
