@@ -52,7 +52,7 @@ def normal_modes(request, make_localizer):
         contacts=0,
         density=SimpleNamespace(
             target=SimpleNamespace(
-                particles_at=lambda T, errors: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T))),
+                particles_at=lambda T: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T))),
                 displaced=lambda T, errors: T,
                 sensors=1,
                 others=(),

@@ -22,9 +22,7 @@ from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_we
 from geomtact.se3 import Array, transform
 
 SURE = POWERS[1]  # of the likelihood: from this power on, no pose may miss a sensor that shows contact
-_MISS = (
-    2.5e7  # nats/m^2 of a distance by which a pose misses; it changes where poses are drawn, not how probable they are
-)
+_MISS = 2.5e7  # nats/m^2 of a distance by which a pose misses: where poses are drawn depends on it, not how probable they are
 _FARTHEST = 50e-3  # m: the largest such distance
 
 

@@ -34,10 +34,10 @@ _ALIGNED = 0.7  # share of the draws whose centre is aligned
 _WIDTH = 1.5  # standard deviation of aligned centres, in samples of the window
 _CUTS = 3  # contacts that are cut for a draw, at most
 _DRAWS = 4  # draws for each pose that is kept
-# Poses that are kept, by the power that was reached, of several sensors: hardly any touch all of them at first.
-_POWERS_OF_SEVERAL = 3  # by larger ones, runs too often miss the true mode
+# Of several sensors: poses that are kept, by power, over those with one. Hardly any touch all sensors at first. By larger powers
+# than these, runs too often miss the true mode.
 _OF_SEVERAL = (16, 8, 6)
-_OF_SEVERAL_COST = 12  # contacts that this takes, over those of one such pose all the way
+_OF_SEVERAL_COST = 12  # contacts that this takes, over those with one sensor
 _MOVES = 2  # of every pose at each step
 _STEPS = 11  # that are usual, for the budget
 _KEPT = 0.6  # share of the poses that the weights of a step leave effective
@@ -124,7 +124,7 @@ def explore(
         """Log weights (runs, m) of the draws in the posterior by that power."""
         return log_weight + drawn.log_target(exponent).reshape(runs, -1)
 
-    powers = POWERS[:_POWERS_OF_SEVERAL] if others else POWERS
+    powers = POWERS[: len(numbers)]
     # the first exponent is the largest that leaves enough draws effective: a distinctive contact begins low
     exponents = _EXPONENTS[powers[-1] >= _EXPONENTS]
     effective = np.array([_effective(by_power(exponent)) for exponent in exponents])
