@@ -134,7 +134,7 @@ def test_registration_moves_a_mode_within_its_radius(posterior):
 
 
 def test_modes_that_hold_more_than_everything_are_not_believed(localizer, touch, monkeypatch):
-    monkeypatch.setattr(two_runs, "weighed", lambda found, log_measure, contacts, rng: (found, 5.0))
+    monkeypatch.setattr(two_runs, "weighed", lambda found, further, log_measure, contacts, rng: (found, 5.0))
     found = localizer.localize(touch.mask, "mask", effort=EFFORT)
     assert found.explored is None and "do not settle how likely" in found.warnings[-1]
 
