@@ -145,7 +145,7 @@ def _example(run: Run, reference: Run, touch: Touch, badly_found: bool, rng: np.
     for particles in run.particles:
         some = particles.take(rng.permutation(len(particles))[:KEPT])
         poses = poses_of(some.poses, some.depth, target.index.mesh.centre)
-        poses = density.displaced(poses, random_errors(len(some), rng))
+        poses = target.displaced(poses, random_errors(len(some), rng))
         poses = poses[np.isfinite(target.particles_at(poses).log_likelihood)]
         at_particles.append(density.of_powers(poses))
         sizes.append(len(poses))
