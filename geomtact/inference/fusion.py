@@ -171,10 +171,12 @@ def fused_posterior(
         timing_ms=timing,
         **_of_all(touches, None if against is None else [against]),
     )
-    if not effort.modes:
-        return posterior
     others = [touch.T_frame_sensor for touch in touches if touch.contact and touch is not first]
     uncertain = bool(others) and extrinsics_std not in (None, ExtrinsicsStd())
+    if not uncertain:
+        posterior = resolve_touches(posterior, touches, log_prior, effort)
+    if not effort.modes:
+        return posterior
     views = [
         SensorView(
             mode_refiner,
@@ -183,8 +185,6 @@ def fused_posterior(
         )
         for touch, mode_refiner in zip(touches, mode_refiners, strict=True)
     ]
-    if not uncertain:
-        posterior = resolve_touches(posterior, touches, log_prior, effort)
     with timed(timing, "refine"):
         if posterior.explored is not None:
             refiner = mode_refiners[posterior.provenance.base]
