@@ -10,8 +10,8 @@ import numpy as np
 
 from geomtact.errors import NoPoseAgreesError, UsageError
 from geomtact.inference.effort import effort_of
+from geomtact.inference.facts import UNEXPLAINED_NATS
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.two_runs import UNEXPLAINED_NATS
 from geomtact.inference.views import read_views
 from geomtact.localizer import Localizer
 from geomtact.se3 import Array
@@ -92,14 +92,13 @@ def identify(
             f"identify: expected a localizer for each object, got {type(localizers).__name__}; give a list of them"
         )
     asked = effort_of(options.get("effort", "balanced"))
-    evidence = replace(
-        asked, contacts=0, several=0
-    )  # poses are resolved within the cells for the most probable object alone
+    # poses are resolved within the cells for the most probable object alone
+    evidence = replace(asked, contacts=0, several=0)
     for i, localizer in enumerate(localizers):
         if log_weights is not None and i >= len(log_weights):
             raise UsageError(f"identify: expected a weight for each object, got {len(log_weights)} for more")
         try:
-            sensors = tuple(sensor.to_toml() for sensor in localizer.sensors)
+            sensors = _sensors(localizer)
             if sensors not in read:
                 read[sensors] = _read(localizer, image, **options)
             posterior = localizer.localize(read[sensors], **{**options, "effort": evidence})
@@ -127,10 +126,13 @@ def identify(
     order = np.argsort(-probability, kind="stable")
     _, localizer, posterior = best
     if evidence != asked:
-        sensors = tuple(sensor.to_toml() for sensor in localizer.sensors)
-        posterior = localizer.localize(read[sensors], **options)
+        posterior = localizer.localize(read[_sensors(localizer)], **options)
     candidates = [Candidate(found[i][0], float(probability[i]), *found[i][1:]) for i in order]
     return Identification(candidates, localizer, posterior)
+
+
+def _sensors(localizer: Localizer) -> tuple[str, ...]:
+    return tuple(sensor.to_toml() for sensor in localizer.sensors)
 
 
 def _read(

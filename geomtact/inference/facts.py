@@ -11,6 +11,10 @@ import numpy as np
 from geomtact.inference.effort import Effort
 from geomtact.se3 import Array
 
+# Where the likeliest pose leaves more of each contact unexplained (see ``Diagnostics``), a search for poses is not believed,
+# nor is the object taken for the one that is touched. Chosen on 22 simulated scenes (docs/which-part.md).
+UNEXPLAINED_NATS = 8.0
+
 
 @dataclass(frozen=True)
 class Diagnostics:

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.inference.distribution import cell_log_density, likeliest_cells
+from geomtact.inference.facts import UNEXPLAINED_NATS
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.reweight import reweight_cells
 from geomtact.inference.search import Search, SensorView
-from geomtact.inference.two_runs import UNEXPLAINED_NATS
 from geomtact.se3 import Array
 
 _CELLS = 250  # number of cells that are searched: more cells cost time and add no information
@@ -27,9 +27,7 @@ _KEPT_SHARE = 0.03  # share of their mass that the searched cells keep, whatever
 # ``_OTHERS_SLOPE`` times the mean likelihood of the searched cells relative to the best.
 _OTHERS_BASE, _OTHERS_MOST, _OTHERS_SLOPE = 0.4, 0.2, 5.0
 _IMAGE_POWER = 0.5  # power of a cell's mass beside the likelihood of its best pose, of the same images; hand-set
-# Unexplained nats per contact up to which the search is trusted in full, and ``UNEXPLAINED_NATS`` from which on not at all; the
-# second was chosen for identification, on 22 simulated scenes (docs/which-part.md).
-EXPLAINED_NATS = 4.0
+EXPLAINED_NATS = 4.0  # unexplained nats per contact up to which the search is trusted in full; hand-set
 _EVIDENCE_POWER = 0.5  # power of the likelihood in the evidence, chosen on 22 simulated scenes (docs/which-part.md)
 _OUTLINE_NATS = 150.0  # loss of log likelihood per metre of outline, measured at true poses (docs/which-part.md)
 

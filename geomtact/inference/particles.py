@@ -144,6 +144,11 @@ class Target:
         return 1 + len(self.others)
 
     @property
+    def carried(self) -> int:
+        """Of how many contacts particles carry the errors: those of one sensor alone do not matter to them."""
+        return self.sensors if self.others else 0
+
+    @property
     def weights(self) -> Array:
         """Weights (K,) of the posteriors by powers of the likelihood."""
         return mixture_weights([self.query, *(other.query for other in self.others)])
@@ -165,7 +170,7 @@ class Target:
         deep have no likelihood; see :meth:`admits`."""
         n = len(poses.reach)
         if errors is None:
-            errors = np.full((n, self.sensors if self.others else 0, 4), 0.5)
+            errors = np.full((n, self.carried, 4), 0.5)
         cut = ContactMaps.of(self.index).compare(self.query.samples, self.query.area, poses, membrane, depth)
         found = replace(poses, reach=cut.reach.astype(float))
         if depth is None:
@@ -188,6 +193,11 @@ class Target:
                 missed[ok] |= by > 0
         log_coarse = self.log_coarse[poses.place]
         return Particles(found, depth, log_likelihood, log_coarse, log_prior, missed, np.arange(n), by_sensor, errors)
+
+    def poses(self, particles: Particles) -> Array:
+        """Where the object is (n, 4, 4) at ``particles`` (n,), with the errors that they carry."""
+        T = poses_of(particles.poses, particles.depth, self.index.mesh.centre)
+        return self.displaced(T, errors_of(particles.errors[:, 0])) if self.others else T
 
     def particles_at(self, T: ArrayLike, errors: Array | None = None) -> Particles:
         """Poses ``T_sensor_object`` (n, 4, 4) as particles, with ``errors`` as of :meth:`evaluated`.

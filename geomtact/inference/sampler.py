@@ -301,7 +301,7 @@ def _draw(target: Target, share: Array, runs: int, n: int, rng: np.random.Genera
     about, cut = _aligned(target, poses, step)
     centre, density = _centres(about, middle, step, _WIDTH * sample_pitch(index.sensor), rng)
     depth = index.sensor.max_penetration * rng.random(len(place))
-    errors = rng.random((len(place), target.sensors if target.others else 0, 4))
+    errors = rng.random((len(place), target.carried, 4))
     particles = target.admitted(target.evaluated(replace(poses, centre=centre), depth=depth, errors=errors))
     log_weight = np.log(index.cell_measure[place]) - np.log(share[place]) - np.log(density * n)
     return particles, log_weight.reshape(runs, n), cut + len(place) * target.sensors

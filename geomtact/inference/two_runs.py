@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.explored import Explored
+from geomtact.inference.facts import UNEXPLAINED_NATS
 from geomtact.inference.mode_mass import counted, weighed
-from geomtact.inference.particles import OtherSensor, Particles, poses_of
+from geomtact.inference.particles import OtherSensor, Particles
 from geomtact.inference.sampler import Run, explore, systematic
-from geomtact.inference.systematic_errors import NODES, errors_of, random_errors
+from geomtact.inference.systematic_errors import NODES, random_errors
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
@@ -29,9 +30,6 @@ _POSES, _FOR_EACH = (300, 600), 20  # poses that are kept in the end, at least a
 # nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
 # believed; hand-set
 _AGREE = 1.0
-# nats a contact: by as much the likeliest pose may explain contacts less than the best pose of each sensor alone; hand-set, and
-# also a limit of the search of cells and of identification
-UNEXPLAINED_NATS = 8.0
 _MORE = 4  # times as many contacts are cut in each attempt after the first
 _LEFT_OUT = 3  # powers that an attempt may leave out, before the last
 _SHARPEST = 100  # poses beside these from which modes may grow
@@ -116,8 +114,9 @@ def _explored_from(run: Run, n: int, rng: np.random.Generator) -> Explored:
     density, target = run.density, run.density.target
     mass = np.concatenate([np.full(len(p), w / len(p)) for p, w in zip(run.particles, density.weights, strict=True)])
     each = functools.reduce(Particles.joined, run.particles).take(systematic(mass, min(len(mass), n), rng))
-    errors = errors_of(each.errors[:, 0]) if target.others else random_errors(len(each), rng)
-    T = target.displaced(poses_of(each.poses, each.depth, target.index.mesh.centre), errors)
+    T = target.poses(each)
+    if not target.carried:
+        T = target.displaced(T, random_errors(len(each), rng))
     moved = target.particles_at(T)
     inside = np.flatnonzero(np.isfinite(moved.log_target(0)))
     if not len(inside):
@@ -132,10 +131,7 @@ def _sharpest(one: Run, other: Run) -> Array:
     """The poses (n, 4, 4) that explain the contacts best, of those that two runs found by the largest power."""
     target, found = one.density.target, one.particles[-1].joined(other.particles[-1])
     best = np.argsort(-found.log_target(POWERS[len(one.log_evidence) - 1]), kind="stable")[:_SHARPEST]
-    some = found.take(best)
-    T = poses_of(some.poses, some.depth, target.index.mesh.centre)
-    if target.others:
-        T = target.displaced(T, errors_of(some.errors[:, 0]))
+    T = target.poses(found.take(best))
     return np.asarray(T[np.isfinite(target.particles_at(T).log_target(0))])
 
 
