@@ -504,9 +504,4 @@ def test_wrong_extrinsics_are_a_warning_and_right_ones_hardly_ever(plug):
                 continue
             warned[name] += any("agree badly" in warning for warning in posterior.warnings)
     assert warned["right"] <= 4 and warned["off"] >= warned["right"] + 6 and warned["known to be"] == 0, warned
-    exact = plug.localize(masks, "mask", T_world_sensor=off, extrinsics_std=ExtrinsicsStd())
-    assert np.array_equal(exact.log_prob, last["off"].log_prob)
-    # a mode is no more certain than the extrinsics
-    for mode in last["known to be"].modes(3):
-        assert np.linalg.eigvalsh(mode.covariance[3:, 3:]).min() >= 0.99 * 5e-3**2
     assert poor_agreement(np.inf) and not poor_agreement(None)

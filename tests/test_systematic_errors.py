@@ -2,9 +2,20 @@
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 from scipy.stats import kstest
 
-from geomtact.inference.systematic_errors import NODES, displaced, nodes, random_errors, undisplaced
+from geomtact import se3
+from geomtact.contact_space.cell_transfer import ExtrinsicsStd
+from geomtact.inference.systematic_errors import (
+    ERRORS,
+    NODES,
+    displaced,
+    nodes,
+    random_errors,
+    stand_of,
+    undisplaced,
+)
 from geomtact.scoring.contact_likelihood import SCALE_ERROR, SHIFT_ERROR
 
 WIDTH = np.array([SCALE_ERROR] + 3 * [SHIFT_ERROR])
@@ -22,7 +33,7 @@ def test_errors_are_drawn_from_their_distribution():
 
 def test_nodes_have_the_distribution():
     """Shifts lie in the middle of every share of it, errors of the scale farther apart; their weights make up for that."""
-    errors, log_weight = nodes()
+    errors, _, log_weight = nodes(NODES)
     weight = np.exp(log_weight)
     assert weight.sum() == pytest.approx(1)
     for each in share(errors)[:, 1:].T:
@@ -31,6 +42,23 @@ def test_nodes_have_the_distribution():
     middle = np.cumsum(weight[order]) - 0.5 * weight[order]
     np.testing.assert_allclose(share(errors)[order, 0], middle, atol=0.01)
     assert errors[:, 0].max() > 20 * SCALE_ERROR
+
+
+def test_sensors_stand_where_they_are_said_to_within_what_is_known_of_it():
+    """By the middle of all shares they stand right; stated uncertainties are those of normal distributions; without one, the
+    logarithm of the standard deviation is uniform from 0.2 to 3 mm and degrees."""
+    np.testing.assert_array_equal(stand_of(np.full((1, ERRORS), 0.5)), np.eye(4)[None])
+    shares = np.random.default_rng(0).random((20_000, ERRORS))
+    stated = se3.log(stand_of(shares, ExtrinsicsStd(0.02, 1e-3)))
+    for each, std in zip(stated.T, [0.02] * 3 + [1e-3] * 3, strict=True):
+        assert kstest(each / std, "norm").pvalue > 1e-3
+    np.testing.assert_array_equal(stand_of(shares[:5], ExtrinsicsStd()), np.broadcast_to(np.eye(4), (5, 4, 4)))
+    shares[:, 5:] = ndtr(1.0)
+    unknown = np.abs(se3.log(stand_of(shares)))
+    low, high = unknown.min(0), unknown.max(0)
+    np.testing.assert_allclose(low[3:], 0.2e-3, rtol=0.05)
+    np.testing.assert_allclose(high[:3], np.deg2rad(3), rtol=0.05)
+    assert kstest(np.log(unknown[:, 0] / low[0]) / np.log(high[0] / low[0]), "uniform").pvalue > 1e-3
 
 
 def test_errors_are_undone():

@@ -7,9 +7,11 @@ size, so what a touch constrains within a cell is lost. Here the contact is made
 from __future__ import annotations
 
 import contextlib
+import os
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -29,7 +31,7 @@ from geomtact.sensing.sensor import Sensor
 SHAPE = (48, 64)  # samples of the window, lying
 _PIXELS_PER_SAMPLE = 2  # of the height maps
 _THREADS = 2
-_PART = 512  # poses that a thread takes at a time
+_PART = 256  # poses that a thread takes at a time
 _FORMAT = 1  # of the file in an index's folder
 _LEVELS = 65_534  # of the heights in it, besides one for where the object is not
 
@@ -121,8 +123,7 @@ class ContactMaps:
         starts = range(0, max(n, 1), _PART)
         if len(starts) == 1:
             return some(0)
-        with ThreadPoolExecutor(_THREADS) as pool:
-            found = list(pool.map(some, starts))
+        found = list(_pool(os.getpid()).map(some, starts))
         return Cut(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
 
@@ -134,6 +135,12 @@ def located(index: Index, T: Array) -> tuple[Placements, Array]:
     place = index.place_of(index.directions.first_turn[direction] + turn, centre)
     reach = centre[:, 2] + 0.5 * index.sensor.max_penetration
     return Placements(place, direction.astype(np.int32), R, centre[:, :2], reach), centre[:, 2]
+
+
+@cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """The threads of a process, by its number: a process that it forks has none of them."""
+    return ThreadPoolExecutor(_THREADS)
 
 
 _OPENED: WeakKeyDictionary[Index, tuple[Maps, Array]] = WeakKeyDictionary()

@@ -37,7 +37,7 @@ class Effort:
 
 EFFORTS = {
     "fast": Effort(0),
-    "balanced": Effort(5, 160_000, thorough=False),
+    "balanced": Effort(5, 160_000, thorough=False, several=40_000),
     "exact": Effort(25, 640_000, several=160_000),
 }
 

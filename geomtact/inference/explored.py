@@ -14,14 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
-from geomtact.inference.particles import SURE, OtherSensor, Particles, Target, prior_at, tempered
-from geomtact.inference.systematic_errors import nodes, undisplaced
+from geomtact.inference.particles import OtherSensor, Particles, Target, prior_at, tempered
+from geomtact.inference.systematic_errors import NODES, NODES_BESIDE, nodes, undisplaced
 from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
 from geomtact.se3 import Array, check_pose, check_transforms
 
 _PART = 512  # poses whose density is made at a time
+_OF_OTHER = ("touched", "source", "sensor", "index", "T_sensor_first", "extrinsics_std")  # what files hold of a sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +35,13 @@ class Density:
     ----------
     target : what poses without errors are judged by
     log_evidence : of each posterior, the log of the mean of the power of the likelihood over the coarse posterior
+    powers : of the likelihood; all but the last are of ``POWERS``
     log_inside : log of the share of the poses with errors that are in the contact pose space
     """
 
     target: Target
     log_evidence: tuple[float, ...]
+    powers: tuple[float, ...] = POWERS
     log_inside: float = 0.0
 
     @property
@@ -48,7 +52,7 @@ class Density:
     @cached_property
     def weights(self) -> Array:
         """Weight of each posterior; the last one has those of the powers that are left out too."""
-        weights, last = self.target.weights, len(self.log_evidence) - 1
+        weights, last = self.target.weights, len(self.powers) - 1
         return np.append(weights[:last], weights[last:].sum())
 
     def by_power(self, log_likelihood: Array, log_coarse: Array) -> Array:
@@ -56,14 +60,14 @@ class Density:
         the coarse posterior (...)."""
         each = [
             tempered(log_likelihood, log_coarse, power) - log_evidence
-            for power, log_evidence in zip(POWERS, self.log_evidence, strict=False)
+            for power, log_evidence in zip(self.powers, self.log_evidence, strict=True)
         ]
         return np.stack(each, -1)
 
     @property
     def _sure(self) -> NDArray[np.bool_]:
         """Under which of the powers (K,) no sensor may be missed."""
-        return np.array(POWERS[: len(self.log_evidence)]) >= SURE
+        return np.array(self.powers) > 0
 
     def of_exact(self, particles: Particles) -> Array:
         """Log density (n,) of the mixture at ``particles`` (n,), if there were no errors but theirs."""
@@ -84,7 +88,7 @@ class Density:
     def _of_powers(self, T: Array) -> Array:
         index, query, n = self.index, self.target.query, len(T)
         poses, membrane = located(index, T)
-        errors, log_weight = nodes()
+        errors, _, log_weight = nodes(NODES)
         centre = undisplaced(np.column_stack([poses.centre, membrane])[:, None], errors, query.centroid)
         flat, rows = centre.reshape(-1, 3), np.repeat(np.arange(n), len(errors))
         place = index.place_of(index.rotation[poses.place[rows]].astype(np.int64), flat)
@@ -96,9 +100,12 @@ class Density:
         # volumes with errors are larger
         each = (each + prior[:, None]).reshape(n, len(errors), -1) + (log_weight - 3 * errors[:, 0])[:, None]
         out = np.asarray(np.logaddexp.reduce(each, 1))
-        powers = np.array(POWERS[: len(self.log_evidence)])[self._sure]
+        powers = np.array(self.powers)[self._sure]
         for other in self.target.others:
-            found, missed = other.log_likelihood(np.repeat(T, len(errors), 0), np.tile(errors, (n, 1)))
+            errors, stand, log_weight = nodes(NODES_BESIDE, other.extrinsics_std)
+            found, missed = other.log_likelihood(
+                np.repeat(T, len(errors), 0), np.tile(errors, (n, 1)), np.tile(stand, (n, 1, 1))
+            )
             found = np.where(missed > 0, -np.inf, found).reshape(n, len(errors), 1)
             out[:, self._sure] += np.logaddexp.reduce(powers * found + log_weight[:, None], 1)
         return out
@@ -182,6 +189,7 @@ class Explored:
             "depth": self.depth,
             "log_density": self.log_density,
             "log_evidence": np.array(self.density.log_evidence),
+            "powers": np.array(self.density.powers),
             "log_inside": np.array(self.density.log_inside),
             "log_coarse": target.log_coarse.astype(np.float32),
             "log_prior": np.zeros(0) if target.log_prior is None else target.log_prior,
@@ -206,9 +214,9 @@ class Explored:
         """
         T, log_coarse = check_transforms(arrays["T"]), arrays["log_coarse"].astype(float)
         log_prior = arrays["log_prior"] if len(arrays["log_prior"]) else None
-        if not 1 < len(arrays["log_evidence"]) <= len(POWERS) or not len(T) == len(arrays["depth"]) == len(
-            arrays["log_density"]
-        ):
+        if not 1 < len(arrays["log_evidence"]) == len(arrays["powers"]) <= len(POWERS) or not len(T) == len(
+            arrays["depth"]
+        ) == len(arrays["log_density"]):
             raise ValueError("particles of different number")
         hearts = check_transforms(arrays["hearts"])
         if len(hearts) != len(arrays["masses"]):
@@ -217,12 +225,19 @@ class Explored:
             raise ValueError("densities that are not of its grid")
         others = []
         for i in range(int(arrays["others"])):
-            its = {k: arrays[f"other_{i}_{k}"] for k in ("touched", "source", "sensor", "index", "T_sensor_first")}
+            its = {k: arrays[f"other_{i}_{k}"] for k in _OF_OTHER}
             on = open_index(str(its["sensor"]), str(its["index"]))
-            others.append(OtherSensor(on, _query(its, on), check_pose(its["T_sensor_first"], "T_sensor_first")))
+            T_sensor_first = check_pose(its["T_sensor_first"], "T_sensor_first")
+            std = ExtrinsicsStd(*its["extrinsics_std"].tolist()) if len(its["extrinsics_std"]) else None
+            others.append(OtherSensor(on, _query(its, on), T_sensor_first, std))
         target = Target(index, _query(arrays, index), log_coarse, log_prior, tuple(others))
         return cls(
-            Density(target, tuple(arrays["log_evidence"].tolist()), float(arrays["log_inside"])),
+            Density(
+                target,
+                tuple(arrays["log_evidence"].tolist()),
+                tuple(arrays["powers"].tolist()),
+                float(arrays["log_inside"]),
+            ),
             T,
             arrays["depth"],
             arrays["log_density"],
@@ -241,11 +256,13 @@ def _of_query(query: ContactQuery) -> dict[str, NDArray[Any]]:
 
 
 def _of_other(other: OtherSensor) -> dict[str, NDArray[Any]]:
+    std = other.extrinsics_std
     return {
         **_of_query(other.query),
         "sensor": np.array(other.index.sensor.to_toml()),
         "index": np.array(other.index.key),
         "T_sensor_first": other.T_sensor_first,
+        "extrinsics_std": np.array([] if std is None else [std.rotation, std.translation]),
     }
 
 

@@ -42,6 +42,7 @@ _LEAST_CORRELATION = 0.1
 _NEGLIGIBLE_NATS = 25.0  # log density below that of the most probable place from which a place has no weight; hand-set
 _UNLIKELY_DENSITY = 0.1  # density relative to the uniform below which a place is transferred by one pose; hand-set
 _DISAGREES_NATS = -2.0  # support of the other sensors for an image below which a disagreement is reported; hand-set
+_ROUGH_POINTS = 20  # largest number of points of an outline, to register many poses
 # Unexplained nats per contact above which poor agreement is reported: 2 of 100 simulated scenes of the pin and the head with
 # exact sensor poses exceed it.
 _UNEXPLAINED_NATS = 1.75
@@ -173,10 +174,6 @@ def fused_posterior(
     )
     others = [touch.T_frame_sensor for touch in touches if touch.contact and touch is not first]
     uncertain = bool(others) and extrinsics_std not in (None, ExtrinsicsStd())
-    if not uncertain:
-        posterior = resolve_touches(posterior, touches, log_prior, effort)
-    if not effort.modes:
-        return posterior
     views = [
         SensorView(
             mode_refiner,
@@ -185,6 +182,14 @@ def fused_posterior(
         )
         for touch, mode_refiner in zip(touches, mode_refiners, strict=True)
     ]
+    register = None
+    if effort.several and not any(view.has_height for view in views):
+        register = mode_refiners[posterior.provenance.base].registering(
+            posterior.index, joint_problem(views, _ROUGH_POINTS)
+        )
+    posterior = resolve_touches(posterior, touches, log_prior, effort, extrinsics_std, register)
+    if not effort.modes:
+        return posterior
     with timed(timing, "refine"):
         if posterior.explored is not None:
             refiner = mode_refiners[posterior.provenance.base]

@@ -11,21 +11,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 from geomtact.contact_space.contact_maps import sample_pitch
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.explored import Explored
+from geomtact.inference.student import Student, log_volume
 from geomtact.inference.systematic_errors import random_errors
 from geomtact.se3 import Array, exp, inverse, log
 
 # These choose where the density is looked at: they change how precise a mass is, not what is estimated.
 _MODES = 5, 20  # that are weighed, at least and at most
 _ROUNDS, _DRAWS = 3, 150  # of poses, for each mode
-_WIDER = 1.6  # standard deviations of the draws over those of the poses before
-_TAIL = 5  # degrees of freedom of the draws, which are of Student's distribution
 _EFFECTIVE = 20  # draws that decide about the next round's, at least
-_KNOWN, _SAMPLES = 3, 0.5  # a covariance whose width is so many samples of the window counts as much as so many draws
+_SAMPLES = 0.5  # of the window: width of the covariance that is known before
 _POINTS = 128  # of the surface, for distances
 
 
@@ -59,7 +57,7 @@ def weighed(
         found = np.full(near.shape, -np.inf)
         particles = density.target.particles_at(T[near])
         log_density = density.of_exact(particles) + np.log(explored.index.uniform_density(T[near]))
-        log_density += _log_volume(turn[near], len(modes[0].basis) - 3)  # 0 or 1 turns, on a known face, give the same
+        log_density += log_volume(turn[near], len(modes[0].basis) - 3)  # 0 or 1 turns, on a known face, give the same
         found[near] = np.where(np.isfinite(particles.log_likelihood), log_density, -np.inf)
         for mode, each, log_densities in zip(modes, draws, found, strict=True):
             mode.add(each, log_densities)
@@ -102,7 +100,7 @@ def _modes(explored: Explored, hearts: Array, members: list[NDArray[np.int64]], 
             poses, weight = heart[None], np.ones(1)
         motions = log(inverse(heart) @ distance.aligned(heart, poses)) @ np.linalg.pinv(basis)
         least = np.where(basis[:, :3].any(1), pitch / explored.index.mesh.radius_rms, pitch)
-        modes.append(_Mode(heart, basis, least, [_Student.of(motions, weight, least)]))
+        modes.append(_Mode(heart, basis, least, [Student.of(motions, weight, least)]))
     return modes
 
 
@@ -115,14 +113,6 @@ def _is_nearest(distance: PoseDistance, heart: Array, T: Array) -> NDArray[np.bo
     if symmetry.axis is not None:  # a half turn swaps its ends
         return np.asarray((T[:, :3, :3] @ symmetry.axis) @ (heart[:3, :3] @ symmetry.axis) > 0)
     return np.asarray(np.abs(distance.aligned(heart, T) - T).max((1, 2)) < 1e-9)
-
-
-def _log_volume(turn: Array, axes: int) -> Array:
-    """Log (n,) of the uniform measure of a small volume of motions that turn by ``turn`` (n,) [rad], about some of so many
-    ``axes``, over that at no turn."""
-    half = np.sinc(turn / (2 * np.pi)) ** 2  # of the shifts
-    of_turns = {2: np.sinc(turn / np.pi), 3: half}.get(axes, np.ones_like(turn))
-    return np.asarray(np.log(np.maximum(half * of_turns, 1e-300)))
 
 
 def _grown(
@@ -174,7 +164,7 @@ class _Mode:
     heart: Array
     basis: Array
     least: Array
-    students: list[_Student]
+    students: list[Student]
     motions: list[Array] = field(default_factory=list)
     log_density: list[Array] = field(default_factory=list)
     log_integral: float = -np.inf
@@ -191,35 +181,7 @@ class _Mode:
         log_weight = np.concatenate(self.log_density) - density
         self.log_integral = _log_mean(log_weight)
         weight = _flattened(log_weight)
-        self.students.append(_Student.of(drawn, weight, self.least) if weight.any() else self.students[-1])
-
-
-@dataclass(frozen=True, eq=False)
-class _Student:
-    """Student's distribution about ``mean`` (d,) with a triangular ``root`` (d, d) of its scale matrix."""
-
-    mean: Array
-    root: Array
-
-    @classmethod
-    def of(cls, motions: Array, weight: Array, least: Array) -> _Student:
-        """That of ``motions`` (n, d) of some ``weight`` (n,), and wider."""
-        weight = weight / weight.sum()
-        mean = weight @ motions
-        n = 1 / float(weight @ weight)
-        spread = ((motions - mean) * weight[:, None]).T @ (motions - mean)
-        root = np.linalg.cholesky((n * spread + _KNOWN * np.diag(least**2)) / (n + _KNOWN))
-        return cls(mean, np.asarray(_WIDER * root, float))
-
-    def draw(self, n: int, rng: np.random.Generator) -> Array:
-        stretch = np.sqrt(_TAIL / rng.chisquare(_TAIL, (n, 1)))
-        return np.asarray(self.mean + stretch * (rng.normal(size=(n, len(self.mean))) @ self.root.T))
-
-    def log_density(self, motions: Array) -> Array:
-        d = len(self.mean)
-        off = np.square(np.linalg.solve(self.root, (motions - self.mean).T)).sum(0)
-        scale = gammaln((_TAIL + d) / 2) - gammaln(_TAIL / 2) - 0.5 * d * np.log(_TAIL * np.pi)
-        return np.asarray(scale - np.log(np.diag(self.root)).sum() - 0.5 * (_TAIL + d) * np.log1p(off / _TAIL), float)
+        self.students.append(Student.of(drawn, weight, self.least) if weight.any() else self.students[-1])
 
 
 def _log_mean(log_weight: Array) -> float:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +52,10 @@ class ModeRefiner:
         spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
         filterreg, icp = FilterReg(self.surface, spread), Icp(self.surface, spread)
         return [filterreg, icp] if thorough else [filterreg]
+
+    def registering(self, index: Index, problem: Problem) -> Callable[[Array], Refinement]:
+        """What registers poses (n, 4, 4) to all contacts of ``problem``."""
+        return partial(self.refiners(index, thorough=False)[0].refine, problem)
 
     def refine(self, posterior: Posterior, contact: Contact, k: int, thorough: bool = True) -> Posterior:
         """``posterior`` with its ``k`` leading modes refined against the observed ``contact``, and reweighted.

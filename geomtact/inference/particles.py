@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geomtact.contact_space.cell_transfer import MISSED_CONTACT_SHARE
+from geomtact.contact_space.cell_transfer import MISSED_CONTACT_SHARE, ExtrinsicsStd
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
-from geomtact.inference.systematic_errors import displaced, errors_of, undisplaced
+from geomtact.inference.systematic_errors import ERRORS, displaced, errors_of, stand_of, undisplaced
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
-from geomtact.se3 import Array, transform
+from geomtact.se3 import Array, inverse, transform
 
 SURE = POWERS[1]  # of the likelihood: from this power on, no pose may miss a sensor that shows contact
 _MISS = 2.5e7  # nats/m^2 of a distance by which a pose misses: where poses are drawn depends on it, not how probable they are
@@ -40,8 +40,8 @@ class Particles:
     missed : (n,) whether another sensor that shows contact is not touched, or too deeply
     draw : (n,) from which draw of the sampler each comes
     by_sensor : (n, S) log likelihood by each of S sensors, the first one first; S is 0 where there is one sensor alone
-    errors : (n, S, 4) of the contact on each, by the shares of all errors that are smaller (see ``systematic_errors``); those of
-        one sensor alone do not matter here
+    errors : (n, S, ERRORS) of the contact on each, by the shares of all errors that are smaller (see ``systematic_errors``);
+        those of one sensor alone do not matter here
     """
 
     poses: Placements
@@ -95,17 +95,20 @@ class OtherSensor:
     ----------
     index, query : all touches of the object on it, and the observed contact, or that there is none
     T_sensor_first : (4, 4) of the first sensor in its frame
+    extrinsics_std : uncertainty of that pose; None where it is not stated
     """
 
     index: Index
     query: ContactQuery
     T_sensor_first: Array
+    extrinsics_std: ExtrinsicsStd | None = None
 
-    def log_likelihood(self, T: Array, errors: Array) -> tuple[Array, Array]:
-        """Log likelihood (n,) of what it shows, with the object at ``T`` (n, 4, 4) in the first sensor's frame and ``errors``
-        (n, 4) of the contact; and by how much a contact that it shows is missed (n,) [m]."""
+    def log_likelihood(self, T: Array, errors: Array, stand: Array) -> tuple[Array, Array]:
+        """Log likelihood (n,) of what it shows, with the object at ``T`` (n, 4, 4) in the first sensor's frame, ``errors`` (n, 4)
+        of the contact and the sensor moved by ``stand`` (n, 4, 4); and by how much a contact that it shows is missed (n,) [m]."""
         query, sensor = self.query, self.index.sensor
-        T = shifted(self.T_sensor_first @ T, self.index.mesh.centre, lambda c: undisplaced(c, errors, query.centroid))
+        T = inverse(stand) @ self.T_sensor_first @ T
+        T = shifted(T, self.index.mesh.centre, lambda c: undisplaced(c, errors, query.centroid))
         poses, membrane = located(self.index, T)
         cut = ContactMaps.of(self.index).compare(query.samples, query.area, poses, membrane)
         depth = np.where(np.isfinite(cut.reach), cut.reach - membrane, -_FARTHEST)
@@ -166,11 +169,11 @@ class Target:
         errors: Array | None = None,
     ) -> Particles:
         """n poses as particles, the membrane's apex ``membrane`` (n,) beyond their centre or ``depth`` (n,) deep, with ``errors``
-        (n, S, 4) of the contacts as of :class:`Particles`, by default none. Those that do not touch the first sensor or press too
-        deep have no likelihood; see :meth:`admits`."""
+        (n, S, ERRORS) of the contacts as of :class:`Particles`, by default none. Those that do not touch the first sensor or
+        press too deep have no likelihood; see :meth:`admits`."""
         n = len(poses.reach)
         if errors is None:
-            errors = np.full((n, self.carried, 4), 0.5)
+            errors = np.full((n, self.carried, ERRORS), 0.5)
         cut = ContactMaps.of(self.index).compare(self.query.samples, self.query.area, poses, membrane, depth)
         found = replace(poses, reach=cut.reach.astype(float))
         if depth is None:
@@ -187,7 +190,9 @@ class Target:
             T = poses_of(found, depth, self.index.mesh.centre)[ok]
             T = self.displaced(T, errors_of(errors[ok, 0]))
             for number, other in enumerate(self.others, 1):
-                its, by = other.log_likelihood(T, errors_of(errors[ok, number]))
+                its, by = other.log_likelihood(
+                    T, errors_of(errors[ok, number]), stand_of(errors[ok, number], other.extrinsics_std)
+                )
                 by_sensor[ok, number] = its
                 log_likelihood[ok] += its - _MISS * by**2
                 missed[ok] |= by > 0

@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.errors import InputError
 from geomtact.inference.distribution import cell_densities
 from geomtact.inference.effort import Effort
 from geomtact.inference.particles import OtherSensor
 from geomtact.inference.posterior import Posterior
+from geomtact.inference.registered import Register
 from geomtact.inference.timing import timed
 from geomtact.inference.two_runs import explore_twice
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
@@ -36,13 +38,18 @@ def resolve_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer
 
 
 def resolve_touches(
-    posterior: Posterior, touches: Sequence[Posterior], log_prior: LogMass, effort: Effort
+    posterior: Posterior,
+    touches: Sequence[Posterior],
+    log_prior: LogMass,
+    effort: Effort,
+    extrinsics_std: ExtrinsicsStd | None = None,
+    register: Register | None = None,
 ) -> Posterior:
     """The ``posterior`` of several sensors' masks, resolved within the cells of the first with contact.
 
     It is as it was with depths. ``touches`` and ``log_prior`` are as of ``fusion.fused_posterior``.
     """
-    return _resolved(posterior, touches, None, log_prior, effort)
+    return _resolved(posterior, touches, None, log_prior, effort, extrinsics_std, register)
 
 
 def _can_resolve(touches: Sequence[Posterior], effort: Effort) -> bool:
@@ -52,7 +59,13 @@ def _can_resolve(touches: Sequence[Posterior], effort: Effort) -> bool:
 
 
 def _resolved(
-    posterior: Posterior, touches: Sequence[Posterior], coarse: Array | None, log_prior: LogMass, effort: Effort
+    posterior: Posterior,
+    touches: Sequence[Posterior],
+    coarse: Array | None,
+    log_prior: LogMass,
+    effort: Effort,
+    extrinsics_std: ExtrinsicsStd | None = None,
+    register: Register | None = None,
 ) -> Posterior:
     """``coarse`` (n,) is the mass of the places without the prior, by default that of ``posterior``, divided by the prior."""
     if not _can_resolve(touches, effort):
@@ -68,18 +81,20 @@ def _resolved(
             coarse = (density.reshape(index.weight.shape) * index.weight).sum(0, dtype=float)
         first = next(touch for touch in touches if touch.contact)
         others = [
-            OtherSensor(touch.index, _query(touch), inverse(touch.T_frame_sensor) @ first.T_frame_sensor)
+            OtherSensor(
+                touch.index, _query(touch), inverse(touch.T_frame_sensor) @ first.T_frame_sensor, extrinsics_std
+            )
             for touch in touches
             if touch is not first
         ]
         rng = np.random.default_rng(posterior.seed)
         try:
             contacts = effort.several if others else effort.contacts
-            explored = explore_twice(index, _query(first), coarse, contacts, rng, prior, others)
+            explored = explore_twice(index, _query(first), coarse, contacts, rng, prior, others, register)
         except InputError as error:
             warning = f"the pose is not resolved within the grid's cells: {error}"
             return replace(posterior, warnings=[*posterior.warnings, warning])
-    power = POWERS[len(explored.density.log_evidence) - 1] / POWERS[-1]
+    power = explored.density.powers[-1] / POWERS[-1]
     diagnostics = replace(posterior.diagnostics, settled_power=power, unexplained_nats=explored.unexplained_nats)
     return replace(posterior, explored=explored, diagnostics=diagnostics)
 

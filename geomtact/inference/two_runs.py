@@ -8,7 +8,6 @@ out.
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -21,18 +20,21 @@ from geomtact.inference.explored import Explored
 from geomtact.inference.facts import UNEXPLAINED_NATS
 from geomtact.inference.mode_mass import counted, weighed
 from geomtact.inference.particles import OtherSensor, Particles
-from geomtact.inference.sampler import Run, explore, systematic
-from geomtact.inference.systematic_errors import NODES, random_errors
+from geomtact.inference.population import systematic
+from geomtact.inference.registered import Register
+from geomtact.inference.sampler import Run, explore
+from geomtact.inference.systematic_errors import NODES, NODES_BESIDE, random_errors
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
-_POSES, _FOR_EACH = (300, 600), 20  # poses that are kept in the end, at least and at most, and contacts for each
+# poses that are kept in the end, at least, which is as many as with several sensors, and at most; and contacts for each
+_POSES, _FOR_EACH = (300, 600), 20
 # nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
 # believed; hand-set
 _AGREE = 1.0
 _MORE = 4  # times as many contacts are cut in each attempt after the first
 _LEFT_OUT = 3  # powers that an attempt may leave out, before the last
-_SHARPEST = 100  # poses beside these from which modes may grow
+_SHARPEST = 100, 40  # poses beside these from which modes may grow, of one sensor and of several
 _WEIGHING = 0.5  # contacts that weigh the modes, for each that finds them
 
 
@@ -44,6 +46,7 @@ def explore_twice(
     rng: np.random.Generator,
     log_prior: NDArray[np.floating] | None = None,
     others: Sequence[OtherSensor] = (),
+    register: Register | None = None,
 ) -> Explored:
     """The distribution of the pose with its modes, by two runs that share a sixteenth of the ``contacts`` of each sensor, or a
     quarter where there are several, and have to agree on the evidence; arguments as of :func:`explore`.
@@ -60,21 +63,22 @@ def explore_twice(
     cut = 0
     attempts = (contacts // _MORE, contacts) if others else (contacts // _MORE**2, contacts // _MORE, contacts)
     for asked in attempts:
-        one, other = explore(index, query, coarse, asked // 2, rng, log_prior, others, runs=2)
+        one, other = explore(index, query, coarse, asked // 2, rng, log_prior, others, 2, register)
         cut += one.contacts + other.contacts
         unexplained = _unexplained(one, other) if others else None
         if unexplained is not None and unexplained > UNEXPLAINED_NATS:
             continue
-        all_powers = len(one.log_evidence)
-        least = 2 if asked == attempts[-1] else max(len(POWERS) - _LEFT_OUT, 2)
-        for powers in range(all_powers, least - 1, -1):
-            run = replace(pooled(one, other, powers, rng), contacts=cut)
-            apart = float(run.density.weights @ np.abs(np.subtract(one.log_evidence, other.log_evidence)[:powers]))
-            if apart < _AGREE * run.density.target.sensors:
-                found = _explored_from(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
+        least = 0 if asked == attempts[-1] else POWERS[len(POWERS) - _LEFT_OUT - 1]
+        for last in range(len(one.log_evidence) - 1, 0, -1):
+            if one.density.powers[last] < least:
+                break
+            run = replace(pooled(one, other, last, rng), contacts=cut)
+            apart = np.abs(np.subtract(one.log_evidence, other.log_evidence))[_kept(one, last)]
+            if run.density.weights @ apart < _AGREE * run.density.target.sensors:
+                found = _explored_from(run, _POSES[0] if others else int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
                 further = _sharpest(one, other)
                 if others:
-                    found = counted(found, further, _draws_left(one, powers) + _draws_left(other, powers))
+                    found = counted(found, further, _draws_left(one, last) + _draws_left(other, last))
                     return replace(found, unexplained_nats=unexplained)
                 found, log_sum = weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
                 if log_sum < 0:
@@ -85,12 +89,18 @@ def explore_twice(
     )
 
 
-def pooled(one: Run, other: Run, powers: int, rng: np.random.Generator) -> Run:
-    """Two runs as one: of each posterior by the smallest ``powers`` the particles of both, of one sensor by how likely each run
+def _kept(run: Run, last: int) -> list[int]:
+    """Which stops of the sampler are kept, if ``last`` is the last: those before it are of ``POWERS``."""
+    return [stop for stop in range(last) if run.density.powers[stop] in POWERS] + [last]
+
+
+def pooled(one: Run, other: Run, last: int, rng: np.random.Generator) -> Run:
+    """Two runs as one, up to the ``last`` stop: of each posterior the particles of both, of one sensor by how likely each run
     makes the contact. With several sensors that is mostly chance, where runs agree, and both count alike."""
-    particles, evidence = [], []
-    each = zip(one.particles, other.particles, one.log_evidence, other.log_evidence, strict=True)
-    for first, second, a, b in itertools.islice(each, powers):
+    particles, evidence, kept = [], [], _kept(one, last)
+    for stop in kept:
+        first, second = one.particles[stop], other.particles[stop]
+        a, b = one.log_evidence[stop], other.log_evidence[stop]
         evidence.append(float(np.logaddexp(a, b) - np.log(2)))
         share, n = float(np.exp(a - np.logaddexp(a, b))), len(first) + len(second)
         if one.density.target.others:
@@ -99,7 +109,8 @@ def pooled(one: Run, other: Run, powers: int, rng: np.random.Generator) -> Run:
         of_second = systematic(np.ones(len(second)), n - round(share * n), rng)
         particles.append(first.take(of_first).joined(second.take(of_second)))
     measure = float(np.logaddexp(one.log_measure, other.log_measure) - np.log(2))
-    density = replace(one.density, log_evidence=tuple(evidence))
+    powers = tuple(one.density.powers[stop] for stop in kept)
+    density = replace(one.density, log_evidence=tuple(evidence), powers=powers)
     return replace(one, density=density, particles=tuple(particles), log_measure=measure)
 
 
@@ -122,7 +133,8 @@ def _explored_from(run: Run, n: int, rng: np.random.Generator) -> Explored:
     if not len(inside):
         raise InputError(f"{target.index.mesh.name}: no pose that was found touches the sensor; allow more contacts")
     density = replace(density, log_inside=float(np.log(len(inside) / len(each))))
-    contacts = run.contacts + target.sensors * (len(each) + NODES * len(inside))
+    averaged = NODES + (target.sensors - 1) * NODES_BESIDE
+    contacts = run.contacts + target.sensors * len(each) + averaged * len(inside)
     T = T[inside]
     return Explored(density, T, moved.depth[inside], density.log_density(T), contacts)
 
@@ -130,14 +142,14 @@ def _explored_from(run: Run, n: int, rng: np.random.Generator) -> Explored:
 def _sharpest(one: Run, other: Run) -> Array:
     """The poses (n, 4, 4) that explain the contacts best, of those that two runs found by the largest power."""
     target, found = one.density.target, one.particles[-1].joined(other.particles[-1])
-    best = np.argsort(-found.log_target(POWERS[len(one.log_evidence) - 1]), kind="stable")[:_SHARPEST]
+    best = np.argsort(-found.log_target(one.density.powers[-1]), kind="stable")[: _SHARPEST[bool(target.others)]]
     T = target.poses(found.take(best))
     return np.asarray(T[np.isfinite(target.particles_at(T).log_target(0))])
 
 
-def _draws_left(run: Run, powers: int) -> float:
-    """From how many draws, if all had as many, the particles by the last of so many ``powers`` come."""
-    count = np.unique(run.particles[powers - 1].draw, return_counts=True)[1]
+def _draws_left(run: Run, last: int) -> float:
+    """From how many draws, if all had as many, the particles at the ``last`` stop come."""
+    count = np.unique(run.particles[last].draw, return_counts=True)[1]
     return float(count.sum() ** 2 / np.square(count).sum())
 
 

@@ -1,0 +1,157 @@
+"""Poses of several sensors drawn about those that registration finds, and led from there to the posterior.
+
+Few poses that are drawn in cells lie near the mode, the fewer the more sensors there are. But registration to all contacts moves
+many of them there. It says nothing about how probable a mode is. So poses are drawn about those that it found, from a
+distribution whose density is known, and go step by step from there to the posterior. That gives the evidence again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+from scipy.special import expit
+
+from geomtact.contact_space.contact_maps import located, sample_pitch
+from geomtact.geometry.distance import PoseDistance
+from geomtact.inference.particles import Particles, Target, poses_of
+from geomtact.inference.population import Population, effective
+from geomtact.inference.student import Student, log_volume
+from geomtact.inference.systematic_errors import ERRORS
+from geomtact.registration.protocol import Refinement
+from geomtact.se3 import Array, exp, inverse, log
+
+Register = Callable[[Array], Refinement]  # poses (n, 4, 4) in the first sensor's frame to all contacts
+
+# All choose where poses are drawn: they change how precise the evidence is, not what is estimated.
+_STARTS = 128  # poses that are registered
+_MODES = 12  # about which poses are drawn, at most
+_APART = 2e-3  # m: mean distance by which two modes differ, at least
+_WIDER = 3.0  # standard deviations of the draws over those of registration, whose likelihood is sharper
+_DRAWS = 4  # for each pose that is kept
+_SHARES = np.linspace(0.02, 1, 50)  # of the way to the posterior, that the first step may have
+
+
+@dataclass(frozen=True, eq=False)
+class AboutModes:
+    """An even mixture of Student's distributions of motions from some poses.
+
+    Attributes
+    ----------
+    target : what decides about poses
+    hearts : (m, 4, 4)
+    bases : m arrays (d, 6) that motions are along
+    students : of their coordinates
+    """
+
+    target: Target
+    hearts: Array
+    bases: list[Array]
+    students: list[Student]
+
+    @classmethod
+    def of(cls, target: Target, refinement: Refinement) -> AboutModes | None:
+        """About the likeliest of the poses that registration found; None if all miss a sensor."""
+        found = target.particles_at(refinement.T)
+        likely = np.where(found.missed, -np.inf, found.log_likelihood)
+        distance = PoseDistance(target.index.mesh)
+        order = [row for row in np.argsort(-likely, kind="stable") if np.isfinite(likely[row])]
+        rows: list[int] = []
+        for row in order:
+            if len(rows) < _MODES and not distance.within(refinement.T[row], refinement.T[rows], _APART).any():
+                rows.append(int(row))
+        if not rows:
+            return None
+        hearts = refinement.T[rows]
+        bases = [target.index.directions.motions(heart[:3, :3]) for heart in hearts]
+        pitch = sample_pitch(target.index.sensor)
+        least = np.repeat([pitch / target.index.mesh.radius_rms, pitch], 3)
+        students = []
+        for basis, covariance in zip(bases, refinement.covariance[rows], strict=True):
+            along = np.linalg.pinv(basis)
+            scale = along.T @ (_WIDER**2 * covariance + np.diag(least**2)) @ along
+            students.append(Student(np.zeros(len(basis)), np.linalg.cholesky(scale)))
+        return cls(target, hearts, bases, students)
+
+    @cached_property
+    def _distance(self) -> PoseDistance:
+        return PoseDistance(self.target.index.mesh)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """Poses (n, 4, 4) without errors."""
+        of, out = rng.integers(len(self.hearts), size=n), np.empty((n, 4, 4))
+        for mode, (heart, basis, student) in enumerate(zip(self.hearts, self.bases, self.students, strict=True)):
+            some = np.flatnonzero(of == mode)
+            out[some] = heart @ exp(student.draw(len(some), rng) @ basis)
+        return out
+
+    def log_density(self, particles: Particles) -> Array:
+        """Log density (n,) at ``particles`` (n,), relative to the uniform."""
+        T = poses_of(particles.poses, particles.depth, self.target.index.mesh.centre)
+        aligned = np.stack([inverse(heart) @ self._distance.aligned(heart, T) for heart in self.hearts])
+        each = []
+        for xi, basis, student in zip(log(aligned), self.bases, self.students, strict=True):
+            x = xi @ np.linalg.pinv(basis)
+            turn = np.linalg.norm(x[:, :-3], axis=1)
+            each.append(student.log_density(x) - log_volume(turn, len(basis) - 3))
+        uniform = np.log(self.target.index.uniform_density(T))
+        return np.asarray(np.logaddexp.reduce(each, 0) - np.log(len(each)) - uniform)
+
+
+def bridged(about: AboutModes, power: float, runs: int, n: int, rng: np.random.Generator) -> Population | None:
+    """``n`` poses for each run from the posterior by that ``power`` of the likelihood, and its evidence; None where none that
+    were drawn touch all sensors."""
+    target = about.target
+    m = _DRAWS * n * runs
+    poses, membrane = located(target.index, about.draw(m, rng))
+    particles = target.admitted(target.evaluated(poses, membrane, errors=rng.random((m, target.carried, ERRORS))))
+
+    def change(particles: Particles) -> Array:
+        return particles.log_target(power) - about.log_density(particles)
+
+    def between(share: float, particles: Particles) -> Array:
+        return (1 - share) * about.log_density(particles) + share * particles.log_target(power)
+
+    population = Population(target, rng, particles, np.zeros(runs), contacts=m * target.sensors)
+    log_weight = np.where(particles.missed, -np.inf, change(particles))
+    each = log_weight.reshape(runs, -1)
+    if not np.isfinite(each).any(1).all():
+        return None
+    enough = [share for share in _SHARES if (effective(share * each) >= n).all()]
+    share = float(enough[-1] if enough else _SHARES[0])
+    population.choose(share * log_weight, n)
+    while True:
+        population.move(partial(between, share))
+        if share >= 1:
+            return population
+        share = min(share + population.reweigh(change(population.particles), 1 - share), 1.0)
+
+
+def starts(target: Target, found: Sequence[Particles], rng: np.random.Generator) -> Array:
+    """Poses (s, 4, 4) to register, as many of each of the ``found``."""
+    some = [each.take(rng.permutation(len(each))[: _STARTS // len(found)]) for each in found]
+    return np.concatenate([target.poses(each) for each in some])
+
+
+def united(one: Population | None, other: Population | None) -> Population | None:
+    """Two populations of one distribution, each of which may have missed what the other found: by how much of it they found."""
+    if one is None or other is None:
+        return one or other
+    share = expit(other.log_evidence - one.log_evidence)
+    rows, rng = [], one.rng
+    n = len(one.particles) // one.runs
+    for run, each in enumerate(share):
+        of = rng.random(n) < each
+        rows.append(np.where(of, len(one.particles), 0) + run * n + np.arange(n))
+    out = Population(
+        one.target,
+        rng,
+        one.particles.joined(other.particles).take(np.concatenate(rows)),
+        np.maximum(one.log_evidence, other.log_evidence),
+        one.size,
+        one.contacts + other.contacts,
+    )
+    out.best = np.maximum(one.best, other.best)
+    return out
