@@ -97,8 +97,8 @@ def test_poses_that_miss_a_sensor_are_possible_by_the_cells_alone(posterior):
 
 
 def test_the_mean_over_errors_is_that_over_random_ones(posterior):
-    """The density at a pose averages over errors of the second contact at 128 nodes. Where hardly any of these suit, it is too low;
-    of the poses that do not belong to the coarse posterior alone, hardly ever by more than 2 nats."""
+    """The density at a pose averages over errors of the second contact at 128 nodes. Where hardly any of these suit, it is too
+    low; hardly ever by more than 2 nats."""
     density = posterior.explored.density
     target, T = density.target, posterior.explored.poses[:20]
     k, rng, n, off = len(density.powers) - 1, np.random.default_rng(0), 4000, []

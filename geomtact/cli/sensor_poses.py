@@ -25,12 +25,12 @@ class SensorPoses:
     ----------
     T_world_sensor : (n, 4, 4), one for each image
     sensor : n names or TOML files, where they are given
-    extrinsics_std : the uncertainty of the poses
+    extrinsics_std : the uncertainty of the poses; None where the file does not state it
     """
 
     T_world_sensor: Array
     sensor: list[str] | None
-    extrinsics_std: ExtrinsicsStd
+    extrinsics_std: ExtrinsicsStd | None
 
 
 def read_sensor_poses(path: Path, images: int) -> SensorPoses:
@@ -76,7 +76,7 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
     if names is not None and (not isinstance(names, list) or len(names) != images):
         got = str(len(names) if isinstance(names, list) else names)
         raise InputError(f"--sensor-poses {path}: sensor must list a name or TOML file for each of {images}, got {got}")
-    std = {key: content.get(key, 0.0) for key in ("std_mm", "std_deg")}
+    std = {key: content[key] for key in ("std_mm", "std_deg") if key in content}
     for key, value in std.items():
         if not (is_number(value) and value >= 0):
             raise InputError(f"--sensor-poses {path}: {key} must be a finite number >= 0, got {value!r}")
@@ -86,7 +86,7 @@ def read_sensor_poses(path: Path, images: int) -> SensorPoses:
     return SensorPoses(
         T,
         None if names is None else [_beside(path, name) for name in names],
-        ExtrinsicsStd(float(np.radians(std["std_deg"])), 1e-3 * std["std_mm"]),
+        ExtrinsicsStd(float(np.radians(std.get("std_deg", 0.0))), 1e-3 * std.get("std_mm", 0.0)) if std else None,
     )
 
 
