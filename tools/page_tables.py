@@ -294,7 +294,6 @@ TABLES = [
     *(("speed-accuracy", f"The {PARTS[part]}:", partial(ways, part), "choices") for part in PARTS),
     ("speed-accuracy", "| gain [nats] /", sides, "choices"),
     ("several-sensors", "| object |", touches, "touches"),
-    ("adaptive", "| object | sensors |", touches, "touches-exact"),
     ("several-sensors", "| shown |", elsewhere_simulated, "triplets"),
     ("tracking", "| method |", followed, "track"),
     ("next-touch", "| object |", until_sure, "next_touch"),

@@ -81,10 +81,7 @@ def counted(explored: Explored, further: Array, draws: float) -> Explored:
     """
     mesh = explored.index.mesh
     hearts, members = _grown(explored, further, PoseDistance(mesh, _POINTS), mode_radius(mesh), _MODES[1])
-    free, mass = np.ones(len(explored.poses), bool), np.zeros(len(hearts))
-    for i, near in enumerate(members):
-        mass[i] = explored.weight[near[free[near]]].sum()
-        free[near] = False
+    mass = _shared_out(explored, members, np.array([explored.weight[rows].sum() for rows in members]))
     order = np.argsort(-mass, kind="stable")
     return replace(explored, hearts=hearts[order], masses=mass[order] * draws / (draws + 1))
 
