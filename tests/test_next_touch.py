@@ -18,7 +18,7 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.effort import Effort
 from geomtact.planning.actions import Probe, Touch
-from geomtact.planning.draws import draw_cells
+from geomtact.planning.draws import draw_places
 from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.next_touch import (
     LEAST,
@@ -298,7 +298,7 @@ def test_the_choice_does_not_depend_on_the_frame(plug, a_touch, posterior):
 
 def test_cells_are_drawn_by_their_probability(plug, posterior, rng):
     sharp = replace(posterior, cells=posterior.cells[:3], cell_log_prob=np.log([0.5, 0.5, 1e-12]))
-    T = draw_cells(sharp, 20, rng, 5)
+    T = draw_places(sharp, 20, rng, 5)
     assert T.shape == (5, 20, 4, 4)
     held = plug.index.lookup(T.reshape(-1, 4, 4), plug.space.penetration(T.reshape(-1, 4, 4)))
     assert set(held.reshape(5, 20)[0]) <= set(posterior.cells[:2])
@@ -312,7 +312,7 @@ def test_a_refined_cell_is_drawn_as_registration_left_it(plug, a_touch, n):
     cell = next(c for c, found in world.refined.items() if np.allclose(T_MOVED @ found.T, mode.T))
     row = np.flatnonzero(world.cells == cell)
     known = replace(world, cells=world.cells[row], cell_log_prob=np.zeros(1))
-    T = draw_cells(known, 2, np.random.default_rng(0), n)
+    T = draw_places(known, 2, np.random.default_rng(0), n)
     white = np.linalg.solve(np.linalg.cholesky(mode.covariance), log(inverse(mode.T) @ T).reshape(-1, 6).T)
     error = 1 / np.sqrt(2 * n)  # of a mean; of a variance it is sqrt 2 of that
     assert white.mean(1) == pytest.approx(np.zeros(6), abs=3.5 * error)
@@ -322,7 +322,7 @@ def test_a_refined_cell_is_drawn_as_registration_left_it(plug, a_touch, n):
 def test_touches_start_clear_of_the_object_and_meet_it(plug, posterior):
     touches = grid_of_touches(posterior)
     assert len(touches) >= 17
-    T = draw_cells(posterior, 32, np.random.default_rng(0), 2)
+    T = draw_places(posterior, 32, np.random.default_rng(0), 2)
     assert all(evaluate(plug.space, replace(t, travel=0.0), T).contact < 0.1 for t in touches[::4])
     assert np.mean([evaluate(plug.space, t, T).contact for t in touches[::4]]) > 0.5
     assert all(t.T_world_sensor[2, 2] < 0.1 for t in touches)  # none comes from the first sensor's side

@@ -48,8 +48,8 @@ def test_the_evidence_about_modes_is_that_of_the_posterior(localizer, scenes):
     off = []
     for scene in scenes:
         target, runs, register = target_of(localizer, scene, contacts=60_000)
-        starts = np.concatenate([target.poses(run.particles[-1])[:60] for run in runs])
-        about = AboutModes.of(target, register(starts))
+        some = runs[0].particles[-1].joined(runs[1].particles[-1])
+        about = AboutModes.of(target, some.take(np.arange(0, len(some), 3)), register)
         found = bridged(about, SURE, 2, 400, np.random.default_rng(1))
         at = runs[0].density.powers.index(SURE)
         off.append(found.log_evidence.mean() - np.mean([run.log_evidence[at] for run in runs]))
@@ -60,10 +60,10 @@ def test_the_evidence_about_modes_is_that_of_the_posterior(localizer, scenes):
 def test_draws_about_modes_have_their_density(localizer, scenes):
     """So the mean of one of them over another, from which poses are drawn, is 1 but for what cannot touch."""
     target, runs, register = target_of(localizer, scenes[0])
-    about = AboutModes.of(target, register(target.poses(runs[0].particles[-1])[:60]))
+    about = AboutModes.of(target, runs[0].particles[-1].take(np.arange(60)), register)
     assert len(about.hearts) <= 12
     rng = np.random.default_rng(0)
-    few = AboutModes(target, about.hearts[:1], about.bases[:1], about.students[:1])
+    few = AboutModes(target, about.hearts[:1], about.bases[:1], about.students[:1], about.led_to, about.origin)
     some = target.particles_at(about.draw(4000, rng))
     inside = np.isfinite(some.log_target(0))
     ratio = np.exp(few.log_density(some) - about.log_density(some))

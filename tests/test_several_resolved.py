@@ -14,7 +14,7 @@ from geomtact.inference import two_runs
 from geomtact.inference.effort import Effort
 from geomtact.inference.particles import SURE
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.systematic_errors import ERRORS, errors_of, stand_of
+from geomtact.inference.systematic_errors import ERRORS, stand_of
 from geomtact.localizer import Localizer
 from geomtact.scoring.contact_likelihood import mixture_weights
 
@@ -97,7 +97,7 @@ def test_poses_that_miss_a_sensor_are_possible_by_the_cells_alone(posterior):
 
 
 def test_the_mean_over_errors_is_that_over_random_ones(posterior):
-    """The density at a pose averages over errors of the second contact at 128 nodes. Where hardly any of these suit, it is too
+    """The density at a pose averages over errors of the second contact at 256 nodes. Where hardly any of these suit, it is too
     low; hardly ever by more than 2 nats."""
     density = posterior.explored.density
     target, T = density.target, posterior.explored.poses[:20]
@@ -106,9 +106,7 @@ def test_the_mean_over_errors_is_that_over_random_ones(posterior):
     more = (density.of_powers(T) - alone.of_powers(T))[:, k]
     for pose, expected in zip(T, more, strict=True):
         shares = rng.random((n, ERRORS))
-        likely, missed = target.others[0].log_likelihood(
-            np.repeat(pose[None], n, 0), errors_of(shares), stand_of(shares)
-        )
+        likely, missed = target.others[0].log_likelihood(np.repeat(pose[None], n, 0), stand_of(shares))
         value = np.where(missed > 0, -np.inf, density.powers[k] * likely)
         off.append(np.logaddexp.reduce(value) - np.log(n) - expected)
     assert np.median(np.abs(off)) < 1 and np.quantile(np.abs(off), 0.7) < 2
@@ -120,11 +118,11 @@ def test_a_sensor_without_contact_counts_against_poses_that_touch_it(localizer, 
     other = target.others[0]
     nothing = replace(other, query=other.query.showing(np.zeros_like(other.query.touched), localizer.sensor, "mask"))
     T = posterior.explored.poses[:50]
-    none = np.zeros((len(T), 4)), np.broadcast_to(np.eye(4), T.shape)
-    likely, missed = nothing.log_likelihood(T, *none)
+    right = np.broadcast_to(np.eye(4), T.shape)
+    likely, missed = nothing.log_likelihood(T, right)
     assert (likely < 0).mean() > 0.5 and not missed.any()
     far = replace(nothing, T_sensor_first=se3.transform(np.eye(3), [0, 0, 2.0]))
-    assert (far.log_likelihood(T, *none)[0] == 0).all()
+    assert (far.log_likelihood(T, right)[0] == 0).all()
 
 
 def test_the_better_sensor_poses_are_known_the_more_is_known(localizer, scenes):

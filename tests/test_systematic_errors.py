@@ -10,8 +10,10 @@ from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.inference.systematic_errors import (
     ERRORS,
     NODES,
+    NODES_BESIDE,
     displaced,
     nodes,
+    nodes_beside,
     random_errors,
     stand_of,
     undisplaced,
@@ -33,7 +35,7 @@ def test_errors_are_drawn_from_their_distribution():
 
 def test_nodes_have_the_distribution():
     """Shifts lie in the middle of every share of it, errors of the scale farther apart; their weights make up for that."""
-    errors, _, log_weight = nodes(NODES)
+    errors, log_weight = nodes()
     weight = np.exp(log_weight)
     assert weight.sum() == pytest.approx(1)
     for each in share(errors)[:, 1:].T:
@@ -45,19 +47,19 @@ def test_nodes_have_the_distribution():
 
 
 def test_sensors_stand_where_they_are_said_to_within_what_is_known_of_it():
-    """By the middle of all shares they stand right; stated uncertainties are those of normal distributions; without one, the
-    logarithm of the standard deviation is uniform from 0.2 to 3 mm and degrees."""
+    """By the middle of all shares they stand right; stated uncertainties are those of normal distributions, with 0.1 mm and
+    degrees of the contact's own; else the logarithm of the standard deviation is uniform from 0.2 to 3 mm and degrees."""
     np.testing.assert_array_equal(stand_of(np.full((1, ERRORS), 0.5)), np.eye(4)[None])
     shares = np.random.default_rng(0).random((20_000, ERRORS))
     stated = se3.log(stand_of(shares, ExtrinsicsStd(0.02, 1e-3)))
-    for each, std in zip(stated.T, [0.02] * 3 + [1e-3] * 3, strict=True):
+    for each, std in zip(stated.T, [np.hypot(0.02, np.deg2rad(0.1))] * 3 + [np.hypot(1e-3, 1e-4)] * 3, strict=True):
         assert kstest(each / std, "norm").pvalue > 1e-3
-    np.testing.assert_array_equal(stand_of(shares[:5], ExtrinsicsStd()), np.broadcast_to(np.eye(4), (5, 4, 4)))
-    shares[:, 5:] = ndtr(1.0)
+    shares[:, 1:] = ndtr(1.0)
     unknown = np.abs(se3.log(stand_of(shares)))
     low, high = unknown.min(0), unknown.max(0)
     np.testing.assert_allclose(low[3:], 0.2e-3, rtol=0.05)
     np.testing.assert_allclose(high[:3], np.deg2rad(3), rtol=0.05)
+    assert nodes_beside(None).shape == (NODES_BESIDE, 4, 4)
     assert kstest(np.log(unknown[:, 0] / low[0]) / np.log(high[0] / low[0]), "uniform").pvalue > 1e-3
 
 

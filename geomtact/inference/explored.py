@@ -18,7 +18,7 @@ from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
 from geomtact.inference.particles import OtherSensor, Particles, Target, prior_at, tempered
-from geomtact.inference.systematic_errors import NODES, NODES_BESIDE, nodes, undisplaced
+from geomtact.inference.systematic_errors import nodes, nodes_beside, undisplaced
 from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
 from geomtact.se3 import Array, check_pose, check_transforms
 
@@ -88,7 +88,7 @@ class Density:
     def _of_powers(self, T: Array) -> Array:
         index, query, n = self.index, self.target.query, len(T)
         poses, membrane = located(index, T)
-        errors, _, log_weight = nodes(NODES)
+        errors, log_weight = nodes()
         centre = undisplaced(np.column_stack([poses.centre, membrane])[:, None], errors, query.centroid)
         flat, rows = centre.reshape(-1, 3), np.repeat(np.arange(n), len(errors))
         place = index.place_of(index.rotation[poses.place[rows]].astype(np.int64), flat)
@@ -102,12 +102,10 @@ class Density:
         out = np.asarray(np.logaddexp.reduce(each, 1))
         powers = np.array(self.powers)[self._sure]
         for other in self.target.others:
-            errors, stand, log_weight = nodes(NODES_BESIDE, other.extrinsics_std)
-            found, missed = other.log_likelihood(
-                np.repeat(T, len(errors), 0), np.tile(errors, (n, 1)), np.tile(stand, (n, 1, 1))
-            )
-            found = np.where(missed > 0, -np.inf, found).reshape(n, len(errors), 1)
-            out[:, self._sure] += np.logaddexp.reduce(powers * found + log_weight[:, None], 1)
+            stand = nodes_beside(other.extrinsics_std)
+            found, missed = other.log_likelihood(np.repeat(T, len(stand), 0), np.tile(stand, (n, 1, 1)))
+            found = np.where(missed > 0, -np.inf, found).reshape(n, len(stand), 1)
+            out[:, self._sure] += np.logaddexp.reduce(powers * found, 1) - np.log(len(stand))
         return out
 
 

@@ -72,15 +72,25 @@ def weighed(
     return replace(explored, hearts=hearts[order], masses=mass[order], contacts=contacts), log_sum
 
 
-def counted(explored: Explored, further: Array, draws: float) -> Explored:
+def counted(
+    explored: Explored, further: Array, draws: float, led_to: tuple[Array, NDArray[np.int64]] | None = None
+) -> Explored:
     """``explored``, of several sensors, with its leading modes; ``further`` is as of :func:`weighed`.
 
     The mass of a mode is the share of the poses near it: of several contacts there are few modes, and an integral about one would
-    be over the errors of all contacts too. All poses come from so many independent ``draws``: one more would have found a mode
-    that was missed with a probability of 1 / (draws + 1) (the rule of succession), which is left out.
+    be over the errors of all contacts too. All poses come from so many independent ``draws``, or registration was ``led_to``
+    their modes, poses (r, 4, 4), from more (r,): one more would have found a mode that was missed with a probability of
+    1 / (draws + 1) (the rule of succession), which is left out.
     """
     mesh = explored.index.mesh
-    hearts, members = _grown(explored, further, PoseDistance(mesh, _POINTS), mode_radius(mesh), _MODES[1])
+    distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
+    hearts, members = _grown(explored, further, distance, radius, _MODES[1])
+    if led_to is not None:
+        T, origin = led_to
+        near = np.stack(
+            [distance.within(heart, T, radius) for heart, rows in zip(hearts, members, strict=True) if len(rows)]
+        )
+        draws = max(draws, len(np.unique(origin[near.any(0)])))
     mass = _shared_out(explored, members, np.array([explored.weight[rows].sum() for rows in members]))
     order = np.argsort(-mass, kind="stable")
     return replace(explored, hearts=hearts[order], masses=mass[order] * draws / (draws + 1))

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.contact_space.cell_transfer import MISSED_CONTACT_SHARE, ExtrinsicsStd
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
-from geomtact.inference.systematic_errors import ERRORS, displaced, errors_of, stand_of, undisplaced
+from geomtact.inference.systematic_errors import ERRORS, displaced, errors_of, stand_of
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
 from geomtact.se3 import Array, inverse, transform
 
@@ -103,13 +103,11 @@ class OtherSensor:
     T_sensor_first: Array
     extrinsics_std: ExtrinsicsStd | None = None
 
-    def log_likelihood(self, T: Array, errors: Array, stand: Array) -> tuple[Array, Array]:
-        """Log likelihood (n,) of what it shows, with the object at ``T`` (n, 4, 4) in the first sensor's frame, ``errors`` (n, 4)
-        of the contact and the sensor moved by ``stand`` (n, 4, 4); and by how much a contact that it shows is missed (n,) [m]."""
+    def log_likelihood(self, T: Array, stand: Array) -> tuple[Array, Array]:
+        """Log likelihood (n,) of what it shows, with the object at ``T`` (n, 4, 4) in the first sensor's frame and this one moved
+        by ``stand`` (n, 4, 4); and by how much a contact that it shows is missed (n,) [m]."""
         query, sensor = self.query, self.index.sensor
-        T = inverse(stand) @ self.T_sensor_first @ T
-        T = shifted(T, self.index.mesh.centre, lambda c: undisplaced(c, errors, query.centroid))
-        poses, membrane = located(self.index, T)
+        poses, membrane = located(self.index, inverse(stand) @ self.T_sensor_first @ T)
         cut = ContactMaps.of(self.index).compare(query.samples, query.area, poses, membrane)
         depth = np.where(np.isfinite(cut.reach), cut.reach - membrane, -_FARTHEST)
         if not query.touched.any():
@@ -190,9 +188,7 @@ class Target:
             T = poses_of(found, depth, self.index.mesh.centre)[ok]
             T = self.displaced(T, errors_of(errors[ok, 0]))
             for number, other in enumerate(self.others, 1):
-                its, by = other.log_likelihood(
-                    T, errors_of(errors[ok, number]), stand_of(errors[ok, number], other.extrinsics_std)
-                )
+                its, by = other.log_likelihood(T, stand_of(errors[ok, number], other.extrinsics_std))
                 by_sensor[ok, number] = its
                 log_likelihood[ok] += its - _MISS * by**2
                 missed[ok] |= by > 0

@@ -85,6 +85,7 @@ class Population:
         if missed.reshape(self.runs, -1).all(1).any():
             return None
         out = replace(self)
+        out.best = self.best
         out.choose(np.where(missed, -np.inf, 0.0))
         return out
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import expit
 
 from geomtact.contact_space.contact_maps import located, sample_pitch
@@ -26,7 +27,7 @@ from geomtact.se3 import Array, exp, inverse, log
 Register = Callable[[Array], Refinement]  # poses (n, 4, 4) in the first sensor's frame to all contacts
 
 # All choose where poses are drawn: they change how precise the evidence is, not what is estimated.
-_STARTS = 128  # poses that are registered
+_STARTS = 256  # poses that are registered
 _MODES = 12  # about which poses are drawn, at most
 _APART = 2e-3  # m: mean distance by which two modes differ, at least
 _WIDER = 3.0  # standard deviations of the draws over those of registration, whose likelihood is sharper
@@ -44,23 +45,32 @@ class AboutModes:
     hearts : (m, 4, 4)
     bases : m arrays (d, 6) that motions are along
     students : of their coordinates
+    led_to : poses (r, 4, 4) to which registration moved some, of those that touch all sensors
+    origin : (r,) from which draws of the sampler these came
     """
 
     target: Target
     hearts: Array
     bases: list[Array]
     students: list[Student]
+    led_to: Array
+    origin: NDArray[np.int64]
 
     @classmethod
-    def of(cls, target: Target, refinement: Refinement) -> AboutModes | None:
-        """About the likeliest of the poses that registration found; None if all miss a sensor."""
+    def of(cls, target: Target, seen: Particles, register: Register) -> AboutModes | None:
+        """About the likeliest of the poses to which registration moves those ``seen``; None if all miss a sensor."""
+        refinement = register(target.poses(seen))
         found = target.particles_at(refinement.T)
         likely = np.where(found.missed, -np.inf, found.log_likelihood)
         distance = PoseDistance(target.index.mesh)
         order = [row for row in np.argsort(-likely, kind="stable") if np.isfinite(likely[row])]
         rows: list[int] = []
+        free = np.isfinite(likely)
         for row in order:
-            if len(rows) < _MODES and not distance.within(refinement.T[row], refinement.T[rows], _APART).any():
+            if len(rows) < _MODES and free[row]:
+                near = free & distance.within(refinement.T[row], refinement.T, _APART)
+                near[row], free[near] = True, False
+                free[row] = False
                 rows.append(int(row))
         if not rows:
             return None
@@ -73,7 +83,8 @@ class AboutModes:
             along = np.linalg.pinv(basis)
             scale = along.T @ (_WIDER**2 * covariance + np.diag(least**2)) @ along
             students.append(Student(np.zeros(len(basis)), np.linalg.cholesky(scale)))
-        return cls(target, hearts, bases, students)
+        touching = np.isfinite(likely)
+        return cls(target, hearts, bases, students, refinement.T[touching], seen.draw[touching])
 
     @cached_property
     def _distance(self) -> PoseDistance:
@@ -106,7 +117,8 @@ def bridged(about: AboutModes, power: float, runs: int, n: int, rng: np.random.G
     target = about.target
     m = _DRAWS * n * runs
     poses, membrane = located(target.index, about.draw(m, rng))
-    particles = target.admitted(target.evaluated(poses, membrane, errors=rng.random((m, target.carried, ERRORS))))
+    errors = rng.random((m, target.carried, ERRORS))
+    particles = target.admitted(target.evaluated(poses, membrane, errors=errors))
 
     def change(particles: Particles) -> Array:
         return particles.log_target(power) - about.log_density(particles)
@@ -129,10 +141,11 @@ def bridged(about: AboutModes, power: float, runs: int, n: int, rng: np.random.G
         share = min(share + population.reweigh(change(population.particles), 1 - share), 1.0)
 
 
-def starts(target: Target, found: Sequence[Particles], rng: np.random.Generator) -> Array:
-    """Poses (s, 4, 4) to register, as many of each of the ``found``."""
-    some = [each.take(rng.permutation(len(each))[: _STARTS // len(found)]) for each in found]
-    return np.concatenate([target.poses(each) for each in some])
+def starts(seen: Sequence[Particles], rng: np.random.Generator) -> Particles:
+    """Poses (s,) to register: half of them from the first of those ``seen``, which come from most draws, the others from all."""
+    numbers = [_STARTS // 2, *[-(-_STARTS // 2 // max(len(seen) - 1, 1))] * (len(seen) - 1)]
+    some = [each.take(rng.permutation(len(each))[:number]) for each, number in zip(seen, numbers, strict=True)]
+    return reduce(Particles.joined, some)
 
 
 def united(one: Population | None, other: Population | None) -> Population | None:

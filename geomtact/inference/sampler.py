@@ -59,6 +59,7 @@ class Run:
     contacts : that were cut
     log_measure : log of the uniform measure of poses that touch over that of the cells that hold them
     best : (S,) the largest log likelihood by each of several sensors of all poses that were tried; S is 0 for one sensor alone
+    about : modes that registration found; None of one sensor
     """
 
     density: Density
@@ -66,6 +67,7 @@ class Run:
     contacts: int
     log_measure: float
     best: Array
+    about: AboutModes | None = None
 
     @property
     def log_evidence(self) -> tuple[float, ...]:
@@ -112,8 +114,10 @@ def explore(
         raise InputError(f"{index.mesh.name}: no pose that was drawn touches the sensor; allow more contacts")
     stops, power, population = _begun(target, drawn, log_weight + (known - whole)[:, None], number, rng)
     population.contacts = cut
+    seen, about = [population.particles], None
     while True:
         population.move(partial(Particles.log_target, power=power))
+        seen.append(population.particles)
         sure = population if not others or power >= SURE else population.that_touch()
         if sure and (others or power in number):
             stops.append((power, sure.log_evidence, sure.particles))
@@ -125,7 +129,8 @@ def explore(
         step = population.reweigh(population.particles.log_likelihood - population.particles.log_coarse, after - power)
         power = after if step == after - power else power + step
         if others and power == SURE:
-            surely = _surely(population, [each for _, _, each in stops[1:]], register)
+            about = AboutModes.of(target, starts(seen, rng), register) if register else None
+            surely = _surely(population, about, known - whole)
             if surely is None:
                 break
             population = surely
@@ -139,6 +144,7 @@ def explore(
             population.contacts // runs,
             float(known - whole[run]),
             population.best,
+            about,
         )
         for run in range(runs)
     )
@@ -194,18 +200,17 @@ def _begun(
     return stops, power, population
 
 
-def _surely(population: Population, before: list[Particles], register: Register | None) -> Population | None:
-    """The ``population``, at the power ``SURE``, where it touches all sensors, with what registration adds; None where it does
-    not and registration adds nothing. Poses of it and of those ``before`` are registered."""
-    target, rng, touching = population.target, population.rng, population.that_touch()
-    found = before + ([touching.particles] if touching else [])
-    if register is None or not found:
-        return touching
-    about = AboutModes.of(target, register(starts(target, found, rng)))
-    if about is None:
-        return touching
+def _surely(population: Population, about: AboutModes | None, log_measure: Array) -> Population | None:
+    """The ``population``, at the power ``SURE``, where it touches all sensors, with what lies ``about`` modes; None where neither
+    does. ``log_measure`` (runs,) is as of :class:`Run`."""
+    touching = population.that_touch()
     n = len(population.particles) // population.runs
-    return united(touching, bridged(about, SURE, population.runs, n, rng))
+    more = bridged(about, SURE, population.runs, n, population.rng) if about else None
+    if more is not None:
+        more.log_evidence = more.log_evidence + log_measure
+        more.best = np.maximum(more.best, population.best)
+        more.contacts += 0 if touching else population.contacts
+    return united(touching, more)
 
 
 def _draw(target: Target, share: Array, runs: int, n: int, rng: np.random.Generator) -> tuple[Particles, Array, int]:

@@ -6,8 +6,9 @@ still above it, or only deeper. Neither changes the shape of a contact of some m
 contact that the pose without them has. How large the errors are is not known either, so they follow heavy-tailed distributions
 (Cauchy's, up to a limit).
 
-Of several sensors, all but the first are not quite where they are said to be. Unless it is stated how well their poses are
-known, standard deviations of 0.2 to 3 mm and degrees are equally probable by their logarithm.
+Of several sensors, all but the first are not quite where they are said to be, which adds to these errors of their contacts and
+is larger. Unless it is stated how well their poses are known, standard deviations of 0.2 to 3 mm and degrees are equally probable
+by their logarithm.
 """
 
 from __future__ import annotations
@@ -23,14 +24,15 @@ from geomtact.scoring.contact_likelihood import SCALE_ERROR, SHIFT_ERROR
 from geomtact.se3 import Array, exp
 
 NODES = 32  # errors over which a density is averaged, a power of two
-NODES_BESIDE = 128  # those of a sensor beside the first
+NODES_BESIDE = 256  # those of a sensor beside the first
 ERRORS = (
-    11  # of a contact on a sensor beside the first: four as above, how well its pose is known, and six of where it is
+    7  # at most: four of the first contact; of any other how well its sensor's pose is known, and six of where that is
 )
 _WIDTHS = np.array([SCALE_ERROR, SHIFT_ERROR, SHIFT_ERROR, SHIFT_ERROR])
 _LIMIT = 40 * _WIDTHS
 _UNITS = np.array([np.deg2rad(1)] * 3 + [1e-3] * 3)  # [rad, m] of what a sensor may be off by
 _LEAST, _MOST = 0.2, 3.0  # standard deviations, in these units, that are equally probable by their logarithm
+_CONTACT = 0.1  # standard deviation, in these units, of where a contact is, were its sensor's pose exactly known
 _WIDER = np.array([4.0, 1.0, 1.0, 1.0])  # distribution of the nodes, so that some lie where errors are large
 
 
@@ -41,29 +43,39 @@ def random_errors(n: int, rng: np.random.Generator) -> Array:
 
 
 def errors_of(shares: Array) -> Array:
-    """Errors (..., 4) as of :func:`random_errors`, below which ``shares`` (..., 4) of them lie along each axis; none at 0.5."""
+    """Errors (..., 4) as of :func:`random_errors`, below which the first four of ``shares`` (..., ERRORS) lie along each axis;
+    none at 0.5."""
     return _quantiles(shares[..., :4], _WIDTHS)
 
 
 def stand_of(shares: Array, extrinsics_std: ExtrinsicsStd | None = None) -> Array:
-    """Motions (..., 4, 4) from where a sensor is said to be to where it is, by the last seven of ``shares`` (..., ERRORS): normal
-    with ``extrinsics_std`` where that is stated."""
+    """Motions (..., 4, 4) from where a sensor beside the first is said to be to where it would show the contact that it does, by
+    ``shares`` (..., ERRORS); none at 0.5.
+
+    They are normal. Their standard deviation is ``extrinsics_std`` and what the contact's own place is uncertain by; or, where
+    that is not stated, any from ``_LEAST`` to ``_MOST``.
+    """
     if extrinsics_std is None:
-        std = _UNITS * _LEAST * (_MOST / _LEAST) ** shares[..., 4:5]
+        std = _UNITS * _LEAST * (_MOST / _LEAST) ** shares[..., :1]
     else:
-        std = np.array([extrinsics_std.rotation] * 3 + [extrinsics_std.translation] * 3)
-    return exp(std * ndtri(np.clip(shares[..., 5:], 1e-9, 1 - 1e-9)))
+        std = np.hypot([extrinsics_std.rotation] * 3 + [extrinsics_std.translation] * 3, _CONTACT * _UNITS)
+    return exp(std * ndtri(np.clip(shares[..., 1:], 1e-9, 1 - 1e-9)))
 
 
 @cache
-def nodes(n: int, extrinsics_std: ExtrinsicsStd | None = None) -> tuple[Array, Array, Array]:
-    """Errors (n, 4) spread evenly, motions (n, 4, 4) of a sensor as of :func:`stand_of`, and the log of their weights (n,), by
-    which they have the distribution of :func:`random_errors`."""
-    share = qmc.Sobol(ERRORS, scramble=False).random(n) + 0.5 / n
-    errors = _quantiles(share[:, :4], _WIDER * _WIDTHS)
-    stand = stand_of(share, extrinsics_std)
+def nodes() -> tuple[Array, Array]:
+    """Errors (NODES, 4) spread evenly, and the log of their weights (NODES,), by which they have the distribution of
+    :func:`random_errors`."""
+    share = qmc.Sobol(4, scramble=False).random(NODES) + 0.5 / NODES
+    errors = _quantiles(share, _WIDER * _WIDTHS)
     log_weight = (_log_density(errors, _WIDTHS) - _log_density(errors, _WIDER * _WIDTHS)).sum(1)
-    return errors, stand, log_weight - np.log(np.exp(log_weight).sum())
+    return errors, log_weight - np.log(np.exp(log_weight).sum())
+
+
+@cache
+def nodes_beside(extrinsics_std: ExtrinsicsStd | None) -> Array:
+    """Motions (NODES_BESIDE, 4, 4) as of :func:`stand_of`, spread evenly."""
+    return stand_of(qmc.Sobol(ERRORS, scramble=False).random(NODES_BESIDE) + 0.5 / NODES_BESIDE, extrinsics_std)
 
 
 def displaced(centre: Array, errors: Array, about: Array) -> Array:

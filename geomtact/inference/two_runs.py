@@ -78,7 +78,8 @@ def explore_twice(
                 found = _explored_from(run, _POSES[0] if others else int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
                 further = _sharpest(one, other)
                 if others:
-                    found = counted(found, further, _draws_left(one, last) + _draws_left(other, last))
+                    led_to = (one.about.led_to, one.about.origin) if one.about else None
+                    found = counted(found, further, _draws_left(one, last) + _draws_left(other, last), led_to)
                     return replace(found, unexplained_nats=unexplained)
                 found, log_sum = weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
                 if log_sum < 0:

@@ -1,4 +1,4 @@
-"""Poses drawn from a posterior, within its cells."""
+"""Poses drawn from a posterior: places that a touch could tell apart, and poses of each."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from geomtact.inference.posterior import Posterior
 from geomtact.se3 import Array, exp
 
 
-def draw_cells(posterior: Posterior, n: int, rng: np.random.Generator, within: int = 1) -> Array:
-    """Poses (d, n, 4, 4) of the object: ``n`` cells drawn from the posterior, and d = ``within`` poses in each.
+def draw_places(posterior: Posterior, n: int, rng: np.random.Generator, within: int = 1) -> Array:
+    """Poses (d, n, 4, 4) of the object: ``n`` places drawn from the posterior, and d = ``within`` poses in each.
 
-    Poses lie anywhere within a cell, but around refined modes they scatter by their covariance: two such cells can differ by less
-    than the grid's step.
+    A place of a resolved posterior is one pose, d times. Of another it is a cell: its poses lie anywhere within, but around
+    refined modes they scatter by their covariance: two such cells can differ by less than the grid's step.
     """
+    if posterior.explored is not None:
+        return np.tile(posterior.T_frame_sensor @ posterior.explored.draw(n, rng), (within, 1, 1, 1))
     p = np.exp(np.asarray(posterior.cell_log_prob, float))
     row = rng.choice(len(p), n, p=p / p.sum())
     cells = posterior.cells[row]

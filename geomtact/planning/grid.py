@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from geomtact.geometry.approach import facing, sunflower
 from geomtact.inference.posterior import Posterior
 from geomtact.planning.actions import Touch
-from geomtact.planning.draws import check_contact, draw_cells
+from geomtact.planning.draws import check_contact, draw_places
 from geomtact.se3 import Array, apply, check_pose, inverse, transform
 
 _SAME_DIRECTION = np.radians(15)  # angle [rad] within which touches at one place count as the same; hand-set
@@ -40,7 +40,7 @@ def grid_of_touches(
     """
     check_contact(posterior)
     space = posterior.space
-    poses = draw_cells(posterior, _POSES, np.random.default_rng(seed))[0]
+    poses = draw_places(posterior, _POSES, np.random.default_rng(seed))[0]
     points = apply(poses, space.mesh.surface_points(64)).reshape(-1, 3)
     long_axis = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][0]
     window = 2 * space.sensor.half_window

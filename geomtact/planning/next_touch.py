@@ -17,7 +17,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import UsageError
 from geomtact.inference.posterior import Posterior
 from geomtact.planning.actions import PRESSED, Probe, Touch
-from geomtact.planning.draws import check_contact, draw_cells
+from geomtact.planning.draws import check_contact, draw_places
 from geomtact.planning.grid import grid_of_touches
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
@@ -95,7 +95,7 @@ def next_touch(
     tried = [a if isinstance(a, Touch | Probe) else Touch(np.asarray(a)) for a in actions]
     if not tried:
         raise UsageError("next_touch: no actions to choose from; give some, or none at all for a grid of touches")
-    T = draw_cells(posterior, n, np.random.default_rng(seed), len(PRESSED))
+    T = draw_places(posterior, n, np.random.default_rng(seed), len(PRESSED))
     few = T[:_WITHIN, ::_ONE_IN] if len(tried) > _CLOSELY and n >= _LEAST_CELLS else T
     ranked = _ranked(evaluate(posterior.space, action, few, number) for number, action in enumerate(tried, 1))
     if few is T:

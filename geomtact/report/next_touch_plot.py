@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.planning.actions import Touch
-from geomtact.planning.draws import draw_cells
+from geomtact.planning.draws import draw_places
 from geomtact.planning.next_touch import Action, ambiguity
 from geomtact.report.canvas import COLOURS, FIRST, SIMULATED, png, rgb
 from geomtact.se3 import Array, apply, inverse, transform
@@ -44,7 +44,7 @@ def draw_next_touch(posterior: Posterior, ranked: Sequence[Action], seed: int = 
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    poses = draw_cells(posterior, _POSES, np.random.default_rng(seed))[0]
+    poses = draw_places(posterior, _POSES, np.random.default_rng(seed))[0]
     best = ranked[: len(_COLOURS)]
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
         figure = Figure(figsize=(14, 8.6), dpi=100, layout="constrained", facecolor="white")

@@ -21,7 +21,7 @@ from geomtact.inference.mode_refiner import LIKELIHOOD_POWER, ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.search import SensorView
 from geomtact.localizer import Localizer
-from geomtact.planning.draws import draw_cells
+from geomtact.planning.draws import draw_places
 from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.jaw import OPPOSITE, close_jaw, first_grasp
 from geomtact.planning.next_touch import evaluate
@@ -110,7 +110,7 @@ def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.rando
     They scatter about what registration found, and lie anywhere within cells that it did not look into. The grid's cells are
     wider than any clearance, so their masses are too coarse; the pixels, cast at the pose itself, are finer.
     """
-    poses = draw_cells(posterior, _DRAWS, rng)[0]
+    poses = draw_places(posterior, _DRAWS, rng)[0]
     mode_refiner, log_weight = ModeRefiner(space), np.zeros(len(poses))
     for T_world_sensor, mask in zip(felt.T_world_sensor, felt.masks, strict=True):
         seen = SensorView(mode_refiner, Contact(mask) if mask.any() else None, inverse(T_world_sensor))
