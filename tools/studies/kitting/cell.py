@@ -17,6 +17,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.contact_space.touches import counts, penetrations
 from geomtact.errors import InputError
+from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.mode_refiner import LIKELIHOOD_POWER, ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.search import SensorView
@@ -50,15 +51,12 @@ class Felt:
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """Poses ``T`` (n, 4, 4) of the object in the world, the heaviest first, and their ``weight`` (n,), which sums to 1."""
+    """Poses ``T`` (n, 4, 4) of the object in the world, first the one by which it would be placed, their ``weight`` (n,), which
+    sums to 1, and the probability that the right one is among what was ``found``."""
 
     T: Array
     weight: Array
-
-    @property
-    def effective(self) -> float:
-        """How many poses of equal weight would be as informative (Kish 1965)."""
-        return float(1 / (self.weight**2).sum())
+    found: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +103,16 @@ def touch_with_jaw(
 
 
 def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.random.Generator) -> Believed:
-    """Poses drawn from ``posterior``, each weighed by the likelihood of all contacts ``felt``.
+    """Poses drawn from ``posterior``; where it is not resolved, each weighed by the likelihood of all contacts ``felt``.
 
-    They scatter about what registration found, and lie anywhere within cells that it did not look into. The grid's cells are
-    wider than any clearance, so their masses are too coarse; the pixels, cast at the pose itself, are finer.
+    Then they scatter about what registration found, and lie anywhere within cells that it did not look into. The grid's cells
+    are wider than any clearance, so their masses are too coarse; the pixels, cast at the pose itself, are finer.
     """
+    if posterior.explored is not None:
+        first, drawn = posterior.modes(1)[0], posterior.sample(_DRAWS, rng)
+        near = PoseDistance(space.mesh).within(first.T, drawn, mode_radius(space.mesh)).mean()
+        found = min(first.probability / max(near, 1 / _DRAWS), 1.0)
+        return Believed(np.concatenate([first.T[None], drawn]), np.full(1 + _DRAWS, 1 / (1 + _DRAWS)), found)
     poses = draw_places(posterior, _DRAWS, rng)[0]
     mode_refiner, log_weight = ModeRefiner(space), np.zeros(len(poses))
     for T_world_sensor, mask in zip(felt.T_world_sensor, felt.masks, strict=True):
@@ -117,20 +120,22 @@ def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.rando
         log_weight += (LIKELIHOOD_POWER if mask.any() else _MISSED) * seen.log_likelihood(poses)
     heaviest = np.argsort(-log_weight)
     weight = np.exp(log_weight - log_weight.max())[heaviest]
-    return Believed(poses[heaviest], weight / weight.sum())
+    weight /= weight.sum()
+    # how many poses of equal weight would be as informative (Kish 1965)
+    effective = 1 / (weight**2).sum()
+    return Believed(poses[heaviest], weight, float(effective / (effective + 1)))
 
 
 def decide(belief: Believed, fixture: Fixture, clearances: Sequence[float]) -> list[Decision]:
     """For each of ``clearances`` [m] the probability that the object fits, placed by the pose that explains the contacts best.
 
-    P(fits | T) = W n / (n + 1), W the weight of the poses T' believed at which inv(T) T' needs no more than the clearance, n
-    how many poses are effective: where hardly any explains the contacts, that one fits itself proves nothing.
+    P(fits | T) is the weight of the poses T' believed at which inv(T) T' needs no more than the clearance, times the probability
+    that what was found holds the right one: where few poses were tried, that one fits itself proves nothing.
     """
     even = (np.arange(_ASKED) + 0.5) / _ASKED
     drawn = np.minimum(np.searchsorted(np.cumsum(belief.weight), even), len(belief.T) - 1)
     needed = fixture.clearance_needed(inverse(belief.T[0]) @ belief.T[drawn])
-    trust = belief.effective / (belief.effective + 1)
-    return [Decision(belief.T[0], float((needed <= clearance).mean() * trust)) for clearance in clearances]
+    return [Decision(belief.T[0], float((needed <= clearance).mean() * belief.found)) for clearance in clearances]
 
 
 def choose_jaw(posterior: Posterior, belief: Believed, made: Array, rng: np.random.Generator) -> Array:
