@@ -1,8 +1,8 @@
 """Which touch to make next: the one with the largest expected information gain for its cost (thesis 8.2).
 
-Cells are drawn from the posterior, and poses within each. Every action is tried at all of these poses in simulation. What
-it would show at one pose of a cell is compared with what it would show at other poses of this and of all other cells: so
-a difference counts only if it distinguishes cells, as the localizer could, not if it lies between two poses of one cell.
+Places are drawn from the posterior, and poses of each. Every action is tried at all of these poses in simulation. What
+it would show at one pose of a place is compared with what it would show at other poses of this and of all other places: so
+a difference counts only if it distinguishes places, as the localizer could, not if it lies between two poses of one place.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
 LEAST = 0.05  # expected information gain below which an action does not help [nats]; hand-set
-_CELLS = 128  # cells drawn from the posterior; hand-set
-# Of many actions, the best ``_CLOSELY`` are evaluated at all poses. They are chosen at ``_WITHIN`` poses in each of every
-# ``_ONE_IN``-th cell, where at least ``_LEAST_CELLS`` cells are drawn. Hand-set, for speed.
+_PLACES = 128  # drawn from the posterior; hand-set
+# Of many actions, the best ``_CLOSELY`` are evaluated at all poses. They are chosen at ``_WITHIN`` poses of every ``_ONE_IN``-th
+# place, where at least ``_LEAST_PLACES`` are drawn. Hand-set, for speed.
 _CLOSELY, _WITHIN, _ONE_IN = 24, 3, 4
-_LEAST_CELLS = 32
+_LEAST_PLACES = 32
 # Standard deviations at one pose: of the sensor's stop and of the contact's centre [m], and of the contact's log area, log size
 # and stretches. Measured on simulated touches of five objects with the calibration's noise, half of them elastic.
 _POSITION_STD, _MOMENTS_STD = 0.3e-3, (0.4, 0.15, 0.17, 0.17)
@@ -69,7 +69,7 @@ class Action:
 
 
 def next_touch(
-    posterior: Posterior, actions: Iterable[Touch | Probe | ArrayLike] | None = None, n: int = _CELLS, seed: int = 0
+    posterior: Posterior, actions: Iterable[Touch | Probe | ArrayLike] | None = None, n: int = _PLACES, seed: int = 0
 ) -> list[Action]:
     """``actions`` by the information that they are expected to give for their cost, the best first; ties in their order.
 
@@ -79,7 +79,7 @@ def next_touch(
     ----------
     posterior : of the touches so far; actions are in its frame
     actions : touches and probes; a pose (4, 4) is a touch without travel; by default :func:`grid_of_touches`
-    n : cells drawn from the posterior; no action can be expected to give more than log(n) nats
+    n : places drawn from the posterior; no action can be expected to give more than log(n) nats
     seed : of the draws
 
     Raises
@@ -96,7 +96,7 @@ def next_touch(
     if not tried:
         raise UsageError("next_touch: no actions to choose from; give some, or none at all for a grid of touches")
     T = draw_places(posterior, n, np.random.default_rng(seed), len(PRESSED))
-    few = T[:_WITHIN, ::_ONE_IN] if len(tried) > _CLOSELY and n >= _LEAST_CELLS else T
+    few = T[:_WITHIN, ::_ONE_IN] if len(tried) > _CLOSELY and n >= _LEAST_PLACES else T
     ranked = _ranked(evaluate(posterior.space, action, few, number) for number, action in enumerate(tried, 1))
     if few is T:
         return ranked
