@@ -504,4 +504,4 @@ def test_wrong_extrinsics_are_a_warning_and_right_ones_hardly_ever(plug):
                 continue
             warned[name] += any("agree badly" in warning for warning in posterior.warnings)
     assert warned["right"] <= 4 and warned["off"] >= warned["right"] + 6 and warned["known to be"] == 0, warned
-    assert poor_agreement(np.inf) and not poor_agreement(None)
+    assert poor_agreement(np.inf, 2.0) and not poor_agreement(None, 2.0) and not poor_agreement(1.9, 2.0)

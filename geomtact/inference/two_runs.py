@@ -80,7 +80,7 @@ def explore_twice(
                 if others:
                     led_to = (one.about.led_to, one.about.origin) if one.about else None
                     found = counted(found, further, _draws_left(one, last) + _draws_left(other, last), led_to)
-                    return replace(found, unexplained_nats=unexplained)
+                    return replace(found, unexplained_nats=_unexplained_in_place(one, other, found))
                 found, log_sum = weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
                 if log_sum < 0:
                     return found
@@ -152,6 +152,15 @@ def _draws_left(run: Run, last: int) -> float:
     """From how many draws, if all had as many, the particles at the ``last`` stop come."""
     count = np.unique(run.particles[last].draw, return_counts=True)[1]
     return float(count.sum() ** 2 / np.square(count).sum())
+
+
+def _unexplained_in_place(one: Run, other: Run, found: Explored) -> float:
+    """As :func:`_unexplained`, of the likeliest pose if all sensors were where they are said to be."""
+    T = found.hearts if one.about is None else np.concatenate([found.hearts, one.about.led_to])
+    at = one.density.target.particles_at(T)
+    together = at.log_likelihood[~at.missed].max(initial=-np.inf)
+    best = np.maximum(one.best, other.best)
+    return float(POWERS[-1] * (best.sum() - together) / len(best))
 
 
 def _unexplained(one: Run, other: Run) -> float:
