@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.contact_space.touches import counts, penetrations
@@ -177,7 +178,10 @@ def kit(
     if not felt.masks or not felt.masks[0].any():
         raise InputError("kit: expected a grasp with contact, no finger touched the object; take another seed")
     for touch in range(1, touches + 1):
-        posterior = localizer.localize(felt.masks, "mask", T_world_sensor=felt.T_world_sensor)
+        # the simulated cell knows exactly where its fingers are
+        posterior = localizer.localize(
+            felt.masks, "mask", T_world_sensor=felt.T_world_sensor, extrinsics_std=ExtrinsicsStd()
+        )
         belief = believe(localizer.space, posterior, felt, rng)
         yield Step(felt, posterior, belief, decide(belief, fixture, clearances))
         if touch < touches:
