@@ -24,8 +24,8 @@ class Diagnostics:
     ----------
     is_outlier : whether a contact is out of distribution: no simulated touch of the object resembles it
     disagrees : whether the other sensors, or the prior, contradict a sensor's image
-    unexplained_nats : per contact, by how much the likeliest pose explains less than the best pose of each sensor alone;
-        inf where no pose suits all; None where no poses were searched
+    unexplained_nats : per contact, by how much the likeliest pose, with sensors where they are said to be, explains less than
+        the best pose of each sensor alone; inf where no pose suits all; None where no poses were searched
     misfit_nats : per contact, by how much the likeliest pose misses the masks beyond the usual error; as
         ``unexplained_nats``, and None with measured depths
     settled_power : largest power of the likelihood that the contacts settle within the cells, 1 the sharpest; None where the
