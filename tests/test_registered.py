@@ -80,7 +80,9 @@ def test_populations_are_united_by_what_they_found(localizer, scenes):
     def population(log_evidence, draw):
         particles = some.take(np.arange(40) % len(some))
         particles.draw[:] = draw
-        return Population(runs[0].density.target, np.random.default_rng(0), particles, np.array([log_evidence, 0.0]))
+        return Population(
+            runs[0].density.target, np.random.default_rng(0), particles, np.array([log_evidence, 0.0]), np.zeros(2)
+        )
 
     likelier = united(population(0.0, 1), population(9.0, 2))
     draws = likelier.particles.draw.reshape(2, -1)

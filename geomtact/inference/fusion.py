@@ -31,7 +31,7 @@ from geomtact.inference.mode_refiner import ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.resolve import resolve_touches
-from geomtact.inference.search import SensorView, joint_problem
+from geomtact.inference.search import ROUGH_POINTS, SensorView, joint_problem
 from geomtact.inference.timing import timed
 from geomtact.log_mass import normalised
 from geomtact.se3 import Array, inverse
@@ -42,7 +42,6 @@ _LEAST_CORRELATION = 0.1
 _NEGLIGIBLE_NATS = 25.0  # log density below that of the most probable place from which a place has no weight; hand-set
 _UNLIKELY_DENSITY = 0.1  # density relative to the uniform below which a place is transferred by one pose; hand-set
 _DISAGREES_NATS = -2.0  # support of the other sensors for an image below which a disagreement is reported; hand-set
-_ROUGH_POINTS = 20  # largest number of points of an outline, to register many poses
 # Unexplained nats per contact above which poor agreement is reported: 2 of 100 simulated scenes of the pin and the head with
 # exact sensor poses exceed it.
 _UNEXPLAINED_NATS = 1.75
@@ -187,7 +186,7 @@ def fused_posterior(
     register = None
     if effort.several and not any(view.has_height for view in views):
         register = mode_refiners[posterior.provenance.base].registering(
-            posterior.index, joint_problem(views, _ROUGH_POINTS)
+            posterior.index, joint_problem(views, ROUGH_POINTS)
         )
     posterior = resolve_touches(posterior, touches, log_prior, effort, extrinsics_std, register)
     if not effort.modes:

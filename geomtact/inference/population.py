@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,8 @@ class Population:
     rng : draws them
     particles : equally probable
     log_evidence : (runs,) log integral of the function that they are drawn in proportion to
-    size : of moves, over that of the first ones
     best : as of ``sampler.Run``
+    size : of moves, over that of the first ones
     contacts : that were cut
     """
 
@@ -45,12 +45,9 @@ class Population:
     rng: np.random.Generator
     particles: Particles
     log_evidence: Array
+    best: Array
     size: float = 1.0
-    best: Array = field(init=False)
     contacts: int = 0
-
-    def __post_init__(self) -> None:
-        self.best = self.particles.by_sensor.max(0, initial=-np.inf)
 
     @property
     def runs(self) -> int:
@@ -85,7 +82,6 @@ class Population:
         if missed.reshape(self.runs, -1).all(1).any():
             return None
         out = replace(self)
-        out.best = self.best
         out.choose(np.where(missed, -np.inf, 0.0))
         return out
 

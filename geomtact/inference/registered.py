@@ -62,16 +62,13 @@ class AboutModes:
         refinement = register(target.poses(seen))
         found = target.particles_at(refinement.T)
         likely = np.where(found.missed, -np.inf, found.log_likelihood)
-        distance = PoseDistance(target.index.mesh)
-        order = [row for row in np.argsort(-likely, kind="stable") if np.isfinite(likely[row])]
+        touching, distance = np.isfinite(likely), PoseDistance(target.index.mesh)
         rows: list[int] = []
-        free = np.isfinite(likely)
-        for row in order:
-            if len(rows) < _MODES and free[row]:
-                near = free & distance.within(refinement.T[row], refinement.T, _APART)
-                near[row], free[near] = True, False
-                free[row] = False
-                rows.append(int(row))
+        free = touching.copy()
+        while free.any() and len(rows) < _MODES:
+            rows.append(int(np.where(free, likely, -np.inf).argmax()))
+            free &= ~np.array(distance.within(refinement.T[rows[-1]], refinement.T, _APART), bool)
+            free[rows[-1]] = False
         if not rows:
             return None
         hearts = refinement.T[rows]
@@ -83,7 +80,6 @@ class AboutModes:
             along = np.linalg.pinv(basis)
             scale = along.T @ (_WIDER**2 * covariance + np.diag(least**2)) @ along
             students.append(Student(np.zeros(len(basis)), np.linalg.cholesky(scale)))
-        touching = np.isfinite(likely)
         return cls(target, hearts, bases, students, refinement.T[touching], seen.draw[touching])
 
     @cached_property
@@ -126,7 +122,8 @@ def bridged(about: AboutModes, power: float, runs: int, n: int, rng: np.random.G
     def between(share: float, particles: Particles) -> Array:
         return (1 - share) * about.log_density(particles) + share * particles.log_target(power)
 
-    population = Population(target, rng, particles, np.zeros(runs), contacts=m * target.sensors)
+    best = particles.by_sensor.max(0)
+    population = Population(target, rng, particles, np.zeros(runs), best, contacts=m * target.sensors)
     log_weight = np.where(particles.missed, -np.inf, change(particles))
     each = log_weight.reshape(runs, -1)
     if not np.isfinite(each).any(1).all():
@@ -158,13 +155,12 @@ def united(one: Population | None, other: Population | None) -> Population | Non
     for run, each in enumerate(share):
         of = rng.random(n) < each
         rows.append(np.where(of, len(one.particles), 0) + run * n + np.arange(n))
-    out = Population(
+    return Population(
         one.target,
         rng,
         one.particles.joined(other.particles).take(np.concatenate(rows)),
         np.maximum(one.log_evidence, other.log_evidence),
+        np.maximum(one.best, other.best),
         one.size,
         one.contacts + other.contacts,
     )
-    out.best = np.maximum(one.best, other.best)
-    return out

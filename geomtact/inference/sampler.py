@@ -195,9 +195,7 @@ def _begun(
         weight = by_power(each)
         stops.append((each, np.logaddexp.reduce(weight, 1), drawn.take(resampled(weight, n, rng))))
     _, log_evidence, particles = stops.pop()
-    population = Population(target, rng, particles, log_evidence)
-    population.best = drawn.by_sensor.max(0, initial=-np.inf)
-    return stops, power, population
+    return stops, power, Population(target, rng, particles, log_evidence, drawn.by_sensor.max(0, initial=-np.inf))
 
 
 def _surely(population: Population, about: AboutModes | None, log_measure: Array) -> Population | None:

@@ -32,7 +32,7 @@ _SHAPE = (24, 32)  # pixels of the casts by which many poses are compared
 _DRAWS = 8  # poses drawn within each cell
 # All constants of the search are hand-set.
 _POINTS = 60  # largest number of points of an outline, for observable directions
-_ROUGH_POINTS = 20  # largest number of points of an outline, to register all searched cells
+ROUGH_POINTS = 20  # largest number of points of an outline, to register many poses
 _HOPEFUL = 4  # number of poses per cell that the third and later sensors evaluate
 _ROUNDS, _AROUND = 3, 12  # rounds of the last search, each for the better half of the cells, and poses per cell in each
 _REFINED_PER_MODE = 5  # number of cells, for each requested mode, whose pose is registered by all points
@@ -163,7 +163,7 @@ class Search:
         self.views = sorted(views, key=lambda view: view.contact is None)
         self.base, self.n_contacts = self.views[0], sum(view.contact is not None for view in views)
         self.first = self.base.refiner
-        self.problem, self.rough = (joint_problem(views, points) for points in (_POINTS, _ROUGH_POINTS))
+        self.problem, self.rough = (joint_problem(views, points) for points in (_POINTS, ROUGH_POINTS))
         self.spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
         self.filterreg = FilterReg(self.first.surface, self.spread)
         self.best = np.full(len(views), -np.inf)

@@ -26,7 +26,7 @@ from geomtact.se3 import Array, exp
 NODES = 32  # errors over which a density is averaged, a power of two
 NODES_BESIDE = 256  # those of a sensor beside the first
 ERRORS = (
-    7  # at most: four of the first contact; of any other how well its sensor's pose is known, and six of where that is
+    7  # of a contact: four of the first one; of any other how well its sensor's pose is known, and six of where that is
 )
 _WIDTHS = np.array([SCALE_ERROR, SHIFT_ERROR, SHIFT_ERROR, SHIFT_ERROR])
 _LIMIT = 40 * _WIDTHS

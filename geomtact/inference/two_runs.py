@@ -158,15 +158,17 @@ def _unexplained_in_place(one: Run, other: Run, found: Explored) -> float:
     """As :func:`_unexplained`, of the likeliest pose if all sensors were where they are said to be."""
     T = found.hearts if one.about is None else np.concatenate([found.hearts, one.about.led_to])
     at = one.density.target.particles_at(T)
-    together = at.log_likelihood[~at.missed].max(initial=-np.inf)
-    best = np.maximum(one.best, other.best)
-    return float(POWERS[-1] * (best.sum() - together) / len(best))
+    return _short_of_best(one, other, at)
 
 
 def _unexplained(one: Run, other: Run) -> float:
     """Nats by which the likeliest pose that two runs found explains each of several contacts less than the best pose of each
     sensor alone does, in the mean and by the largest power."""
-    found = one.particles[-1].joined(other.particles[-1])
+    return _short_of_best(one, other, one.particles[-1].joined(other.particles[-1]))
+
+
+def _short_of_best(one: Run, other: Run, found: Particles) -> float:
+    """Nats by which the likeliest of the ``found`` poses explains each contact less, as of :func:`_unexplained`."""
     together = found.log_likelihood[~found.missed].max(initial=-np.inf)
     best = np.maximum(one.best, other.best)
     return float(POWERS[-1] * (best.sum() - together) / len(best))

@@ -1,4 +1,4 @@
-"""Poses drawn from a posterior: places that a touch could tell apart, and poses of each."""
+"""Poses drawn from a posterior: places that a touch could distinguish, and poses of each."""
 
 from __future__ import annotations
 
