@@ -131,7 +131,7 @@ class Localizer(PreparedObject):
         self, frames: Iterable[Any], T_world_sensor: Any = None, motion: Any = None, **options: Any
     ) -> Iterator[Posterior]:
         """A Posterior for each frame, given all frames up to it (thesis 8.1); see :func:`geomtact.inference.sequence.track`."""
-        return track(self.localize, self.index, self.scorer, self.cache_dir, frames, T_world_sensor, motion, **options)
+        return track(self, self.localize, frames, T_world_sensor, motion, **options)
 
     def next_touch(self, posterior: Posterior, actions: Any = None, seed: int = 0) -> list[Action]:
         """Actions by expected information for their cost (thesis 8.2); see :func:`geomtact.planning.next_touch.next_touch`."""

@@ -21,7 +21,6 @@ from geomtact.errors import ImageError, InputError, UsageError
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.distribution import cell_log_density
-from geomtact.inference.effort import Effort
 from geomtact.inference.motion import GaussianTwist, UniformBall
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.sensing.image_file import ImageFile, write_image
@@ -31,8 +30,6 @@ from tools.studies.track.trajectories import random_trajectory
 
 STILL = GaussianTwist(0.0, 0.0)
 KINDS = ("pin", "ball", "cone", "flat_nut")  # an axis, a sphere, cones of approach, and a face with a housing
-
-CELLS = Effort(5, thorough=False)  # as a sequence uses them
 
 
 def track(localizer, frames, *args, **options):
@@ -146,10 +143,26 @@ def test_frames_of_a_still_object_multiply(flat_nut, creeping):
 
 def test_one_frame_is_a_touch(flat_nut, creeping):
     mask = creeping[0][0].masks[0]
-    (first,), single = track(flat_nut, [mask], effort="balanced"), flat_nut.localize(mask, effort=CELLS)
-    possible = flat_nut.index.possible
-    np.testing.assert_allclose(cell_log_density(first, possible), cell_log_density(single, possible), atol=1e-4)
-    assert first.modes(1)[0].probability == pytest.approx(single.modes(1)[0].probability, abs=1e-4)
+    (first,), single = track(flat_nut, [mask], effort="balanced"), flat_nut.localize(mask)
+    np.testing.assert_allclose(first.poses, single.poses, atol=1e-9)
+    np.testing.assert_allclose(first.log_density(single.poses[:50]), single.log_density(single.poses[:50]), atol=1e-3)
+    assert first.modes(1)[0].probability == pytest.approx(single.modes(1)[0].probability, abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["flat_nut", "pin"])
+def test_frames_are_resolved_as_single_touches_are(name, request):
+    """And what the frames before make of the pose adds to them."""
+    localizer, more = request.getfixturevalue(name), []
+    for seed in range(4):
+        t = random_trajectory(localizer.space, 5, seed, speed=4e-3, elastic=seed % 2 == 1)
+        posteriors = list(track(localizer, t.masks, effort="balanced"))
+        assert all(p.explored is not None and p.diagnostics.frame for p in posteriors)
+        single = [localizer.localize(mask) for mask in t.masks]
+        more += list(np.subtract(gains(posteriors, t), gains(single, t))[1:])
+        cells = gains([alone(localizer, mask) for mask in t.masks], t)
+        assert np.mean(gains(posteriors, t)) > np.mean(cells)
+    assert np.mean(more) > 0
 
 
 def gains(posteriors, trajectory):

@@ -12,6 +12,7 @@ that the filter recovers from a slip.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.inference.posterior import Posterior
+from geomtact.log_mass import normalised
 from geomtact.se3 import Array, inverse
 from geomtact.sensing.moments import moments_of
 from geomtact.sensing.reading import Observation
@@ -39,6 +41,7 @@ _MOST_IMAGES = 1_000  # digests of the last frames that are kept, to detect a pr
 _LEADING_CELLS = 2_000  # densest cells of a posterior that the next frame is compared with; hand-set
 
 Counts = tuple[float, float | None]
+Resolve = Callable[[Posterior, NDArray[np.floating] | None, Posterior], Posterior]
 CellLogProb = tuple[NDArray[np.int64], NDArray[np.floating]]  # cells, ascending, and the log probability of each
 
 
@@ -59,6 +62,8 @@ class Filter:
         all earlier frames have ``MEMORY_POWER`` together; a new one replaces them by how far the contact changed
     fresh : share of the uniform distribution that is mixed in before a frame; with 0, dropped cells stay impossible
     most : largest number of cells that are kept
+    resolve : the posterior within the cells, from that over the cells, the log mass (N,) that each cell was expected to have,
+        None where nothing was, and the frame's own posterior; None leaves the cells as they are
     memory : the distribution that is predicted for the next frame, while the object does not move
     leading : the leading cells of the last posterior; None before the first frame
     T_frame_sensor : (4, 4) of the last frame
@@ -71,6 +76,7 @@ class Filter:
     counts: Counts = (FRAME_POWER, None)
     fresh: float = UNIFORM_SHARE
     most: int | None = None
+    resolve: Resolve | None = None
     memory: Mixture = field(default_factory=Mixture)
     leading: Mixture | None = None
     T_frame_sensor: Array | None = None
@@ -82,6 +88,7 @@ class Filter:
         self._last: Posterior | None = None
         self._images: tuple[str, ...] = ()
         self._moments: NDArray[np.float32] | None = None
+        self._expected: NDArray[np.floating] | None = None
 
     def step(self, seen: Posterior) -> Posterior:
         """The posterior after one more frame.
@@ -93,10 +100,11 @@ class Filter:
         began, last, surprise, warnings = perf_counter(), self._last, None, list(seen.warnings)
         result: CellLogProb | None = None
         self.frames += 1
-        if seen.contact and last is not None and np.array_equal(_observation(seen).image, _observation(last).image):
+        repeated = last if seen.contact and last and _shows_the_same(seen, last) else None
+        rests = repeated is not None and np.array_equal(repeated.T_frame_sensor, seen.T_frame_sensor)
+        if repeated is not None:
             warnings.append(f"frame {self.frames} is the same image as the one before: it counts once")
-            rests = np.array_equal(last.T_frame_sensor, seen.T_frame_sensor)
-            result = (last.cells, last.cell_log_prob) if rests else self._passed_over(seen.T_frame_sensor)
+            result = (repeated.cells, repeated.cell_log_prob) if rests else self._passed_over(seen.T_frame_sensor)
         elif seen.contact:
             if self.missed and self.leading is not None:
                 lost = "a frame" if self.missed == 1 else f"{self.missed} frames"
@@ -124,6 +132,10 @@ class Filter:
         )
         if result is not None:
             out = replace(out, cells=result[0], cell_log_prob=result[1], contact=True)
+        if rests and repeated is not None:
+            out = replace(out, explored=repeated.explored)
+        elif self.resolve is not None and seen.contact and repeated is None:
+            out = self.resolve(out, self._expected, seen)
         self._last = out if out.contact and not out.diagnostics.is_skipped else None
         return out
 
@@ -161,6 +173,7 @@ class Filter:
             if has_slipped(surprise) and self.fresh > 0:
                 expected = expected.with_uniform(_UNIFORM_AFTER_LOSS)
         before = self._log_density(expected)
+        self._expected = self._log_mass(before) if len(expected.cells) else None
         log_density = np.float32(now) * gain
         log_density += before
         log_prob = self._normalise(log_density)
@@ -198,6 +211,13 @@ class Filter:
         density[rows] += expected.mass / self._weight[rows]
         with np.errstate(divide="ignore"):
             return np.log(density, out=density)
+
+    def _log_mass(self, log_density: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The log mass (N,) of every cell, of a log density (n,) in all possible cells."""
+        index = self.motion_kernel.index
+        out = np.full(len(index), -np.inf, np.float32)
+        out[index.possible] = log_density + index.log_possible_weight
+        return normalised(out)
 
     def _normalise(self, log_density: NDArray[np.float32]) -> NDArray[np.float32]:
         """The log probability (n,) of all possible cells, of a log density (n,), which is normalised in place."""
@@ -242,6 +262,10 @@ class Filter:
         """The possible cells that have mass, by their log probability (n,)."""
         possible, held = self.motion_kernel.index.possible, log_prob > -np.inf
         return (possible, log_prob) if held.all() else (possible[held], log_prob[held])
+
+
+def _shows_the_same(seen: Posterior, last: Posterior) -> bool:
+    return np.array_equal(_observation(seen).image, _observation(last).image)
 
 
 def _observation(seen: Posterior) -> Observation:

@@ -24,16 +24,22 @@ from geomtact.se3 import Array, inverse
 LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
 
 
-def resolve_touch(posterior: Posterior, log_prior: LogMass, scorer: FittedScorer, effort: Effort) -> Posterior:
+def resolve_touch(
+    posterior: Posterior, log_prior: LogMass, scorer: FittedScorer, effort: Effort, alone: Posterior | None = None
+) -> Posterior:
     """The ``posterior`` of one mask, resolved within the cells by the contacts of ``effort``.
 
-    It is as it was without contact, or with depths. ``log_prior`` is as of ``single_touch.touch_posterior``.
+    It is as it was without contact, or with depths. ``log_prior`` is as of ``single_touch.touch_posterior``, ``alone`` the
+    posterior of the same image without it, where that is known.
     """
     if log_prior is None or not _can_resolve([posterior], effort):
         return _resolved(posterior, [posterior], None, None, effort)
     assert posterior.observation is not None
-    # cells that the prior rules out have no mass in the posterior
-    coarse = np.exp(scorer.log_mass(posterior.index, posterior.observation.contact.soft_mask)).sum(0)
+    if alone is not None:
+        coarse = (cell_densities(alone).reshape(alone.index.weight.shape) * alone.index.weight).sum(0, dtype=float)
+    else:
+        # cells that the prior rules out have no mass in the posterior
+        coarse = np.exp(scorer.log_mass(posterior.index, posterior.observation.contact.soft_mask)).sum(0)
     return _resolved(posterior, [posterior], coarse, log_prior, effort)
 
 

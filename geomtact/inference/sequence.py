@@ -9,18 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from geomtact.contact_space.index import Index
 from geomtact.errors import InputError, PoseError, UsageError, nearest_name
 from geomtact.inference.effort import Effort, effort_of
 from geomtact.inference.facts import Diagnostics, TrackRecord
-from geomtact.inference.filter import FRAME_POWER, UNIFORM_SHARE, Counts, Filter
+from geomtact.inference.filter import FRAME_POWER, UNIFORM_SHARE, Counts, Filter, Resolve
 from geomtact.inference.motion import Motion, UniformBall
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.inference.posterior import Posterior
+from geomtact.inference.preparation import PreparedObject
 from geomtact.inference.prior import opened, prior_log_mass, reference_of
 from geomtact.inference.repeated_images import counted_once
-from geomtact.scoring.fitted import FittedScorer
+from geomtact.inference.resolve import resolve_touch
+from geomtact.inference.single_touch import refine_modes
+from geomtact.inference.views import read_views
 from geomtact.se3 import Array, check_transforms
 
 _ERRORS = ("raise", "skip")
@@ -29,10 +32,8 @@ _NO_FRAMES = "frames: expected at least one image, got none; check the folder, o
 
 
 def track(
+    prepared: PreparedObject,
     localize: Callable[..., Posterior],
-    index: Index,
-    scorer: FittedScorer,
-    cache_dir: str | Path | None,
     frames: Iterable[Any],
     T_world_sensor: Any = None,
     motion: Motion | None = None,
@@ -51,13 +52,14 @@ def track(
 
     Parameters
     ----------
-    localize, index, scorer, cache_dir : of the localizer
+    prepared, localize : of the localizer
     frames : images as ``localize`` takes them, a list or a generator, such as a live camera
     T_world_sensor : (4, 4) of a sensor at rest, or one a frame (n, 4, 4), a list or a generator: the posteriors are then in the
         world frame, and where the sensor moves the object stays, but for ``motion``
     motion : of the object from one frame to the next, ``UniformBall()`` by default; the tighter it is, the more the frames
         before constrain the pose
-    effort, kind, background, seed : as for ``localize``
+    effort, kind, background, seed : as for ``localize``; the filter lives on the cells of the grid, and masks are resolved within
+        them as single touches are, with what the frames before make of the pose as their prior
     prior : distribution before the first frame with contact, over the sensor as it stands then (see ``inference.prior``)
     most : cells that are kept from frame to frame at most, which bounds the time a frame takes; all that count by default
     counts : powers of a frame's likelihood, in its own posterior and in those of all later frames. With None for the latter,
@@ -79,47 +81,62 @@ def track(
     UsageError, InputError
         At once, or with the frame they concern, counted from 1.
     """
-    motion = motion or UniformBall()
+    motion, index = motion or UniformBall(), prepared.index
     _check(frames, index.sensor.image_size_px, motion, counts, fresh, most, on_error)
-    state = make_filter(index, scorer, motion, counts, fresh, most, seed)
+    state = make_filter(prepared, motion, counts, fresh, most, seed, effort_of(effort))
     pairs = _pairs(frames, _poses(frames, T_world_sensor))
-    # the filter's powers are those of distributions over cells, so that frames are not resolved within them
-    resolved = effort_of(effort)
-    effort = replace(resolved, contacts=0) if resolved.contacts else effort
     options = {"effort": effort, "kind": kind, "background": background, "seed": seed}
-    return _tracked(localize, index, cache_dir, pairs, state, prior, options, on_error == "skip")
+    return _tracked(prepared, localize, pairs, state, prior, options, on_error == "skip")
 
 
 def make_filter(
-    index: Index,
-    scorer: FittedScorer,
+    prepared: PreparedObject,
     motion: Motion | None = None,
     counts: Counts = (FRAME_POWER, None),
     fresh: float = UNIFORM_SHARE,
     most: int | None = None,
     seed: int = 0,
+    effort: Effort | None = None,
 ) -> Filter:
-    """The filter that :func:`track` puts the posteriors of single frames through, one :meth:`Filter.step` a frame."""
-    within = scorer.evidence_model.moments.covariance
-    return Filter(MotionKernel(index, motion or UniformBall(), seed), within, counts, fresh, most)
+    """The filter that :func:`track` puts the posteriors of single frames through, over cells and not refined, one
+    :meth:`Filter.step` a frame. Its posteriors are resolved within the cells, and their modes refined, by ``effort``."""
+    within = prepared.scorer.evidence_model.moments.covariance
+    kernel = MotionKernel(prepared.index, motion or UniformBall(), seed)
+    resolve = _resolved_by(prepared, effort) if effort is not None and effort.contacts else None
+    return Filter(kernel, within, counts, fresh, most, resolve)
+
+
+def _resolved_by(prepared: PreparedObject, effort: Effort) -> Resolve:
+    def resolve(posterior: Posterior, log_prior: NDArray[np.floating] | None, alone: Posterior) -> Posterior:
+        posterior = resolve_touch(posterior, log_prior, prepared.scorer, effort, alone)
+        if posterior.explored is None:
+            return posterior
+        return refine_modes(posterior, log_prior, prepared.mode_refiner, effort)
+
+    return resolve
 
 
 def _tracked(
+    prepared: PreparedObject,
     localize: Callable[..., Posterior],
-    index: Index,
-    cache_dir: str | Path | None,
     pairs: Iterable[tuple[int, Any, Array | None]],
     state: Filter,
     prior: Any,
     options: dict[str, Any],
     skip: bool,
 ) -> Iterator[Posterior]:
-    motion, made_from, expected = state.motion_kernel.motion, None, None
+    index, motion, made_from, expected = prepared.index, state.motion_kernel.motion, None, None
+    effort = effort_of(options["effort"])
     record = TrackRecord({"kind": type(motion).__name__, **vars(motion)}, state.counts, state.fresh, state.most)
     for n, image, T in pairs:
         frame, at = ("sensor", np.eye(4)) if T is None else ("world", T)
         try:
-            seen = localize(image, T_world_sensor=T, **options)
+            (view,) = read_views(image, T, prepared.sensors, options["kind"], options["background"])
+            # masks are resolved after the filter's step, by the modes of its posterior
+            to_resolve = effort.contacts and view.observation.contact.height is None
+            over_cells = replace(effort, contacts=0, modes=0) if to_resolve else replace(effort, contacts=0)
+            seen = localize(view.observation, T_world_sensor=T, **options | {"effort": over_cells})
+            seen = replace(seen, provenance=replace(seen.provenance, effort=options["effort"]))
         except InputError as error:
             if not skip:
                 raise type(error)(
@@ -138,7 +155,7 @@ def _tracked(
             )
         if prior is not None and (seen.contact or seen.diagnostics.is_skipped):
             # the cells are those over the sensor where it stands now
-            prior = opened(prior, cache_dir)
+            prior = opened(prior, prepared.cache_dir)
             log_mass = prior_log_mass(index, prior, at, frame)
             state.memory = Mixture(np.flatnonzero(np.isfinite(log_mass)), np.exp(log_mass[np.isfinite(log_mass)]), 0.0)
             made_from, expected, prior = prior, prior, None

@@ -15,7 +15,9 @@ from geomtact.errors import MeshError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import filter as filtering
 from geomtact.inference.distribution import cell_log_density
+from geomtact.inference.effort import effort_of
 from geomtact.inference.posterior import Posterior
+from geomtact.inference.resolve import resolve_touch
 from geomtact.inference.sequence import make_filter
 from geomtact.localizer import Localizer
 from geomtact.se3 import Array
@@ -71,25 +73,30 @@ def make_trajectory(localizer: Localizer, number: int, seed: int, frames: int, n
 def follow(
     localizer: Localizer, n: int, seed: int, frames: int, noise: Noise, effort: str, first: int = 0
 ) -> Iterator[Followed]:
-    """Trajectories ``first`` to ``n`` of an object, each frame localized once and put through every filter."""
+    """Trajectories ``first`` to ``n`` of an object, each frame localized alone and put through every filter."""
+    resolved = effort_of(effort)
     distance = PoseDistance(localizer.mesh, _POINTS)
     radius = mode_radius(localizer.mesh) + cell_width(localizer.index, distance)
     for number in range(first, n):
         trajectory = make_trajectory(localizer, number, seed, frames, noise)
         filters = {
-            "filter": make_filter(localizer.index, localizer.scorer, seed=seed),
-            "thesis": make_filter(localizer.index, localizer.scorer, counts=(1, 1), fresh=0, most=50, seed=seed),
+            "filter": make_filter(localizer, seed=seed, effort=resolved),
+            "thesis": make_filter(localizer, counts=(1, 1), fresh=0, most=50, seed=seed),
         }
         told: dict[str, list[tuple[float, ...]]] = {method: [] for method in METHODS}
         rng = np.random.default_rng([seed, number, 1])
         poses = trajectory.T_sensor_object
         cells = localizer.index.lookup(poses, localizer.space.penetration(poses))[:, None]
         for T, cell, mask in zip(poses, cells, trajectory.masks, strict=True):
-            alone = localizer.localize(mask, kind="mask", effort=effort, seed=seed)
+            of_cells = localizer.localize(mask, kind="mask", effort="fast", seed=seed)
             near, tie = cells_near(localizer.index, distance, T, radius), rng.random()
-            told["frames"].append(_judged(alone, cell, near, tie))
-            for method, each in filters.items():
-                told[method].append(_judged(each.step(alone), cell, near, tie))
+            found = {"frames": resolve_touch(of_cells, None, localizer.scorer, resolved)}
+            found |= {method: each.step(of_cells) for method, each in filters.items()}
+            for method, posterior in found.items():
+                if posterior.explored is None:
+                    told[method].append(_judged(posterior, cell, near, tie))
+                else:
+                    told[method].append(_judged_within(posterior, T, distance, radius))
         plain = [contact_class(localizer.space, T) in FEATURELESS for T in poses]
         columns = [{m: [row[k] for row in rows] for m, rows in told.items()} for k in range(4)]
         yield Followed(number, trajectory.elastic, plain, *columns)
@@ -110,6 +117,16 @@ def cells_near(index: Index, distance: PoseDistance, T: Array, radius: float) ->
     return near[distance.within(T, index.poses(near), radius)]
 
 
+def _judged_within(
+    posterior: Posterior, T: Array, distance: PoseDistance, radius: float
+) -> tuple[float, float, float, float]:
+    """As :func:`_judged`, of a posterior that is resolved within the cells and a true pose ``T`` (4, 4)."""
+    explored = posterior.explored
+    assert explored is not None
+    mass = float(explored.weight @ distance.within(T, explored.poses, radius))
+    return posterior.log_density(T), posterior.credible_level(T), mass, posterior.information_gain_nats
+
+
 def _judged(
     posterior: Posterior, cell: NDArray[np.int64], near: NDArray[np.int64], tie: float
 ) -> tuple[float, float, float, float]:
@@ -128,11 +145,11 @@ def _judged(
 
 
 def time_steps(localizer: Localizer, seed: int, frames: int, noise: Noise, effort: str) -> list[float]:
-    """Milliseconds of each step of the filter alone, with ``LIVE`` cells kept, from the third frame of a trajectory on."""
-    state = make_filter(localizer.index, localizer.scorer, most=LIVE, seed=seed)
+    """Milliseconds of each frame, with ``LIVE`` cells kept, from the third one of a trajectory on."""
+    state = make_filter(localizer, most=LIVE, seed=seed, effort=effort_of(effort))
     masks = make_trajectory(localizer, 0, seed, frames, noise).masks
-    posteriors = [state.step(localizer.localize(mask, kind="mask", effort=effort, seed=seed)) for mask in masks]
-    return [p.timing_ms["filter"] for p in posteriors[2:]]
+    posteriors = [state.step(localizer.localize(mask, kind="mask", effort="fast", seed=seed)) for mask in masks]
+    return [sum(p.timing_ms.values()) for p in posteriors[2:]]
 
 
 def settings() -> dict[str, Any]:
