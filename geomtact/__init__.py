@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
     from geomtact.geometry.mesh_file import load_mesh
     from geomtact.identification import identify
-    from geomtact.inference.densities import GaussianPrior
     from geomtact.inference.effort import Effort
+    from geomtact.inference.gaussian_prior import GaussianPrior
     from geomtact.inference.modes import Mode
     from geomtact.inference.motion import GaussianTwist
     from geomtact.inference.posterior import Posterior
@@ -45,7 +45,7 @@ _MODULE_OF = {
     "Action": "geomtact.planning.next_touch",
     "Contact": "geomtact.sensing.contact",
     "Effort": "geomtact.inference.effort",
-    "GaussianPrior": "geomtact.inference.densities",
+    "GaussianPrior": "geomtact.inference.gaussian_prior",
     "GaussianTwist": "geomtact.inference.motion",
     "Localizer": "geomtact.localizer",
     "Mesh": "geomtact.geometry.mesh",

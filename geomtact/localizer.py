@@ -120,7 +120,7 @@ class Localizer(PreparedObject):
         if len(views) == 1:
             posterior, log_prior = touches[0]
             posterior, prior = drop_lost_contact_prior(posterior, prior)
-            posterior = resolve_touch(posterior, log_prior, self.scorer, resolved)
+            posterior = resolve_touch(posterior, prior, log_prior, self.scorer, resolved)
             posterior = refine_modes(posterior, log_prior, self.mode_refiner, resolved)
         else:
             refiners = [one.mode_refiner for one in each]

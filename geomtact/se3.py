@@ -106,15 +106,20 @@ def exp(xi: ArrayLike) -> Array:
     """Exponential of twists (..., 6) -> (..., 4, 4) (Barfoot, eqs. 7.25 and 7.37)."""
     xi = np.asarray(xi, float)
     w, v = xi[..., :3], xi[..., 3:]
+    R = Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape[:-1], 3, 3)
+    return transform(R, (left_jacobian(w) @ v[..., None])[..., 0])
+
+
+def left_jacobian(w: ArrayLike) -> Array:
+    """Matrices (..., 3, 3) by which the exponential of a twist with the turn ``w`` (..., 3) shifts (Barfoot, eq. 7.37)."""
+    w = np.asarray(w, float)
     theta = np.linalg.norm(w, axis=-1)[..., None, None]
     small = theta < 1e-5
     safe = np.where(small, 1.0, theta)
     a = np.where(small, 0.5 - theta**2 / 24, (1 - np.cos(safe)) / safe**2)
     b = np.where(small, 1 / 6 - theta**2 / 120, (safe - np.sin(safe)) / safe**3)
     W = hat(w)
-    V = np.eye(3) + a * W + b * (W @ W)
-    R = Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape[:-1], 3, 3)
-    return transform(R, (V @ v[..., None])[..., 0])
+    return np.asarray(np.eye(3) + a * W + b * (W @ W))
 
 
 def log(T: ArrayLike) -> Array:

@@ -15,7 +15,6 @@ from geomtact.evaluation import simultaneous_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import sampler, two_runs
 from geomtact.inference.effort import Effort
-from geomtact.inference.particles import prior_at
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
 from geomtact.sensing.reading import read_observation
 
@@ -181,8 +180,8 @@ def test_what_a_prior_rules_out_stays_so(localizer, touch):
     ruled_out = localizer.index.poses()[:, 0, 3] >= 0
     assert not np.exp(known.cell_log_prob)[ruled_out[known.cells]].any()
     explored, index = known.explored, localizer.index
-    place = located(index, explored.poses)[0].place
-    assert np.isfinite(prior_at(index, explored.density.target.log_prior, place, explored.depth)).all()
+    poses, _ = located(index, explored.poses)
+    assert np.isfinite(explored.density.target.prior.log_density(poses, explored.depth)).all()
 
 
 def test_the_same_seed_gives_the_same(localizer, touch, posterior):

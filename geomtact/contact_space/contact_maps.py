@@ -31,6 +31,7 @@ from geomtact.sensing.sensor import Sensor
 SHAPE = (48, 64)  # samples of the window, lying
 _PIXELS_PER_SAMPLE = 2  # of the height maps
 _THREADS = 2
+_CENTRING = 1.5  # samples of the window
 _PART = 256  # poses that a thread takes at a time
 _FORMAT = 1  # of the file in an index's folder
 _LEVELS = 65_534  # of the heights in it, besides one for where the object is not
@@ -212,6 +213,11 @@ def _read(path: Path) -> NDArray[np.float32] | None:
             images = list(pool.map(_decoded, np.split(coded, ends[:-1])))
         return _heights(np.stack(images), float(low), float(step))
     return None
+
+
+def centring_std(sensor: Sensor) -> float:
+    """Standard deviation [m] by which objects are placed about where a contact's centroid is the observed one."""
+    return _CENTRING * sample_pitch(sensor)
 
 
 def sample_pitch(sensor: Sensor) -> float:

@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
-from geomtact.inference.particles import OtherSensor, Particles, Target, prior_at, tempered
+from geomtact.inference.particles import OtherSensor, Particles, Target, tempered
+from geomtact.inference.pose_prior import pose_prior_of
 from geomtact.inference.systematic_errors import nodes, nodes_beside, undisplaced
 from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
 from geomtact.se3 import Array, check_pose, check_transforms
@@ -96,9 +97,10 @@ class Density:
         asked = Placements(place, poses.direction[rows], poses.rotation[rows], flat[:, :2], reach)
         cut = ContactMaps.of(index).compare(query.samples, query.area, asked, flat[:, 2])
         each = self.by_power(query.log_likelihood(cut.energy), self.target.log_coarse[place])
-        prior = prior_at(index, self.target.log_prior, place, cut.reach - flat[:, 2])
+        if self.target.prior is not None:
+            each += self.target.prior.log_density(asked, cut.reach - flat[:, 2])[:, None]
         # volumes with errors are larger
-        each = (each + prior[:, None]).reshape(n, len(errors), -1) + (log_weight - 3 * errors[:, 0])[:, None]
+        each = each.reshape(n, len(errors), -1) + (log_weight - 3 * errors[:, 0])[:, None]
         out = np.asarray(np.logaddexp.reduce(each, 1))
         powers = np.array(self.powers)[self._sure]
         for other in self.target.others:
@@ -190,7 +192,7 @@ class Explored:
             "powers": np.array(self.density.powers),
             "log_inside": np.array(self.density.log_inside),
             "log_coarse": target.log_coarse.astype(np.float32),
-            "log_prior": np.zeros(0) if target.log_prior is None else target.log_prior,
+            **({} if target.prior is None else target.prior.arrays()),
             "contacts": np.array(self.contacts),
             "hearts": self.hearts,
             "masses": self.masses,
@@ -211,7 +213,7 @@ class Explored:
             They are not what it gives, or the index of another sensor cannot be opened.
         """
         T, log_coarse = check_transforms(arrays["T"]), arrays["log_coarse"].astype(float)
-        log_prior = arrays["log_prior"] if len(arrays["log_prior"]) else None
+        prior = pose_prior_of(index, arrays)
         if not 1 < len(arrays["log_evidence"]) == len(arrays["powers"]) <= len(POWERS) or not len(T) == len(
             arrays["depth"]
         ) == len(arrays["log_density"]):
@@ -219,7 +221,7 @@ class Explored:
         hearts = check_transforms(arrays["hearts"])
         if len(hearts) != len(arrays["masses"]):
             raise ValueError("modes without their masses")
-        if len(log_coarse) != index.places or (log_prior is not None and len(log_prior) != len(index)):
+        if len(log_coarse) != index.places:
             raise ValueError("densities that are not of its grid")
         others = []
         for i in range(int(arrays["others"])):
@@ -228,7 +230,7 @@ class Explored:
             T_sensor_first = check_pose(its["T_sensor_first"], "T_sensor_first")
             std = ExtrinsicsStd(*its["extrinsics_std"].tolist()) if len(its["extrinsics_std"]) else None
             others.append(OtherSensor(on, _query(its, on), T_sensor_first, std))
-        target = Target(index, _query(arrays, index), log_coarse, log_prior, tuple(others))
+        target = Target(index, _query(arrays, index), log_coarse, prior, tuple(others))
         return cls(
             Density(
                 target,

@@ -188,7 +188,7 @@ def fused_posterior(
         register = mode_refiners[posterior.provenance.base].registering(
             posterior.index, joint_problem(views, ROUGH_POINTS)
         )
-    posterior = resolve_touches(posterior, touches, log_prior, effort, extrinsics_std, register)
+    posterior = resolve_touches(posterior, touches, prior, log_prior, effort, extrinsics_std, register)
     if not effort.modes:
         return posterior
     with timed(timing, "refine"):

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.contact_space.cell_transfer import MISSED_CONTACT_SHARE, ExtrinsicsStd
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
+from geomtact.inference.pose_prior import PosePrior
 from geomtact.inference.systematic_errors import ERRORS, displaced, errors_of, stand_of
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
 from geomtact.se3 import Array, inverse, transform
@@ -129,14 +130,14 @@ class Target:
     ----------
     index, query : all touches of the object on the first sensor that shows contact, and that contact
     log_coarse : (n,) log density of the coarse posterior at the places of the index, without the prior
-    log_prior : (N,) log density of the prior in the cells of the index; None for the uniform
+    prior : None for the uniform
     others : the other sensors
     """
 
     index: Index
     query: ContactQuery
     log_coarse: Array
-    log_prior: NDArray[np.floating] | None
+    prior: PosePrior | None
     others: tuple[OtherSensor, ...] = ()
 
     @property
@@ -181,7 +182,7 @@ class Target:
         depth = np.where(ok, depth, 0.0)
         log_likelihood = np.full(len(depth), -np.inf)
         log_likelihood[ok] = self.query.log_likelihood(cut.energy[ok])
-        log_prior = prior_at(self.index, self.log_prior, poses.place, depth)
+        log_prior = np.zeros(n) if self.prior is None else self.prior.log_density(poses, depth)
         missed, by_sensor = np.zeros(n, bool), np.full(errors.shape[:2], -np.inf)
         if self.others and ok.any():
             by_sensor[:, 0] = log_likelihood
@@ -243,10 +244,3 @@ def tempered(log_likelihood: Array, log_coarse: Array, power: float) -> Array:
     if power > 0:
         out = out + power * log_likelihood
     return out
-
-
-def prior_at(index: Index, log_prior: NDArray[np.floating] | None, place: NDArray[np.int64], depth: Array) -> Array:
-    """Log density (n,) of the prior, known in the cells of ``index``, at places (n,) and penetrations (n,) [m]."""
-    if log_prior is None:
-        return np.zeros(len(place))
-    return log_prior[index.level_of(place, depth) * index.places + place].astype(float)

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from geomtact.contact_space.contact_maps import located, sample_pitch
+from geomtact.contact_space.contact_maps import centring_std, located
 from geomtact.inference.particles import Particles, Target, poses_of
 from geomtact.se3 import Array, exp, inverse, log, transform
 
 # All choose where poses are drawn: they change how precise the evidence is, not what is estimated.
 MOVES = 2  # of every pose at each step
-WIDTH = 1.5  # standard deviation of where the contact is, in samples of the window
 _KEPT = 0.6  # share of the poses that the weights of a step leave effective
 _ACCEPTED = 0.25  # share of moves accepted at which their size stays
 _SMALL = 0.5  # share of the moves that are small motions
@@ -189,7 +188,7 @@ def _nudged(target: Target, T: Array, size: float, rng: np.random.Generator) -> 
     if target.index.space.on_known_faces:
         rotvec[:, :2] = 0
     turn = Rotation.from_rotvec(rotvec).as_matrix()
-    shift = scale * WIDTH * sample_pitch(target.index.sensor) * rng.normal(size=(n, 3))
+    shift = scale * centring_std(target.index.sensor) * rng.normal(size=(n, 3))
     about = target.query.centroid
     where = np.einsum("nij,nj->ni", turn, T[:, :3, 3] - about) + about + shift
     return transform(turn @ T[:, :3, :3], where)

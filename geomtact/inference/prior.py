@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError, UsageError
 from geomtact.geometry.mesh import Mesh
-from geomtact.inference.densities import GaussianPrior, LogDensity, OfAllImages, OfPoses, likeliest_images
+from geomtact.inference.densities import LogDensity, OfAllImages, OfPoses, likeliest_images
+from geomtact.inference.gaussian_prior import GaussianPrior
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior_cells import log_mass_of_density, log_mass_of_poses, log_mass_of_posterior, stands_as
 from geomtact.inference.reference import Reference

@@ -9,7 +9,6 @@ from geomtact.contact_space.cell_transfer import CellTransfer
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.densities import (
-    GaussianPrior,
     LogDensity,
     NoContactDensity,
     OfAllImages,
@@ -18,6 +17,7 @@ from geomtact.inference.densities import (
     over_images,
 )
 from geomtact.inference.distribution import cell_densities, cell_log_density
+from geomtact.inference.gaussian_prior import GaussianPrior
 from geomtact.inference.posterior import Posterior
 from geomtact.log_mass import log_mean_of_counted, normalised
 from geomtact.se3 import Array, inverse
@@ -25,8 +25,9 @@ from geomtact.sensing.sensor import Sensor
 
 _CHUNK = 1 << 16
 _DRAWN = 1024  # poses drawn from a Gaussian at a time; hand-set, as are the next three
-_BATCHES, _TOUCHING = 8, 1000  # largest number of such draws, and number of touching poses at which they end
+_BATCHES, _TOUCHING = 3, 500  # largest number of such draws, and number of touching poses at which they end
 _FARTHEST = 8.0  # largest distance of a touching pose from a Gaussian widened by a cell, in standard deviations
+_NEGLIGIBLE = -20.0  # log density of a cell over the largest, below which it is not needed exactly
 _LOOK = (24, 32)  # rays by which poses that cannot touch are left out
 
 
@@ -110,7 +111,7 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     assert index.mesh.symmetry is not None
     cell = index.cell_covariance(inverse(T_frame_sensor) @ prior.T)
     wide = GaussianPrior(prior.T, over_images(prior, index.mesh.symmetry).covariance + cell)
-    density = _over_images(index, lambda T: wide(T_frame_sensor @ T))
+    density = _density_of_gaussian(index, wide, T_frame_sensor)
     if density[index.possible].max() < -0.5 * _FARTHEST**2:
         raise InputError(
             f"prior: no pose that touches the sensor lies within about {_FARTHEST:.0f} of its standard deviations, even "
@@ -134,6 +135,24 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
     drawn = np.bincount(cells, minlength=len(index))
     with np.errstate(divide="ignore"):
         return np.asarray(np.log((drawn + spread * mass) / (len(cells) + spread)), np.float32)
+
+
+def _density_of_gaussian(index: Index, wide: GaussianPrior, T_frame_sensor: Array) -> Array:
+    """Log density (N,) of a Gaussian in all cells; an upper bound where the rotation alone makes it negligible."""
+    assert index.mesh.symmetry is not None
+    R = (inverse(T_frame_sensor) @ wide.T)[:3, :3]
+    turned = np.einsum(
+        "mij,ik,gjk->mg", index.rotations, R, images(index.mesh.symmetry)[:, :3, :3].swapaxes(1, 2), optimize=True
+    )
+    angle = np.arccos(np.clip(0.5 * (turned.max(1) - 1), -1, 1))
+    bound = -0.5 * angle**2 / np.linalg.eigvalsh(wide.covariance[:3, :3])[-1]
+    out = np.tile(bound[index.rotation], len(index.height))
+    for least in (_NEGLIGIBLE, -np.inf):
+        near = np.flatnonzero(out >= least)
+        out[near] = _over_images(index, lambda T: wide(T_frame_sensor @ T), near)
+        if out[near].max(initial=-np.inf) > least:
+            break
+    return out
 
 
 def _on_another_grid(index: Index, prior: Posterior) -> Array:
@@ -189,8 +208,8 @@ def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
     return out
 
 
-def _over_images(index: Index, density: LogDensity) -> Array:
-    """Log of the mean of exp(``density``) over the images of every cell's pose under the object's symmetry (N,).
+def _over_images(index: Index, density: LogDensity, cells: NDArray[np.int64] | None = None) -> Array:
+    """Log of the mean of exp(``density``) over the images of each cell's pose under the symmetry (n,), of all by default.
 
     A cell stands for all of these images. Those that the approach rules out do not count.
     """
@@ -206,14 +225,12 @@ def _over_images(index: Index, density: LogDensity) -> Array:
             each[i, ok] = density(image[ok])
         return log_mean_of_counted(each, allowed)
 
-    return _by_chunks(index, density if len(symmetric) == 1 else mean)
+    return _by_chunks(index, density if len(symmetric) == 1 else mean, cells)
 
 
-def _by_chunks(index: Index, density: LogDensity) -> Array:
-    """``density`` at the pose of every cell (N,)."""
+def _by_chunks(index: Index, density: LogDensity, cells: NDArray[np.int64] | None = None) -> Array:
+    """``density`` at the pose of each of ``cells`` (n,), of all by default."""
+    cells = np.arange(len(index)) if cells is None else cells
     return np.concatenate(
-        [
-            density(index.poses(np.arange(start, min(start + _CHUNK, len(index)))))
-            for start in range(0, len(index), _CHUNK)
-        ]
+        [density(index.poses(cells[start : start + _CHUNK])) for start in range(0, len(cells), _CHUNK)]
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from geomtact.errors import InputError
 from geomtact.inference.distribution import cell_densities
 from geomtact.inference.effort import Effort
 from geomtact.inference.particles import OtherSensor
+from geomtact.inference.pose_prior import prior_at_poses
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.registered import Register
 from geomtact.inference.timing import timed
@@ -25,27 +27,33 @@ LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None fo
 
 
 def resolve_touch(
-    posterior: Posterior, log_prior: LogMass, scorer: FittedScorer, effort: Effort, alone: Posterior | None = None
+    posterior: Posterior,
+    prior: Any,
+    log_prior: LogMass,
+    scorer: FittedScorer,
+    effort: Effort,
+    alone: Posterior | None = None,
 ) -> Posterior:
     """The ``posterior`` of one mask, resolved within the cells by the contacts of ``effort``.
 
-    It is as it was without contact, or with depths. ``log_prior`` is as of ``single_touch.touch_posterior``, ``alone`` the
-    posterior of the same image without it, where that is known.
+    It is as it was without contact, or with depths. ``prior`` and ``log_prior`` are as of ``single_touch.touch_posterior``,
+    ``alone`` is the posterior of the same image without them, where that is known.
     """
     if log_prior is None or not _can_resolve([posterior], effort):
-        return _resolved(posterior, [posterior], None, None, effort)
+        return _resolved(posterior, [posterior], None, None, None, effort)
     assert posterior.observation is not None
     if alone is not None:
         coarse = (cell_densities(alone).reshape(alone.index.weight.shape) * alone.index.weight).sum(0, dtype=float)
     else:
         # cells that the prior rules out have no mass in the posterior
         coarse = np.exp(scorer.log_mass(posterior.index, posterior.observation.contact.soft_mask)).sum(0)
-    return _resolved(posterior, [posterior], coarse, log_prior, effort)
+    return _resolved(posterior, [posterior], coarse, prior, log_prior, effort)
 
 
 def resolve_touches(
     posterior: Posterior,
     touches: Sequence[Posterior],
+    prior: Any,
     log_prior: LogMass,
     effort: Effort,
     extrinsics_std: ExtrinsicsStd | None = None,
@@ -53,9 +61,9 @@ def resolve_touches(
 ) -> Posterior:
     """The ``posterior`` of several sensors' masks, resolved within the cells of the first with contact.
 
-    It is as it was with depths. ``touches`` and ``log_prior`` are as of ``fusion.fused_posterior``.
+    It is as it was with depths. ``touches``, ``prior`` and ``log_prior`` are as of ``fusion.fused_posterior``.
     """
-    return _resolved(posterior, touches, None, log_prior, effort, extrinsics_std, register)
+    return _resolved(posterior, touches, None, prior, log_prior, effort, extrinsics_std, register)
 
 
 def _can_resolve(touches: Sequence[Posterior], effort: Effort) -> bool:
@@ -68,6 +76,7 @@ def _resolved(
     posterior: Posterior,
     touches: Sequence[Posterior],
     coarse: Array | None,
+    prior: Any,
     log_prior: LogMass,
     effort: Effort,
     extrinsics_std: ExtrinsicsStd | None = None,
@@ -76,14 +85,15 @@ def _resolved(
     """``coarse`` (n,) is the mass of the places without the prior, by default that of ``posterior``, divided by the prior."""
     if not _can_resolve(touches, effort):
         return posterior
-    index, prior = posterior.index, None
+    index, at_poses = posterior.index, None
     with timed(posterior.timing_ms, "explore"):
         if log_prior is not None:
-            prior = np.where(index.log_weight > -np.inf, log_prior - np.maximum(index.log_weight, -1e3), -np.inf)
+            in_cells = np.where(index.log_weight > -np.inf, log_prior - np.maximum(index.log_weight, -1e3), -np.inf)
+            at_poses = prior_at_poses(index, in_cells, prior, posterior.T_frame_sensor)
         if coarse is None:
             density = cell_densities(posterior)
-            if prior is not None:
-                density = np.where(prior > -np.inf, density * np.exp(-np.maximum(prior, -1e3)), 0)
+            if at_poses is not None:
+                density = np.where(in_cells > -np.inf, density * np.exp(-np.maximum(in_cells, -1e3)), 0)
             coarse = (density.reshape(index.weight.shape) * index.weight).sum(0, dtype=float)
         first = next(touch for touch in touches if touch.contact)
         others = [
@@ -96,7 +106,7 @@ def _resolved(
         rng = np.random.default_rng(posterior.seed)
         try:
             contacts = effort.several if others else effort.contacts
-            explored = explore_twice(index, _query(first), coarse, contacts, rng, prior, others, register)
+            explored = explore_twice(index, _query(first), coarse, contacts, rng, at_poses, others, register)
         except InputError as error:
             warning = f"the pose is not resolved within the grid's cells: {error}"
             return replace(posterior, warnings=[*posterior.warnings, warning])

@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from geomtact.contact_space.contact_maps import ContactMaps, Placements, sample_pitch
+from geomtact.contact_space.contact_maps import ContactMaps, Placements, centring_std
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.explored import Density
 from geomtact.inference.particles import SURE, OtherSensor, Particles, Target
-from geomtact.inference.population import MOVES, WIDTH, Population, effective, resampled, systematic
+from geomtact.inference.population import MOVES, Population, effective, resampled, systematic
+from geomtact.inference.pose_prior import NormalPrior, PosePrior
 from geomtact.inference.registered import AboutModes, Register, bridged, starts, united
 from geomtact.inference.systematic_errors import ERRORS
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
@@ -81,7 +82,7 @@ def explore(
     coarse: Array,
     contacts: int,
     rng: np.random.Generator,
-    log_prior: NDArray[np.floating] | None = None,
+    prior: PosePrior | None = None,
     others: Sequence[OtherSensor] = (),
     runs: int = 1,
     register: Register | None = None,
@@ -91,7 +92,7 @@ def explore(
     Parameters
     ----------
     coarse : (n,) mass of the places of the index in a coarse posterior; a share of the uniform one is mixed in
-    log_prior : (N,) log density of the prior in the cells of the index, relative to the uniform; None for the uniform
+    prior : None for the uniform
     others : the other sensors that touch the object, or do not
     register : poses to all contacts together, where there are several
 
@@ -100,7 +101,7 @@ def explore(
     InputError
         No pose that was drawn touches the sensor, or none that was found touches all that show contact.
     """
-    target, share, known = _coarse_target(index, query, coarse, log_prior, others)
+    target, share, known = _coarse_target(index, query, coarse, prior, others)
     usual = _DRAWS * _CUTS + MOVES * _STEPS
     numbers = [max(contacts // usual, 20)] * len(POWERS)
     if others:
@@ -108,11 +109,15 @@ def explore(
     number = dict(zip(POWERS, numbers, strict=False))
     largest = max(number)
     drawn, log_weight, cut = _draw(target, share, runs, _DRAWS * numbers[0], rng)
-    # the evidence of the coarse posterior is known: what is left is an error of the measure, which all poses of a run share
+    if isinstance(prior, NormalPrior):
+        drawn, log_weight, more = _or_by_prior(target, prior, drawn, log_weight, rng)
+        cut += more
     whole = np.logaddexp.reduce(log_weight + drawn.log_target(0).reshape(runs, -1), 1)
     if not np.isfinite(whole).all():
         raise InputError(f"{index.mesh.name}: no pose that was drawn touches the sensor; allow more contacts")
-    stops, power, population = _begun(target, drawn, log_weight + (known - whole)[:, None], number, rng)
+    # the evidence of the coarse posterior is known: what is left is an error of the measure, which all poses of a run share
+    log_measure = np.zeros(runs) if isinstance(prior, NormalPrior) else known - whole
+    stops, power, population = _begun(target, drawn, log_weight + log_measure[:, None], number, rng)
     population.contacts = cut
     seen, about = [population.particles], None
     while True:
@@ -130,7 +135,7 @@ def explore(
         power = after if step == after - power else power + step
         if others and power == SURE:
             about = AboutModes.of(target, starts(seen, rng), register) if register else None
-            surely = _surely(population, about, known - whole)
+            surely = _surely(population, about, log_measure)
             if surely is None:
                 break
             population = surely
@@ -142,7 +147,7 @@ def explore(
             Density(target, tuple(float(each[run]) for each in evidence), powers),
             tuple(each.take(np.arange(len(each)).reshape(runs, -1)[run]) for each in found),
             population.contacts // runs,
-            float(known - whole[run]),
+            float(log_measure[run]),
             population.best,
             about,
         )
@@ -154,7 +159,7 @@ def _coarse_target(
     index: Index,
     query: ContactQuery,
     coarse: Array,
-    log_prior: NDArray[np.floating] | None,
+    prior: PosePrior | None,
     others: Sequence[OtherSensor],
 ) -> tuple[Target, Array, float]:
     """What poses are judged by, arguments as of :func:`explore`; in proportion to what places are drawn (n,); and the log of the
@@ -163,10 +168,10 @@ def _coarse_target(
     measure = cells.sum(0)
     share = (1 - _UNIFORM) * coarse / coarse.sum() + _UNIFORM * measure
     log_coarse = np.log(share / measure).astype(np.float32).astype(float)  # as files hold it
-    target = Target(index, query, log_coarse, log_prior, tuple(others))
-    if log_prior is None:
+    target = Target(index, query, log_coarse, prior, tuple(others))
+    if prior is None:
         return target, share, 0.0
-    share = share / measure * (cells * np.exp(log_prior.reshape(cells.shape))).sum(0)
+    share = share / measure * (cells * np.exp(prior.in_cells.reshape(cells.shape))).sum(0)
     return target, share, float(np.log(share.sum()))
 
 
@@ -228,12 +233,34 @@ def _draw(target: Target, share: Array, runs: int, n: int, rng: np.random.Genera
     reach = index.height[0, place].astype(float) + index.resolution.penetrations[0]
     poses = Placements(place, direction, rotation, middle, reach)
     about, cut = _aligned(target, poses, step)
-    centre, density = _centres(about, middle, step, WIDTH * sample_pitch(index.sensor), rng)
+    centre, density = _centres(about, middle, step, centring_std(index.sensor), rng)
     depth = index.sensor.max_penetration * rng.random(len(place))
     errors = rng.random((len(place), target.carried, ERRORS))
     particles = target.admitted(target.evaluated(replace(poses, centre=centre), depth=depth, errors=errors))
     log_weight = np.log(index.cell_measure[place]) - np.log(share[place]) - np.log(density * n)
     return particles, log_weight.reshape(runs, n), cut + len(place) * target.sensors
+
+
+def _or_by_prior(
+    target: Target, prior: NormalPrior, drawn: Particles, log_weight: Array, rng: np.random.Generator
+) -> tuple[Particles, Array, int]:
+    """Poses ``drawn`` in the cells, or as many that are drawn from the ``prior``, of whichever more are effective; their log
+    weights (runs, n) as of :func:`_draw`, and how many contacts were cut."""
+    poses, depth, log_ratio, rotation = prior.draw(len(drawn), target.query, rng)
+    errors = rng.random((len(drawn), target.carried, ERRORS))
+    others = target.admitted(target.evaluated(poses, depth=depth, errors=errors))
+    height = np.where(np.isfinite(others.poses.reach), others.poses.reach, 0.0) - depth
+    # an image of the pose stands for itself alone
+    own = prior.of_image(rotation, poses.centre, height) - others.log_prior
+    by_prior = (log_ratio + own).reshape(log_weight.shape) - np.log(log_weight.shape[1])
+    more = (1 + target.sensors) * len(drawn)
+
+    def enough(particles: Particles, weight: Array) -> float:
+        return float(effective(weight + particles.log_target(_EXPONENTS[0]).reshape(weight.shape)).min())
+
+    if enough(others, by_prior) > enough(drawn, log_weight):
+        return others, by_prior, more
+    return drawn, log_weight, more
 
 
 def _aligned(target: Target, poses: Placements, step: float) -> tuple[Array, int]:
@@ -250,7 +277,7 @@ def _aligned(target: Target, poses: Placements, step: float) -> tuple[Array, int
         centre[near] += np.where(touches, query.centroid[:2] - found.centroid, np.nan)
         reach[near] = found.reach
         off = np.abs(centre - poses.centre).max(1)
-        inside = off <= 0.5 * step + 2 * WIDTH * sample_pitch(target.index.sensor)
+        inside = off <= 0.5 * step + 2 * centring_std(target.index.sensor)
         centre[~inside] = np.nan
         near = np.flatnonzero(inside)
     return centre, cut

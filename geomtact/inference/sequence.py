@@ -108,7 +108,7 @@ def make_filter(
 
 def _resolved_by(prepared: PreparedObject, effort: Effort) -> Resolve:
     def resolve(posterior: Posterior, log_prior: NDArray[np.floating] | None, alone: Posterior) -> Posterior:
-        posterior = resolve_touch(posterior, log_prior, prepared.scorer, effort, alone)
+        posterior = resolve_touch(posterior, None, log_prior, prepared.scorer, effort, alone)
         if posterior.explored is None:
             return posterior
         return refine_modes(posterior, log_prior, prepared.mode_refiner, effort)

@@ -45,6 +45,11 @@ class Student:
 def log_volume(turn: Array, axes: int) -> Array:
     """Log (n,) of the uniform measure of a small volume of motions that turn by ``turn`` (n,) [rad], about some of so many
     ``axes``, over that at no turn."""
-    half = np.sinc(turn / (2 * np.pi)) ** 2  # of the shifts
-    of_turns = {2: np.sinc(turn / np.pi), 3: half}.get(axes, np.ones_like(turn))
-    return np.asarray(np.log(np.maximum(half * of_turns, 1e-300)))
+    of_shifts = np.log(np.maximum(np.sinc(turn / (2 * np.pi)) ** 2, 1e-300))
+    return np.asarray(of_shifts + log_volume_of_turns(turn, axes))
+
+
+def log_volume_of_turns(turn: Array, axes: int) -> Array:
+    """As :func:`log_volume`, of the turns alone."""
+    volume = {2: np.sinc(turn / np.pi), 3: np.sinc(turn / (2 * np.pi)) ** 2}.get(axes, np.ones_like(turn))
+    return np.asarray(np.log(np.maximum(volume, 1e-300)))

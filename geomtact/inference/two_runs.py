@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
@@ -21,6 +20,7 @@ from geomtact.inference.facts import UNEXPLAINED_NATS
 from geomtact.inference.mode_mass import counted, weighed
 from geomtact.inference.particles import OtherSensor, Particles
 from geomtact.inference.population import systematic
+from geomtact.inference.pose_prior import PosePrior
 from geomtact.inference.registered import Register
 from geomtact.inference.sampler import Run, explore
 from geomtact.inference.systematic_errors import NODES, NODES_BESIDE, random_errors
@@ -44,7 +44,7 @@ def explore_twice(
     coarse: Array,
     contacts: int,
     rng: np.random.Generator,
-    log_prior: NDArray[np.floating] | None = None,
+    prior: PosePrior | None = None,
     others: Sequence[OtherSensor] = (),
     register: Register | None = None,
 ) -> Explored:
@@ -63,7 +63,7 @@ def explore_twice(
     cut = 0
     attempts = (contacts // _MORE, contacts) if others else (contacts // _MORE**2, contacts // _MORE, contacts)
     for asked in attempts:
-        one, other = explore(index, query, coarse, asked // 2, rng, log_prior, others, 2, register)
+        one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, register)
         cut += one.contacts + other.contacts
         unexplained = _unexplained(one, other) if others else None
         if unexplained is not None and unexplained > UNEXPLAINED_NATS:

@@ -90,7 +90,7 @@ def follow(
         for T, cell, mask in zip(poses, cells, trajectory.masks, strict=True):
             of_cells = localizer.localize(mask, kind="mask", effort="fast", seed=seed)
             near, tie = cells_near(localizer.index, distance, T, radius), rng.random()
-            found = {"frames": resolve_touch(of_cells, None, localizer.scorer, resolved)}
+            found = {"frames": resolve_touch(of_cells, None, None, localizer.scorer, resolved)}
             found |= {method: each.step(of_cells) for method, each in filters.items()}
             for method, posterior in found.items():
                 if posterior.explored is None:
