@@ -21,7 +21,7 @@ PICTURES = {
     "geomtact/study/3": {"calibration": "localize.draw_answers"},
     "geomtact/thesis-table/2": {"errors": "thesis.draw_thesis"},
     "geomtact/touches/1": {"touches": "touches.draw_touches"},
-    "geomtact/track/1": {"track": "track.draw_track"},
+    "geomtact/track/2": {"track": "track.draw_track"},
 }
 
 

@@ -13,7 +13,7 @@ from geomtact.cli.shell import print_table, to_stderr
 from geomtact.cli.simulate import NoiseName
 from tools.studies.common import study_file, study_options
 
-SCHEMA = "geomtact/track/1"
+SCHEMA = "geomtact/track/2"
 
 
 def judge_track(

@@ -39,7 +39,7 @@ def draw_track(content: Mapping[str, Any]) -> bytes:
     right.set_xlabel("trajectories, object by object")
     right.set_ylabel("filter less independent frames [nats]")
     right.set_title("Each trajectory, mean over its frames")
-    right.legend(frameon=False, fontsize=8, loc="lower right")
+    right.legend(frameon=False, fontsize=8, loc="lower left")
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3, axis="y")
