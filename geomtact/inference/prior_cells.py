@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from geomtact.contact_space.cell_transfer import CellTransfer
 from geomtact.contact_space.index import Index
@@ -20,14 +21,13 @@ from geomtact.inference.distribution import cell_densities, cell_log_density
 from geomtact.inference.gaussian_prior import GaussianPrior
 from geomtact.inference.posterior import Posterior
 from geomtact.log_mass import log_mean_of_counted, normalised
-from geomtact.se3 import Array, inverse
+from geomtact.se3 import Array, adjoint, inverse, left_jacobian, transform
 from geomtact.sensing.sensor import Sensor
 
 _CHUNK = 1 << 16
 _DRAWN = 1024  # poses drawn from a Gaussian at a time; hand-set, as are the next three
 _BATCHES, _TOUCHING = 3, 500  # largest number of such draws, and number of touching poses at which they end
 _FARTHEST = 8.0  # largest distance of a touching pose from a Gaussian widened by a cell, in standard deviations
-_NEGLIGIBLE = -20.0  # log density of a cell over the largest, below which it is not needed exactly
 _LOOK = (24, 32)  # rays by which poses that cannot touch are left out
 
 
@@ -137,22 +137,35 @@ def _of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> N
         return np.asarray(np.log((drawn + spread * mass) / (len(cells) + spread)), np.float32)
 
 
-def _density_of_gaussian(index: Index, wide: GaussianPrior, T_frame_sensor: Array) -> Array:
-    """Log density (N,) of a Gaussian in all cells; an upper bound where the rotation alone makes it negligible."""
+def _density_of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Array) -> Array:
+    """Log density (N,) of a Gaussian in all cells, the mean over the images under the symmetry; an upper bound where the rotation
+    alone is too far.
+
+    Given a rotation, xi is linear in where the object's centre is: so the logarithm is taken of the rotations alone.
+    """
     assert index.mesh.symmetry is not None
-    R = (inverse(T_frame_sensor) @ wide.T)[:3, :3]
-    turned = np.einsum(
-        "mij,ik,gjk->mg", index.rotations, R, images(index.mesh.symmetry)[:, :3, :3].swapaxes(1, 2), optimize=True
-    )
-    angle = np.arccos(np.clip(0.5 * (turned.max(1) - 1), -1, 1))
-    bound = -0.5 * angle**2 / np.linalg.eigvalsh(wide.covariance[:3, :3])[-1]
-    out = np.tile(bound[index.rotation], len(index.height))
-    for least in (_NEGLIGIBLE, -np.inf):
-        near = np.flatnonzero(out >= least)
-        out[near] = _over_images(index, lambda T: wide(T_frame_sensor @ T), near)
-        if out[near].max(initial=-np.inf) > least:
-            break
-    return out
+    expected = inverse(T_frame_sensor) @ prior.T
+    R, middle = expected[:3, :3], index.mesh.centre
+    to_centre = adjoint(transform(np.eye(3), -middle))
+    covariance = to_centre @ prior.covariance @ to_centre.T
+    turns, gain = covariance[:3, :3], np.linalg.solve(covariance[:3, :3], covariance[:3, 3:]).T
+    root = np.linalg.cholesky(np.linalg.inv(covariance[3:, 3:] - gain @ covariance[:3, 3:])).T
+    off = np.concatenate([np.broadcast_to(index.shift, (*index.height.shape, 2)), index.height[..., None]], -1)
+    off = off - (R @ middle + expected[:3, 3])
+    each, allowed = [], []
+    for S in images(index.mesh.symmetry):
+        w = Rotation.from_matrix(R.T @ index.rotations @ S[:3, :3]).as_rotvec()
+        of_turn = -0.5 * np.einsum("mi,mi->m", w, np.linalg.solve(turns, w.T).T)
+        log_density = np.tile(of_turn[index.rotation], (len(index.height), 1))
+        near = np.flatnonzero(of_turn[index.rotation] > -0.5 * _FARTHEST**2)
+        row = index.rotation[near]
+        along = (root @ np.linalg.inv(left_jacobian(w)) @ R.T)[row]
+        x = np.einsum("nij,lnj->lni", along, off[:, near]) - (w @ gain.T @ root.T)[row]
+        log_density[:, near] -= 0.5 * np.square(x).sum(-1)
+        each.append(log_density.ravel())
+        ok = index.space.approaches(transform(index.rotations @ S[:3, :3], np.zeros(3)))
+        allowed.append(np.tile(ok[index.rotation], len(index.height)))
+    return each[0] if len(each) == 1 else log_mean_of_counted(each, np.stack(allowed))
 
 
 def _on_another_grid(index: Index, prior: Posterior) -> Array:
@@ -208,8 +221,8 @@ def _carried(index: Index, prior: Posterior, T_frame_sensor: Array) -> Array:
     return out
 
 
-def _over_images(index: Index, density: LogDensity, cells: NDArray[np.int64] | None = None) -> Array:
-    """Log of the mean of exp(``density``) over the images of each cell's pose under the symmetry (n,), of all by default.
+def _over_images(index: Index, density: LogDensity) -> Array:
+    """Log of the mean of exp(``density``) over the images of every cell's pose under the object's symmetry (N,).
 
     A cell stands for all of these images. Those that the approach rules out do not count.
     """
@@ -225,12 +238,14 @@ def _over_images(index: Index, density: LogDensity, cells: NDArray[np.int64] | N
             each[i, ok] = density(image[ok])
         return log_mean_of_counted(each, allowed)
 
-    return _by_chunks(index, density if len(symmetric) == 1 else mean, cells)
+    return _by_chunks(index, density if len(symmetric) == 1 else mean)
 
 
-def _by_chunks(index: Index, density: LogDensity, cells: NDArray[np.int64] | None = None) -> Array:
-    """``density`` at the pose of each of ``cells`` (n,), of all by default."""
-    cells = np.arange(len(index)) if cells is None else cells
+def _by_chunks(index: Index, density: LogDensity) -> Array:
+    """``density`` at the pose of every cell (N,)."""
     return np.concatenate(
-        [density(index.poses(cells[start : start + _CHUNK])) for start in range(0, len(cells), _CHUNK)]
+        [
+            density(index.poses(np.arange(start, min(start + _CHUNK, len(index)))))
+            for start in range(0, len(index), _CHUNK)
+        ]
     )
