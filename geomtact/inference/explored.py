@@ -18,7 +18,7 @@ from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
 from geomtact.inference.particles import OtherSensor, Particles, Target, tempered
-from geomtact.inference.pose_prior import pose_prior_of
+from geomtact.inference.pose_prior import CellPrior, NormalPrior, pose_prior_of
 from geomtact.inference.systematic_errors import nodes, nodes_beside, undisplaced
 from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
 from geomtact.se3 import Array, check_pose, check_transforms
@@ -97,11 +97,13 @@ class Density:
         asked = Placements(place, poses.direction[rows], poses.rotation[rows], flat[:, :2], reach)
         cut = ContactMaps.of(index).compare(query.samples, query.area, asked, flat[:, 2])
         each = self.by_power(query.log_likelihood(cut.energy), self.target.log_coarse[place])
-        if self.target.prior is not None:
+        if isinstance(self.target.prior, CellPrior):
             each += self.target.prior.log_density(asked, cut.reach - flat[:, 2])[:, None]
         # volumes with errors are larger
         each = each.reshape(n, len(errors), -1) + (log_weight - 3 * errors[:, 0])[:, None]
         out = np.asarray(np.logaddexp.reduce(each, 1))
+        if isinstance(self.target.prior, NormalPrior):
+            out += self.target.prior.log_density(T)[:, None]
         powers = np.array(self.powers)[self._sure]
         for other in self.target.others:
             stand = nodes_beside(other.extrinsics_std)

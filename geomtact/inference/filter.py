@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,7 @@ _MOST_IMAGES = 1_000  # digests of the last frames that are kept, to detect a pr
 _LEADING_CELLS = 2_000  # densest cells of a posterior that the next frame is compared with; hand-set
 
 Counts = tuple[float, float | None]
-Resolve = Callable[[Posterior, NDArray[np.floating] | None, Posterior], Posterior]
+Resolve = Callable[[Posterior, Any, NDArray[np.floating] | None, Posterior], Posterior]
 CellLogProb = tuple[NDArray[np.int64], NDArray[np.floating]]  # cells, ascending, and the log probability of each
 
 
@@ -58,12 +59,14 @@ class Filter:
     ----------
     motion_kernel : what the object's motion makes of a distribution
     within : (6, 6) covariance of the difference between a contact's moments and those stored for its cell
-    counts : powers of a frame's likelihood in its own posterior and in those of all later frames. With None for the latter,
-        all earlier frames have ``MEMORY_POWER`` together; a new one replaces them by how far the contact changed
+    counts : powers of a frame's likelihood over the cells, in its own posterior and in those of all later frames. With None for
+        the latter, all earlier frames have ``MEMORY_POWER`` together; a new one replaces them by how far the contact changed
     fresh : share of the uniform distribution that is mixed in before a frame; with 0, dropped cells stay impossible
     most : largest number of cells that are kept
-    resolve : the posterior within the cells, from that over the cells, the log mass (N,) that each cell was expected to have,
-        None where nothing was, and the frame's own posterior; None leaves the cells as they are
+    resolve : the posterior within the cells, from that over the cells, the prior that was given for this frame, the log mass (N,)
+        that each cell was expected to have, None where nothing was, and the frame's own posterior; None leaves the cells as they
+        are
+    prior : that was given for the next frame, whose mass the memory has
     memory : the distribution that is predicted for the next frame, while the object does not move
     leading : the leading cells of the last posterior; None before the first frame
     T_frame_sensor : (4, 4) of the last frame
@@ -77,6 +80,7 @@ class Filter:
     fresh: float = UNIFORM_SHARE
     most: int | None = None
     resolve: Resolve | None = None
+    prior: Any = None
     memory: Mixture = field(default_factory=Mixture)
     leading: Mixture | None = None
     T_frame_sensor: Array | None = None
@@ -133,9 +137,11 @@ class Filter:
         if result is not None:
             out = replace(out, cells=result[0], cell_log_prob=result[1], contact=True)
         if rests and repeated is not None:
-            out = replace(out, explored=repeated.explored)
+            found = replace(out.diagnostics, settled_power=repeated.diagnostics.settled_power)
+            out = replace(out, explored=repeated.explored, refined=repeated.refined, diagnostics=found)
         elif self.resolve is not None and seen.contact and repeated is None:
-            out = self.resolve(out, self._expected, seen)
+            out = self.resolve(out, self.prior, self._expected, seen)
+            self.prior = None
         self._last = out if out.contact and not out.diagnostics.is_skipped else None
         return out
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geomtact.errors import InputError
-from geomtact.se3 import Array, check_pose, exp, inverse, log
+from geomtact.se3 import Array, adjoint, check_pose, exp, inverse, log, transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +54,11 @@ class GaussianPrior:
         """Log density (n,), not normalised, at poses (n, 4, 4)."""
         xi = log(inverse(self.T) @ T)
         return np.asarray(-0.5 * np.einsum("ni,ni->n", xi, np.linalg.solve(self.covariance, xi.T).T))
+
+    def covariance_about(self, point: Array) -> Array:
+        """As :attr:`covariance`, of shifts of ``point`` (3,) of the object."""
+        to_point = adjoint(transform(np.eye(3), -point))
+        return np.asarray(to_point @ self.covariance @ to_point.T)
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """Up to ``n`` poses (m, 4, 4) from it: all of ``n`` draws of a narrow one, fewer of one with wide rotations."""

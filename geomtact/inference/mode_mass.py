@@ -16,7 +16,7 @@ from geomtact.contact_space.contact_maps import sample_pitch
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.explored import Explored
 from geomtact.inference.student import Student, log_volume
-from geomtact.inference.systematic_errors import random_errors
+from geomtact.inference.systematic_errors import ERRORS, errors_of
 from geomtact.se3 import Array, exp, inverse, log
 
 # These choose where the density is looked at: they change how precise a mass is, not what is estimated.
@@ -45,8 +45,8 @@ def weighed(
         draws = [mode.students[-1].draw(_DRAWS, rng) for mode in modes]
         xi = np.stack([each @ mode.basis for mode, each in zip(modes, draws, strict=True)])
         T = np.stack([mode.heart for mode in modes])[:, None] @ exp(xi)
-        errors = random_errors(len(modes) * _DRAWS, rng).reshape(*xi.shape[:2], -1)
-        moved = density.target.displaced(T, errors)
+        shares = rng.random((*xi.shape[:2], 4))
+        moved = density.target.displaced(T, errors_of(shares))
         near = np.array(
             [distance.within(mode.heart, each, radius) for mode, each in zip(modes, moved, strict=True)], bool
         )
@@ -55,7 +55,11 @@ def weighed(
         nearest = [_is_nearest(distance, mode.heart, each) for mode, each in zip(modes, T, strict=True)]
         near &= np.array(turn < np.pi, bool) & np.array(nearest, bool)
         found = np.full(near.shape, -np.inf)
-        particles = density.target.particles_at(T[near])
+        carried = None
+        if density.target.carried:
+            carried = np.full((int(near.sum()), 1, ERRORS), 0.5)
+            carried[:, 0, :4] = shares[near]
+        particles = density.target.particles_at(T[near], carried)
         log_density = density.of_exact(particles) + np.log(explored.index.uniform_density(T[near]))
         log_density += log_volume(turn[near], len(modes[0].basis) - 3)  # 0 or 1 turns, on a known face, give the same
         found[near] = np.where(np.isfinite(particles.log_likelihood), log_density, -np.inf)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from geomtact.contact_space.cell_transfer import MISSED_CONTACT_SHARE, ExtrinsicsStd
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
 from geomtact.contact_space.index import Index
-from geomtact.inference.pose_prior import PosePrior
+from geomtact.inference.pose_prior import CellPrior, NormalPrior, PosePrior
 from geomtact.inference.systematic_errors import ERRORS, displaced, errors_of, stand_of
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
 from geomtact.se3 import Array, inverse, transform
@@ -147,8 +147,9 @@ class Target:
 
     @property
     def carried(self) -> int:
-        """Of how many contacts particles carry the errors: those of one sensor alone do not matter to them."""
-        return self.sensors if self.others else 0
+        """Of how many contacts particles carry the errors: those of one sensor alone matter to a prior that is narrower than
+        them, and to nothing else."""
+        return self.sensors if self.others or isinstance(self.prior, NormalPrior) else 0
 
     @property
     def weights(self) -> Array:
@@ -182,12 +183,14 @@ class Target:
         depth = np.where(ok, depth, 0.0)
         log_likelihood = np.full(len(depth), -np.inf)
         log_likelihood[ok] = self.query.log_likelihood(cut.energy[ok])
-        log_prior = np.zeros(n) if self.prior is None else self.prior.log_density(poses, depth)
+        log_prior = self.prior.log_density(poses, depth) if isinstance(self.prior, CellPrior) else np.zeros(n)
         missed, by_sensor = np.zeros(n, bool), np.full(errors.shape[:2], -np.inf)
-        if self.others and ok.any():
+        if self.carried and ok.any():
             by_sensor[:, 0] = log_likelihood
             T = poses_of(found, depth, self.index.mesh.centre)[ok]
             T = self.displaced(T, errors_of(errors[ok, 0]))
+            if isinstance(self.prior, NormalPrior):
+                log_prior[ok] = self.prior.log_density(T)
             for number, other in enumerate(self.others, 1):
                 its, by = other.log_likelihood(T, stand_of(errors[ok, number], other.extrinsics_std))
                 by_sensor[ok, number] = its
@@ -199,7 +202,7 @@ class Target:
     def poses(self, particles: Particles) -> Array:
         """Where the object is (n, 4, 4) at ``particles`` (n,), with the errors that they carry."""
         T = poses_of(particles.poses, particles.depth, self.index.mesh.centre)
-        return self.displaced(T, errors_of(particles.errors[:, 0])) if self.others else T
+        return self.displaced(T, errors_of(particles.errors[:, 0])) if self.carried else T
 
     def particles_at(self, T: ArrayLike, errors: Array | None = None) -> Particles:
         """Poses ``T_sensor_object`` (n, 4, 4) as particles, with ``errors`` as of :meth:`evaluated`.

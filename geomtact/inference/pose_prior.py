@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,40 +17,25 @@ from geomtact.geometry.symmetry import Symmetry
 from geomtact.inference.gaussian_prior import GaussianPrior
 from geomtact.inference.student import log_volume_of_turns
 from geomtact.scoring.contact_likelihood import ContactQuery
-from geomtact.se3 import Array, exp, hat, inverse, left_jacobian, log, transform
+from geomtact.se3 import Array, exp, inverse, left_jacobian, log, transform
 
-_ALIGNED = 0.7  # share of the draws whose centre is aligned
-
-
-class PosePrior(Protocol):
-    """A density of the pose, up to a constant."""
-
-    def log_density(self, poses: Placements, depth: Array) -> Array:
-        """Log density (n,), relative to the uniform, at ``poses`` (n,) that press ``depth`` (n,) [m] deep."""
-        ...
-
-    @property
-    def in_cells(self) -> NDArray[np.floating]:
-        """Log density (N,) in the cells of the index, normalised."""
-        ...
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that makes it again, beside the index."""
-        ...
+ALIGNED = 0.7  # share of the draws whose centre is aligned
 
 
 @dataclass(frozen=True, eq=False)
 class CellPrior:
-    """A prior that is known in the cells of ``index``."""
+    """A prior that is known in the cells of ``index``, by its log density (N,), normalised."""
 
     index: Index
     in_cells: NDArray[np.floating]
 
     def log_density(self, poses: Placements, depth: Array) -> Array:
+        """Log density (n,), relative to the uniform, at ``poses`` (n,) that press ``depth`` (n,) [m] deep."""
         rows = self.index.level_of(poses.place, depth) * self.index.places + poses.place
         return np.asarray(self.in_cells[rows], float)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that makes it again, beside the index."""
         return {"log_prior": self.in_cells}
 
 
@@ -58,21 +43,33 @@ class CellPrior:
 class NormalPrior:
     """A Gaussian prior of the pose of the object of ``index``, in the sensor's frame.
 
-    All images of a pose under the object's symmetry count; turns about an axis of symmetry do not.
+    All images of a pose under the object's symmetry count alike that the approach allows. Of a turn about an axis of symmetry its
+    marginal distribution counts, which is exact while shifts are small against the object.
+
+    Attributes
+    ----------
+    in_cells : log density (N,) in the cells, normalised
     """
 
     index: Index
     in_cells: NDArray[np.floating]
     gaussian: GaussianPrior
 
-    def log_density(self, poses: Placements, depth: Array) -> Array:
-        # where nothing is touched there is no likelihood either
-        height = np.where(np.isfinite(poses.reach) & np.isfinite(depth), poses.reach - depth, 0.0)
-        # the centre stays where it is under the symmetry
-        each = [self.of_image(poses.rotation @ S[:3, :3], poses.centre, height) for S in self._symmetry.elements]
-        return np.asarray(np.logaddexp.reduce(each, 0))
+    def log_density(self, T: Array) -> Array:
+        """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4), up to a constant."""
+        allowed, images = self._images(T)
+        each = np.stack(
+            [np.where(ok, self.of_image(image), -np.inf) for ok, image in zip(allowed, images, strict=True)]
+        )
+        return np.asarray(np.logaddexp.reduce(each, 0) - np.log(np.maximum(allowed.sum(0), 1)))
+
+    def own_density(self, T: Array) -> Array:
+        """The part (n,) of :meth:`log_density` that images ``T`` (n, 4, 4) themselves have, not those under the symmetry."""
+        allowed, _ = self._images(T)
+        return np.where(allowed[0], self.of_image(T) - np.log(np.maximum(allowed.sum(0), 1)), -np.inf)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that makes it again, beside the index."""
         return {"log_prior": self.in_cells, "prior_T": self.gaussian.T, "prior_covariance": self.gaussian.covariance}
 
     def draw(self, n: int, query: ContactQuery, rng: np.random.Generator) -> tuple[Placements, Array, Array, Array]:
@@ -89,7 +86,8 @@ class NormalPrior:
             -0.5 * np.einsum("ni,ni->n", y, np.linalg.solve(turns, y.T).T)
             - 0.5 * np.linalg.slogdet(2 * np.pi * turns)[1]
         )
-        log_drawn -= log_volume_of_turns(np.linalg.norm(y, axis=1), k)
+        angle = np.linalg.norm(y, axis=1)
+        log_drawn -= log_volume_of_turns(angle, k)
         # the centre, given the turn
         gain = np.linalg.solve(turns, self._covariance[:k, k:]).T if k else np.zeros((3, 0))
         left = self._covariance[k:, k:] - gain @ self._covariance[:k, k:]
@@ -100,6 +98,7 @@ class NormalPrior:
         along = base[:3, :3] @ left_jacobian(y @ self._axes)
         spread = (along @ left @ np.swapaxes(along, 1, 2))[:, :2, :2]
         root = np.linalg.cholesky(spread)
+        # where the contact is cut; given that, centres have a known density
         middle = expected + np.einsum("nij,nj->ni", root, rng.normal(size=(n, 2)))
         at = transform(rotation, np.column_stack([middle, np.zeros(n)]) - rotation @ index.mesh.centre)
         poses, _ = located(index, at)
@@ -112,7 +111,7 @@ class NormalPrior:
         observed = middle + np.where(touches[:, None], query.centroid[:2] - found.centroid, 0.0)
         about = expected + np.einsum("nij,nj->ni", share, observed - expected)
         narrow = np.linalg.cholesky(width**2 * share)
-        known = np.where(touches, _ALIGNED, 0.0)
+        known = np.where(touches, ALIGNED, 0.0)
         aligned = rng.random(n) < known
         off = np.einsum("nij,nj->ni", np.where(aligned[:, None, None], narrow, root), rng.normal(size=(n, 2)))
         centre = np.where(aligned[:, None], about, expected) + off
@@ -121,11 +120,14 @@ class NormalPrior:
         turn = index.rotation[poses.place].astype(np.int64)
         poses = replace(poses, centre=centre, place=index.place_of(turn, centre))
         uniform = np.log(np.maximum(index.uniform_density(at), 1e-300))
-        return poses, deepest * rng.random(n), uniform - log_drawn, rotation
+        # a turn by more than half a turn is another one's
+        log_ratio = np.where(angle <= np.pi, uniform - log_drawn, -np.inf)
+        return poses, deepest * rng.random(n), log_ratio, rotation
 
-    def of_image(self, rotation: Array, centre: Array, height: Array) -> Array:
-        """Log density (n,) of one image alone, with rotations (n, 3, 3) and the object's centre at (n, 2) and ``height`` (n,)."""
-        moved = inverse(self._centred) @ transform(rotation, np.column_stack([centre, height]))
+    def of_image(self, T: Array) -> Array:
+        """Log density (n,) of the Gaussian at ``T`` (n, 4, 4), without the images under the symmetry."""
+        middle = self.index.mesh.centre
+        moved = inverse(self._centred) @ transform(T[:, :3, :3], T[:, :3, :3] @ middle + T[:, :3, 3])
         if self._symmetry.axis is not None:
             # without the turn about the axis
             turn, axis = Rotation.from_matrix(moved[:, :3, :3]).as_quat(), self._symmetry.axis
@@ -136,6 +138,13 @@ class NormalPrior:
         xi = log(moved)
         x = np.concatenate([xi[:, :3] @ self._axes.T, xi[:, 3:]], 1)
         return np.asarray(-0.5 * np.einsum("ni,ni->n", x, np.linalg.solve(self._covariance, x.T).T))
+
+    def _images(self, T: Array) -> tuple[NDArray[np.bool_], Array]:
+        """Whether the approach allows each image (g, n) of ``T`` (n, 4, 4), itself first, and the images (g, n, 4, 4)."""
+        images = T @ self._symmetry.elements[:, None]
+        if self.index.space.cones is None:
+            return np.ones(images.shape[:2], bool), images
+        return np.stack([self.index.space.approaches(image) for image in images]), images
 
     @property
     def _symmetry(self) -> Symmetry:
@@ -160,8 +169,10 @@ class NormalPrior:
         k = len(self._axes)
         along = np.zeros((k + 3, 6))
         along[:k, :3], along[k:, 3:] = self._axes, np.eye(3)
-        along[k:, :3] = -hat(self.index.mesh.centre)
-        return np.asarray(along @ self.gaussian.covariance @ along.T)
+        return np.asarray(along @ self.gaussian.covariance_about(self.index.mesh.centre) @ along.T)
+
+
+PosePrior = CellPrior | NormalPrior
 
 
 def prior_at_poses(index: Index, in_cells: NDArray[np.floating], prior: Any, T_frame_sensor: Array) -> PosePrior:
@@ -173,7 +184,7 @@ def prior_at_poses(index: Index, in_cells: NDArray[np.floating], prior: Any, T_f
 
 
 def pose_prior_of(index: Index, arrays: Mapping[str, NDArray[Any]]) -> PosePrior | None:
-    """Inverse of :meth:`PosePrior.arrays`; None where they hold none.
+    """Inverse of ``arrays``; None where they hold none.
 
     Raises
     ------

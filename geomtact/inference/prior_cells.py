@@ -21,7 +21,7 @@ from geomtact.inference.distribution import cell_densities, cell_log_density
 from geomtact.inference.gaussian_prior import GaussianPrior
 from geomtact.inference.posterior import Posterior
 from geomtact.log_mass import log_mean_of_counted, normalised
-from geomtact.se3 import Array, adjoint, inverse, left_jacobian, transform
+from geomtact.se3 import Array, inverse, left_jacobian, transform
 from geomtact.sensing.sensor import Sensor
 
 _CHUNK = 1 << 16
@@ -146,8 +146,7 @@ def _density_of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Arr
     assert index.mesh.symmetry is not None
     expected = inverse(T_frame_sensor) @ prior.T
     R, middle = expected[:3, :3], index.mesh.centre
-    to_centre = adjoint(transform(np.eye(3), -middle))
-    covariance = to_centre @ prior.covariance @ to_centre.T
+    covariance = prior.covariance_about(middle)
     turns, gain = covariance[:3, :3], np.linalg.solve(covariance[:3, :3], covariance[:3, 3:]).T
     root = np.linalg.cholesky(np.linalg.inv(covariance[3:, 3:] - gain @ covariance[:3, 3:])).T
     off = np.concatenate([np.broadcast_to(index.shift, (*index.height.shape, 2)), index.height[..., None]], -1)

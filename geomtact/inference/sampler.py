@@ -24,23 +24,23 @@ from geomtact.contact_space.contact_maps import ContactMaps, Placements, centrin
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.explored import Density
-from geomtact.inference.particles import SURE, OtherSensor, Particles, Target
+from geomtact.inference.particles import SURE, OtherSensor, Particles, Target, poses_of
 from geomtact.inference.population import MOVES, Population, effective, resampled, systematic
-from geomtact.inference.pose_prior import NormalPrior, PosePrior
+from geomtact.inference.pose_prior import ALIGNED, NormalPrior, PosePrior
 from geomtact.inference.registered import AboutModes, Register, bridged, starts, united
-from geomtact.inference.systematic_errors import ERRORS
+from geomtact.inference.systematic_errors import ERRORS, errors_of
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array, transform
 
 _UNIFORM = 0.2  # share of the uniform distribution in the coarse posterior, by which poses are drawn; hand-set
 # All other constants choose where poses are drawn: they change how precise the evidence is, not what is estimated.
-_ALIGNED = 0.7  # share of the draws whose centre is aligned
 _CUTS = 3  # contacts that are cut for a draw, at most
 _DRAWS = 4  # draws for each pose that is kept
 # Of several sensors: poses that are kept, by power, over those with one: hardly any touch all sensors at first. The largest power
 # is left out.
 _OF_SEVERAL = (16, 8, 6, 4)
 _OF_SEVERAL_COST = 12  # contacts that this takes, over those with one sensor
+_MEASURED = 2000  # draws by which the measure of what touches is known, where a prior is no one of the cells
 _STEPS = 11  # that are usual, for the budget
 _EXPONENTS = np.geomspace(2e-4, POWERS[-1], 40)  # of the likelihood, that the first step may have
 
@@ -116,7 +116,7 @@ def explore(
     if not np.isfinite(whole).all():
         raise InputError(f"{index.mesh.name}: no pose that was drawn touches the sensor; allow more contacts")
     # the evidence of the coarse posterior is known: what is left is an error of the measure, which all poses of a run share
-    log_measure = np.zeros(runs) if isinstance(prior, NormalPrior) else known - whole
+    log_measure = np.full(runs, _log_measure(target, rng)) if isinstance(prior, NormalPrior) else known - whole
     stops, power, population = _begun(target, drawn, log_weight + log_measure[:, None], number, rng)
     population.contacts = cut
     seen, about = [population.particles], None
@@ -241,6 +241,14 @@ def _draw(target: Target, share: Array, runs: int, n: int, rng: np.random.Genera
     return particles, log_weight.reshape(runs, n), cut + len(place) * target.sensors
 
 
+def _log_measure(target: Target, rng: np.random.Generator) -> float:
+    """As of :class:`Run`, from poses that are drawn uniformly."""
+    index = target.index
+    cells = index.weight.sum(0, dtype=float)
+    drawn, log_weight, _ = _draw(target, cells / cells.sum(), 1, _MEASURED, rng)
+    return float(-np.logaddexp.reduce(np.where(np.isfinite(drawn.log_likelihood), log_weight[0], -np.inf)))
+
+
 def _or_by_prior(
     target: Target, prior: NormalPrior, drawn: Particles, log_weight: Array, rng: np.random.Generator
 ) -> tuple[Particles, Array, int]:
@@ -248,19 +256,20 @@ def _or_by_prior(
     weights (runs, n) as of :func:`_draw`, and how many contacts were cut."""
     poses, depth, log_ratio, rotation = prior.draw(len(drawn), target.query, rng)
     errors = rng.random((len(drawn), target.carried, ERRORS))
-    others = target.admitted(target.evaluated(poses, depth=depth, errors=errors))
-    height = np.where(np.isfinite(others.poses.reach), others.poses.reach, 0.0) - depth
-    # an image of the pose stands for itself alone
-    own = prior.of_image(rotation, poses.centre, height) - others.log_prior
+    found = target.admitted(target.evaluated(poses, depth=depth, errors=errors))
+    # Over all poses a Gaussian alone has the mean that the sum over images has over poses that are no images of each other. So a
+    # pose is weighed by the density that was drawn from, over that sum.
+    T = target.displaced(
+        poses_of(replace(found.poses, rotation=rotation), depth, target.index.mesh.centre), errors_of(errors[:, 0])
+    )
+    own = np.where(np.isfinite(found.log_likelihood), prior.own_density(T) - found.log_prior, -np.inf)
     by_prior = (log_ratio + own).reshape(log_weight.shape) - np.log(log_weight.shape[1])
-    more = (1 + target.sensors) * len(drawn)
 
     def enough(particles: Particles, weight: Array) -> float:
         return float(effective(weight + particles.log_target(_EXPONENTS[0]).reshape(weight.shape)).min())
 
-    if enough(others, by_prior) > enough(drawn, log_weight):
-        return others, by_prior, more
-    return drawn, log_weight, more
+    cut = (1 + target.sensors) * len(drawn)
+    return (found, by_prior, cut) if enough(found, by_prior) > enough(drawn, log_weight) else (drawn, log_weight, cut)
 
 
 def _aligned(target: Target, poses: Placements, step: float) -> tuple[Array, int]:
@@ -290,7 +299,7 @@ def _centres(
     and their density (n,), that of the uniform being 1."""
     low, high = middle - step / 2, middle + step / 2
     known = np.asarray(np.isfinite(target).all(1), bool)
-    share = np.where(known, _ALIGNED, 0.0)
+    share = np.where(known, ALIGNED, 0.0)
     about = np.where(known[:, None], target, middle)
     first, last = ndtr((low - about) / width), ndtr((high - about) / width)
     within = np.maximum(last - first, 1e-12)

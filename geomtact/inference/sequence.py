@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geomtact.errors import InputError, PoseError, UsageError, nearest_name
 from geomtact.inference.effort import Effort, effort_of
@@ -21,7 +20,7 @@ from geomtact.inference.posterior import Posterior
 from geomtact.inference.preparation import PreparedObject
 from geomtact.inference.prior import opened, prior_log_mass, reference_of
 from geomtact.inference.repeated_images import counted_once
-from geomtact.inference.resolve import resolve_touch
+from geomtact.inference.resolve import LogMass, resolve_touch
 from geomtact.inference.single_touch import refine_modes
 from geomtact.inference.views import read_views
 from geomtact.se3 import Array, check_transforms
@@ -62,9 +61,9 @@ def track(
         them as single touches are, with what the frames before make of the pose as their prior
     prior : distribution before the first frame with contact, over the sensor as it stands then (see ``inference.prior``)
     most : cells that are kept from frame to frame at most, which bounds the time a frame takes; all that count by default
-    counts : powers of a frame's likelihood, in its own posterior and in those of all later frames. With None for the latter,
-        all earlier frames have the power ``filter.MEMORY_POWER`` together, so that frames which err alike do not count twice.
-        (1, 1) is the thesis's, for frames that err independently, such as separate touches
+    counts : powers of a frame's likelihood over the cells, in its own posterior and in those of all later frames. With None for
+        the latter, all earlier frames have the power ``filter.MEMORY_POWER`` together, so that frames which err alike do not
+        count twice. (1, 1) is the thesis's, for frames that err independently, such as separate touches
     fresh : share of the uniform distribution that is mixed in before each frame; 0 is the thesis's filter, in
         which dropped cells stay impossible
     on_error : "raise", or "skip" a frame that cannot be read: its posterior is what the frames before expect
@@ -107,10 +106,10 @@ def make_filter(
 
 
 def _resolved_by(prepared: PreparedObject, effort: Effort) -> Resolve:
-    def resolve(posterior: Posterior, log_prior: NDArray[np.floating] | None, alone: Posterior) -> Posterior:
-        posterior = resolve_touch(posterior, None, log_prior, prepared.scorer, effort, alone)
-        if posterior.explored is None:
+    def resolve(posterior: Posterior, prior: Any, log_prior: LogMass, alone: Posterior) -> Posterior:
+        if posterior.observation is None or posterior.observation.contact.height is not None:
             return posterior
+        posterior = resolve_touch(posterior, prior, log_prior, prepared.scorer, effort, alone)
         return refine_modes(posterior, log_prior, prepared.mode_refiner, effort)
 
     return resolve
@@ -158,7 +157,8 @@ def _tracked(
             prior = opened(prior, prepared.cache_dir)
             log_mass = prior_log_mass(index, prior, at, frame)
             state.memory = Mixture(np.flatnonzero(np.isfinite(log_mass)), np.exp(log_mass[np.isfinite(log_mass)]), 0.0)
-            made_from, expected, prior = prior, prior, None
+            state.prior = made_from = expected = prior
+            prior = None
         if not seen.diagnostics.is_skipped:
             seen = counted_once(seen, made_from)
         posterior = state.step(replace(seen, provenance=replace(seen.provenance, track=record)))
