@@ -52,9 +52,10 @@ def normal_modes(request, make_localizer):
         contacts=0,
         density=SimpleNamespace(
             target=SimpleNamespace(
-                particles_at=lambda T: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T))),
+                particles_at=lambda T, errors=None: SimpleNamespace(T=T, log_likelihood=np.zeros(len(T))),
                 displaced=lambda T, errors: T,
                 sensors=1,
+                carried=0,
                 others=(),
             ),
             of_exact=lambda particles: log_normal(particles.T),

@@ -79,24 +79,8 @@ class NormalPrior:
         Turns are the prior's. So are some of the object's centres; the others are near where the contact's centroid is that of
         ``query``. Depths are uniform. A contact is cut for each.
         """
-        index, k, deepest = self.index, len(self._axes), self.index.sensor.max_penetration
-        turns = self._covariance[:k, :k]
-        y = rng.normal(size=(n, k)) @ np.linalg.cholesky(turns).T if k else np.zeros((n, 0))
-        log_drawn = (
-            -0.5 * np.einsum("ni,ni->n", y, np.linalg.solve(turns, y.T).T)
-            - 0.5 * np.linalg.slogdet(2 * np.pi * turns)[1]
-        )
-        angle = np.linalg.norm(y, axis=1)
-        log_drawn -= log_volume_of_turns(angle, k)
-        # the centre, given the turn
-        gain = np.linalg.solve(turns, self._covariance[:k, k:]).T if k else np.zeros((3, 0))
-        left = self._covariance[k:, k:] - gain @ self._covariance[:k, k:]
-        moved = exp(np.concatenate([y @ self._axes, y @ gain.T], 1))
-        base = self._centred
-        rotation = base[:3, :3] @ moved[:, :3, :3]
-        expected = (base @ moved)[:, :2, 3]
-        along = base[:3, :3] @ left_jacobian(y @ self._axes)
-        spread = (along @ left @ np.swapaxes(along, 1, 2))[:, :2, :2]
+        index, deepest = self.index, self.index.sensor.max_penetration
+        rotation, expected, spread, log_ratio = self._turned(n, rng)
         root = np.linalg.cholesky(spread)
         # where the contact is cut; given that, centres have a known density
         middle = expected + np.einsum("nij,nj->ni", root, rng.normal(size=(n, 2)))
@@ -116,13 +100,27 @@ class NormalPrior:
         off = np.einsum("nij,nj->ni", np.where(aligned[:, None, None], narrow, root), rng.normal(size=(n, 2)))
         centre = np.where(aligned[:, None], about, expected) + off
         density = (1 - known) * _normal(centre - expected, root) + known * _normal(centre - about, narrow)
-        log_drawn += np.log(np.maximum(density, 1e-300)) - np.log(deepest)
+        log_ratio -= np.log(np.maximum(density, 1e-300)) - np.log(deepest)
         turn = index.rotation[poses.place].astype(np.int64)
         poses = replace(poses, centre=centre, place=index.place_of(turn, centre))
-        uniform = np.log(np.maximum(index.uniform_density(at), 1e-300))
-        # a turn by more than half a turn is another one's
-        log_ratio = np.where(angle <= np.pi, uniform - log_drawn, -np.inf)
+        log_ratio += np.log(np.maximum(index.uniform_density(at), 1e-300))
         return poses, deepest * rng.random(n), log_ratio, rotation
+
+    def _turned(self, n: int, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+        """``n`` rotations (n, 3, 3) from the prior; where over the sensor the centre is expected then (n, 2) [m], and its
+        covariance (n, 2, 2); and minus the log density (n,) of the rotations per rad, -inf of turns by more than half a turn."""
+        k, base = len(self._axes), self._centred
+        turns = self._covariance[:k, :k]
+        y = rng.normal(size=(n, k)) @ np.linalg.cholesky(turns).T if k else np.zeros((n, 0))
+        log_ratio = 0.5 * np.einsum("ni,ni->n", y, np.linalg.solve(turns, y.T).T)
+        angle = np.linalg.norm(y, axis=1)
+        log_ratio += 0.5 * np.linalg.slogdet(2 * np.pi * turns)[1] + log_volume_of_turns(angle, k)
+        gain = np.linalg.solve(turns, self._covariance[:k, k:]).T if k else np.zeros((3, 0))
+        left = self._covariance[k:, k:] - gain @ self._covariance[:k, k:]
+        moved = base @ exp(np.concatenate([y @ self._axes, y @ gain.T], 1))
+        along = base[:3, :3] @ left_jacobian(y @ self._axes)
+        spread = (along @ left @ np.swapaxes(along, 1, 2))[:, :2, :2]
+        return moved[:, :3, :3], moved[:, :2, 3], spread, np.where(angle <= np.pi, log_ratio, -np.inf)
 
     def of_image(self, T: Array) -> Array:
         """Log density (n,) of the Gaussian at ``T`` (n, 4, 4), without the images under the symmetry."""
