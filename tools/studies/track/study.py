@@ -73,7 +73,7 @@ def follow(
             "filter": make_filter(localizer, seed=seed, effort=resolved),
             "thesis": make_filter(localizer, counts=(1, 1), fresh=0, most=50, seed=seed),
         }
-        told: dict[str, list[tuple[float, ...]]] = {method: [] for method in METHODS}
+        judged: dict[str, list[tuple[float, ...]]] = {method: [] for method in METHODS}
         poses = trajectory.T_sensor_object
         for T, mask in zip(poses, trajectory.masks, strict=True):
             of_cells = localizer.localize(mask, kind="mask", effort="fast", seed=seed)
@@ -81,9 +81,9 @@ def follow(
             found |= {method: each.step(of_cells) for method, each in filters.items()}
             for method, posterior in found.items():
                 level = float(posterior.credible_level(T))
-                told[method].append((float(posterior.log_density(T)), level, posterior.information_gain_nats))
+                judged[method].append((float(posterior.log_density(T)), level, posterior.information_gain_nats))
         plain = [contact_class(localizer.space, T) in FEATURELESS for T in poses]
-        columns = [{m: [row[k] for row in rows] for m, rows in told.items()} for k in range(3)]
+        columns = [{m: [row[k] for row in rows] for m, rows in judged.items()} for k in range(3)]
         yield Followed(number, trajectory.elastic, plain, *columns)
 
 
