@@ -92,7 +92,6 @@ class Filter:
         self._last: Posterior | None = None
         self._images: tuple[str, ...] = ()
         self._moments: NDArray[np.float32] | None = None
-        self._expected: NDArray[np.floating] | None = None
 
     def step(self, seen: Posterior) -> Posterior:
         """The posterior after one more frame.
@@ -103,6 +102,7 @@ class Filter:
         """
         began, last, surprise, warnings = perf_counter(), self._last, None, list(seen.warnings)
         result: CellLogProb | None = None
+        log_mass: NDArray[np.floating] | None = None
         self.frames += 1
         repeated = last if seen.contact and last and _shows_the_same(seen, last) else None
         rests = repeated is not None and np.array_equal(repeated.T_frame_sensor, seen.T_frame_sensor)
@@ -114,7 +114,7 @@ class Filter:
                 lost = "a frame" if self.missed == 1 else f"{self.missed} frames"
                 warnings.append(f"contact was lost for {lost}: half of the earlier distribution is discarded")
             self.predict(seen.T_frame_sensor)
-            result, surprise = self.update(seen)
+            result, surprise, log_mass = self.update(seen)
             if has_slipped(surprise):
                 ratio = f"{np.exp(min(-surprise, 99)):.3g}"
                 discarded = ": half of the earlier distribution is discarded" if self.fresh > 0 else ""
@@ -140,7 +140,7 @@ class Filter:
             found = replace(out.diagnostics, settled_power=repeated.diagnostics.settled_power)
             out = replace(out, explored=repeated.explored, refined=repeated.refined, diagnostics=found)
         elif self.resolve is not None and seen.contact and repeated is None:
-            out = self.resolve(out, self.prior, self._expected, seen)
+            out = self.resolve(out, self.prior, log_mass, seen)
             self.prior = None
         self._last = out if out.contact and not out.diagnostics.is_skipped else None
         return out
@@ -164,8 +164,9 @@ class Filter:
             self.leading = self.leading and later(self.leading)
         self.T_frame_sensor, self.missed = T_frame_sensor, 0
 
-    def update(self, seen: Posterior) -> tuple[CellLogProb, float]:
-        """The distribution after a frame with the own posterior ``seen``, and the frame's surprise [nats].
+    def update(self, seen: Posterior) -> tuple[CellLogProb, float, NDArray[np.floating] | None]:
+        """The distribution after a frame with the own posterior ``seen``, the frame's surprise [nats], and the log mass (N,) that
+        each cell was expected to have, None where nothing was or it is not asked for.
 
         The surprise is the log of how likely the last posterior makes the frame, relative to chance.
         """
@@ -179,7 +180,7 @@ class Filter:
             if has_slipped(surprise) and self.fresh > 0:
                 expected = expected.with_uniform(_UNIFORM_AFTER_LOSS)
         before = self._log_density(expected)
-        self._expected = self._log_mass(before) if len(expected.cells) else None
+        log_mass = self._log_mass(before) if self.resolve is not None and len(expected.cells) else None
         log_density = np.float32(now) * gain
         log_density += before
         log_prob = self._normalise(log_density)
@@ -189,7 +190,7 @@ class Filter:
             log_density += np.multiply(before, np.float32(kept), out=before)
             self._normalise(log_density)
         self.memory = self._kept(log_density, self.most)
-        return self._with_mass(log_prob), surprise
+        return self._with_mass(log_prob), surprise, log_mass
 
     def _passed_over(self, T_frame_sensor: Array) -> CellLogProb:
         """The distribution after a frame that constrains nothing."""

@@ -67,3 +67,10 @@ class GaussianPrior:
         # the exponential takes less volume, the larger the angle (Barfoot, State Estimation for Robotics, ch. 7)
         kept = (angle <= np.pi) & (rng.random(n) < np.sinc(angle / (2 * np.pi)) ** 4)
         return self.T @ exp(xi[kept])
+
+
+def given_turns(covariance: Array, k: int) -> tuple[Array, Array]:
+    """Of a covariance (k + 3, k + 3) of ``k`` turns and of shifts: the mean shift for each turn (3, k), and the covariance (3, 3)
+    of shifts that is left where the turns are known."""
+    gain = np.asarray(np.linalg.solve(covariance[:k, :k], covariance[:k, k:]).T)
+    return gain, covariance[k:, k:] - gain @ covariance[:k, k:]

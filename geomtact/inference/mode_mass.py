@@ -16,7 +16,7 @@ from geomtact.contact_space.contact_maps import sample_pitch
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.explored import Explored
 from geomtact.inference.student import Student, log_volume
-from geomtact.inference.systematic_errors import ERRORS, errors_of
+from geomtact.inference.systematic_errors import errors_of
 from geomtact.se3 import Array, exp, inverse, log
 
 # These choose where the density is looked at: they change how precise a mass is, not what is estimated.
@@ -55,10 +55,7 @@ def weighed(
         nearest = [_is_nearest(distance, mode.heart, each) for mode, each in zip(modes, T, strict=True)]
         near &= np.array(turn < np.pi, bool) & np.array(nearest, bool)
         found = np.full(near.shape, -np.inf)
-        carried = None
-        if density.target.carried:
-            carried = np.full((int(near.sum()), 1, ERRORS), 0.5)
-            carried[:, 0, :4] = shares[near]
+        carried = shares[near][:, None] if density.target.carried else None
         particles = density.target.particles_at(T[near], carried)
         log_density = density.of_exact(particles) + np.log(explored.index.uniform_density(T[near]))
         log_density += log_volume(turn[near], len(modes[0].basis) - 3)  # 0 or 1 turns, on a known face, give the same

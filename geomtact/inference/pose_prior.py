@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from geomtact.contact_space.contact_maps import ContactMaps, Placements, centring_std, located
 from geomtact.contact_space.index import Index
 from geomtact.geometry.symmetry import Symmetry
-from geomtact.inference.gaussian_prior import GaussianPrior
+from geomtact.inference.gaussian_prior import GaussianPrior, given_turns
 from geomtact.inference.student import log_volume_of_turns
 from geomtact.scoring.contact_likelihood import ContactQuery
 from geomtact.se3 import Array, exp, inverse, left_jacobian, log, transform
@@ -111,12 +111,11 @@ class NormalPrior:
         covariance (n, 2, 2); and minus the log density (n,) of the rotations per rad, -inf of turns by more than half a turn."""
         k, base = len(self._axes), self._centred
         turns = self._covariance[:k, :k]
-        y = rng.normal(size=(n, k)) @ np.linalg.cholesky(turns).T if k else np.zeros((n, 0))
+        y = rng.normal(size=(n, k)) @ np.linalg.cholesky(turns).T
         log_ratio = 0.5 * np.einsum("ni,ni->n", y, np.linalg.solve(turns, y.T).T)
         angle = np.linalg.norm(y, axis=1)
         log_ratio += 0.5 * np.linalg.slogdet(2 * np.pi * turns)[1] + log_volume_of_turns(angle, k)
-        gain = np.linalg.solve(turns, self._covariance[:k, k:]).T if k else np.zeros((3, 0))
-        left = self._covariance[k:, k:] - gain @ self._covariance[:k, k:]
+        gain, left = given_turns(self._covariance, k)
         moved = base @ exp(np.concatenate([y @ self._axes, y @ gain.T], 1))
         along = base[:3, :3] @ left_jacobian(y @ self._axes)
         spread = (along @ left @ np.swapaxes(along, 1, 2))[:, :2, :2]

@@ -18,7 +18,7 @@ from geomtact.inference.densities import (
     over_images,
 )
 from geomtact.inference.distribution import cell_densities, cell_log_density
-from geomtact.inference.gaussian_prior import GaussianPrior
+from geomtact.inference.gaussian_prior import GaussianPrior, given_turns
 from geomtact.inference.posterior import Posterior
 from geomtact.log_mass import log_mean_of_counted, normalised
 from geomtact.se3 import Array, inverse, left_jacobian, transform
@@ -147,14 +147,14 @@ def _density_of_gaussian(index: Index, prior: GaussianPrior, T_frame_sensor: Arr
     expected = inverse(T_frame_sensor) @ prior.T
     R, middle = expected[:3, :3], index.mesh.centre
     covariance = prior.covariance_about(middle)
-    turns, gain = covariance[:3, :3], np.linalg.solve(covariance[:3, :3], covariance[:3, 3:]).T
-    root = np.linalg.cholesky(np.linalg.inv(covariance[3:, 3:] - gain @ covariance[:3, 3:])).T
+    gain, left = given_turns(covariance, 3)
+    root = np.linalg.cholesky(np.linalg.inv(left)).T
     off = np.concatenate([np.broadcast_to(index.shift, (*index.height.shape, 2)), index.height[..., None]], -1)
     off = off - (R @ middle + expected[:3, 3])
     each, allowed = [], []
     for S in images(index.mesh.symmetry):
         w = Rotation.from_matrix(R.T @ index.rotations @ S[:3, :3]).as_rotvec()
-        of_turn = -0.5 * np.einsum("mi,mi->m", w, np.linalg.solve(turns, w.T).T)
+        of_turn = -0.5 * np.einsum("mi,mi->m", w, np.linalg.solve(covariance[:3, :3], w.T).T)
         log_density = np.tile(of_turn[index.rotation], (len(index.height), 1))
         near = np.flatnonzero(of_turn[index.rotation] > -0.5 * _FARTHEST**2)
         row = index.rotation[near]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.cell_transfer import ExtrinsicsStd
+from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.distribution import cell_densities
 from geomtact.inference.effort import Effort
@@ -43,7 +44,7 @@ def resolve_touch(
         return _resolved(posterior, [posterior], None, None, None, effort)
     assert posterior.observation is not None
     if alone is not None:
-        coarse = (cell_densities(alone).reshape(alone.index.weight.shape) * alone.index.weight).sum(0, dtype=float)
+        coarse = _mass_of_places(alone.index, cell_densities(alone))
     else:
         # cells that the prior rules out have no mass in the posterior
         coarse = np.exp(scorer.log_mass(posterior.index, posterior.observation.contact.soft_mask)).sum(0)
@@ -94,7 +95,7 @@ def _resolved(
             density = cell_densities(posterior)
             if at_poses is not None:
                 density = np.where(in_cells > -np.inf, density * np.exp(-np.maximum(in_cells, -1e3)), 0)
-            coarse = (density.reshape(index.weight.shape) * index.weight).sum(0, dtype=float)
+            coarse = _mass_of_places(index, density)
         first = next(touch for touch in touches if touch.contact)
         others = [
             OtherSensor(
@@ -113,6 +114,11 @@ def _resolved(
     power = explored.density.powers[-1] / POWERS[-1]
     diagnostics = replace(posterior.diagnostics, settled_power=power, unexplained_nats=explored.unexplained_nats)
     return replace(posterior, explored=explored, diagnostics=diagnostics)
+
+
+def _mass_of_places(index: Index, density: NDArray[np.floating]) -> Array:
+    """Mass (n,) of the places of ``index``, of a density (N,) in its cells."""
+    return np.asarray((density.reshape(index.weight.shape) * index.weight).sum(0, dtype=float))
 
 
 def _query(touch: Posterior) -> ContactQuery:

@@ -243,9 +243,7 @@ def _draw(target: Target, share: Array, runs: int, n: int, rng: np.random.Genera
 
 def _log_measure(target: Target, rng: np.random.Generator) -> float:
     """As of :class:`Run`, from poses that are drawn uniformly."""
-    index = target.index
-    cells = index.weight.sum(0, dtype=float)
-    drawn, log_weight, _ = _draw(target, cells / cells.sum(), 1, _MEASURED, rng)
+    drawn, log_weight, _ = _draw(target, target.index.weight.sum(0, dtype=float), 1, _MEASURED, rng)
     return float(-np.logaddexp.reduce(np.where(np.isfinite(drawn.log_likelihood), log_weight[0], -np.inf)))
 
 

@@ -135,7 +135,11 @@ def _tracked(
             to_resolve = effort.contacts and view.observation.contact.height is None
             over_cells = replace(effort, contacts=0, modes=0) if to_resolve else replace(effort, contacts=0)
             seen = localize(view.observation, T_world_sensor=T, **options | {"effort": over_cells})
-            seen = replace(seen, provenance=replace(seen.provenance, effort=options["effort"]))
+            seen = replace(
+                seen,
+                provenance=replace(seen.provenance, effort=options["effort"]),
+                timing_ms=seen.timing_ms | {"read": view.read_ms},
+            )
         except InputError as error:
             if not skip:
                 raise type(error)(
