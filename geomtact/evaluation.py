@@ -133,13 +133,14 @@ def simultaneous_touches(
 
 
 def localized(
-    localizer: Localizer, scene: SimultaneousTouches, sensors: int, effort: str, seed: int
+    localizer: Localizer, scene: SimultaneousTouches, sensors: int, **options: Any
 ) -> tuple[Posterior | None, float]:
-    """The posterior by the first ``sensors`` of a scene and the time it took [ms]; None and 0 where no pose agrees."""
+    """The posterior by the first ``sensors`` of a scene, with ``options`` of ``Localizer.localize``, and the time it took [ms];
+    None and 0 where no pose agrees."""
     began = time.perf_counter()
     images = [touch.mask for touch in scene.touches[:sensors]]
     try:
-        posterior = localizer.localize(images, "mask", None, scene.T_world_sensor[:sensors], effort=effort, seed=seed)
+        posterior = localizer.localize(images, "mask", None, scene.T_world_sensor[:sensors], **options)
     except NoPoseAgreesError:
         return None, 0.0
     return posterior, 1e3 * (time.perf_counter() - began)
@@ -187,7 +188,7 @@ def evaluate(
     for scene in islice(simultaneous_touches(localizer.space, touches, most, seed), first, None):
         out = []
         for n in sensors:
-            posterior, ms = localized(localizer, scene, n, effort, seed)
+            posterior, ms = localized(localizer, scene, n, effort=effort, seed=seed)
             if posterior is None:
                 out.append(Outcome(n, -math.inf, 0.0, 1.0, math.inf, math.inf, False, ms))
                 continue

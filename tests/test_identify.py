@@ -15,7 +15,7 @@ from geomtact.cli import app
 from geomtact.cli.several import objects_of
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import simultaneous_touches
-from geomtact.identification import identify
+from geomtact.identification import _MISFIT_NATS, _MISSED, identify
 from geomtact.inference.facts import Diagnostics
 from geomtact.sensing.image_file import write_image
 from geomtact.sensing.noise import MODERATE
@@ -99,8 +99,8 @@ def test_probabilities_are_evidence_times_weights(drawer):
         ({"is_outlier": False, "unexplained_nats": 7.9}, False),
         ({"is_outlier": False, "unexplained_nats": 8.1}, True),
         ({"is_outlier": False, "unexplained_nats": np.inf}, True),
-        ({"is_outlier": False, "unexplained_nats": 0.0, "misfit_nats": 4.5}, False),
-        ({"is_outlier": False, "unexplained_nats": 0.0, "misfit_nats": 4.7}, True),
+        ({"is_outlier": False, "unexplained_nats": 8.1, "misfit_nats": 0.9 * _MISFIT_NATS}, False),
+        ({"is_outlier": False, "unexplained_nats": 0.0, "misfit_nats": 1.1 * _MISFIT_NATS}, True),
     ],
 )
 def test_unlike_all_are_outliers_or_unexplained_touches_of_each_object(drawer, said, unlike):
@@ -116,6 +116,33 @@ def test_unlike_all_are_outliers_or_unexplained_touches_of_each_object(drawer, s
     assert not identify([localizer(said), localizer({"is_outlier": False})], image).is_unknown, (
         "one that it is like is enough"
     )
+
+
+@pytest.mark.slow
+def test_contacts_tell_objects_apart_that_moments_do_not(drawer):
+    """By contacts the right one of three objects is the most probable in more of the same touches, and given more: the log of its
+    probability is larger in the mean. None that explains them is ruled out."""
+    right, logs = {"fast": 0, "balanced": 0}, {"fast": [], "balanced": []}
+    for own in drawer:
+        for mask in touches(own, 6, seed=3):
+            for effort in right:
+                found = identify(drawer, mask, kind="mask", effort=effort)
+                given = {each.name: each.probability for each in found.candidates}
+                right[effort] += found.candidates[0].name == own.mesh.name
+                logs[effort].append(np.log(given[own.mesh.name]))
+            assert min(given.values()) >= _MISSED / 3 - 1e-12 and sum(given.values()) == pytest.approx(1)
+    assert right["balanced"] > right["fast"] and np.mean(logs["balanced"]) > np.mean(logs["fast"])
+
+
+def test_the_evidence_of_contacts_does_not_depend_on_the_cells(drawer, make_localizer):
+    """Of one object on 4,000 poses and on four times as many."""
+    finer = make_localizer(drawer[2].mesh, "gelslim", max_poses=16_000, touches=120, scorer="moments")
+    masks = touches(drawer[2], 8, seed=5)
+    apart = [
+        finer.localize(mask, "mask", seed=1).log_evidence - drawer[2].localize(mask, "mask", seed=1).log_evidence
+        for mask in masks
+    ]
+    assert abs(np.mean(apart)) < 0.2 + 3 * np.std(apart) / np.sqrt(len(apart)), "each is found to about a nat"
 
 
 @pytest.mark.parametrize("scenes", slow_but((1, 2), 1))

@@ -26,8 +26,9 @@ class Diagnostics:
     disagrees : whether the other sensors, or the prior, contradict a sensor's image
     unexplained_nats : per contact, by how much the likeliest pose, with sensors where they are said to be, explains less than
         the best pose of each sensor alone; inf where no pose suits all; None where no poses were searched
-    misfit_nats : per contact, by how much the likeliest pose misses the masks beyond the usual error; as
-        ``unexplained_nats``, and None with measured depths
+    misfit_nats : by how much the contacts that are cut at the likeliest pose miss the masks, for every 15 mm of outline; inf
+        where no pose suits all, None where no contacts were cut
+    evidence_of : what ``log_evidence`` compares: "moments" or "pixels" of the cells, or "contacts" that are cut at poses
     settled_power : largest power of the likelihood that the contacts settle within the cells, 1 the sharpest; None where the
         posterior is that of the cells
     frame : number of the frame in a sequence, from 1; None outside of one
@@ -40,6 +41,7 @@ class Diagnostics:
     disagrees: bool = False
     unexplained_nats: float | None = None
     misfit_nats: float | None = None
+    evidence_of: str = "moments"
     settled_power: float | None = None
     frame: int | None = None
     surprise_nats: float | None = None

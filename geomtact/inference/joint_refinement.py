@@ -29,7 +29,6 @@ _OTHERS_BASE, _OTHERS_MOST, _OTHERS_SLOPE = 0.4, 0.2, 5.0
 _IMAGE_POWER = 0.5  # power of a cell's mass beside the likelihood of its best pose, of the same images; hand-set
 EXPLAINED_NATS = 4.0  # unexplained nats per contact up to which the search is trusted in full; hand-set
 _EVIDENCE_POWER = 0.5  # power of the likelihood in the evidence, chosen on 22 simulated scenes (docs/which-part.md)
-_OUTLINE_NATS = 150.0  # loss of log likelihood per metre of outline, measured at true poses (docs/which-part.md)
 
 
 def refine_jointly(
@@ -45,8 +44,8 @@ def refine_jointly(
     That holds only as far as the likeliest pose explains all images nearly as well as other poses explain each of them. If no
     pose does, the search missed the right cell. ``log_prior`` is as of ``reweight_cells``.
 
-    The evidence becomes the mean likelihood under the prior, over the searched cells. The posterior's
-    diagnostics report ``unexplained_nats`` and, of masks alone, ``misfit_nats``.
+    The posterior's diagnostics report ``unexplained_nats``. Where the evidence is not that of contacts, it becomes the mean
+    likelihood of the pixels under the prior, over the searched cells.
     """
     searched = likeliest_cells(posterior, _CELLS)
     if not len(searched):
@@ -62,7 +61,9 @@ def refine_jointly(
     if search.n_contacts > 1:
         others = _others_factor(mass, _LIKELIHOOD_POWER * likely, search.n_contacts)
     kept_share, others_factor = (1 - (1 - share) * explains for share in (_KEPT_SHARE, others))
-    if len(home):
+    diagnostics = replace(posterior.diagnostics, unexplained_nats=_finite_or_inf(unexplained))
+    if len(home) and diagnostics.evidence_of != "contacts":
+        diagnostics = replace(diagnostics, evidence_of="pixels")
         prior = posterior.index.log_weight if log_prior is None else log_prior
         by_depth = search.depth_log_likelihood(poses)
         explained = prior[home] + _EVIDENCE_POWER * (likely - by_depth) + by_depth
@@ -71,11 +72,6 @@ def refine_jointly(
         posterior, home, _LIKELIHOOD_POWER * likely, kept_share, others_factor, _IMAGE_POWER, log_prior
     )
 
-    misfit = None
-    if not any(view.has_height for view in views):
-        outline = np.mean([view.outline for view in search.views[: search.n_contacts]])
-        misfit = _finite_or_inf(-likely.max(initial=-np.inf) / search.n_contacts - _OUTLINE_NATS * outline)
-    diagnostics = replace(posterior.diagnostics, unexplained_nats=_finite_or_inf(unexplained), misfit_nats=misfit)
     return replace(posterior, refined=search.refined(posterior, home, poses, k), diagnostics=diagnostics)
 
 

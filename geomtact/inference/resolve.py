@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.contact_space.index import Index
-from geomtact.errors import InputError
 from geomtact.inference.distribution import cell_densities
 from geomtact.inference.effort import Effort
 from geomtact.inference.particles import OtherSensor
@@ -105,14 +104,16 @@ def _resolved(
             if touch is not first
         ]
         rng = np.random.default_rng(posterior.seed)
-        try:
-            contacts = effort.several if others else effort.contacts
-            explored = explore_twice(index, _query(first), coarse, contacts, rng, at_poses, others, register)
-        except InputError as error:
-            warning = f"the pose is not resolved within the grid's cells: {error}"
-            return replace(posterior, warnings=[*posterior.warnings, warning])
+        contacts = effort.several if others else effort.contacts
+        found = explore_twice(index, _query(first), coarse, contacts, rng, at_poses, others, register)
+    diagnostics = replace(posterior.diagnostics, evidence_of="contacts", misfit_nats=found.misfit_nats)
+    posterior = replace(posterior, log_evidence=found.log_evidence)
+    explored = found.explored
+    if explored is None:
+        warning = f"the pose is not resolved within the grid's cells: {found.why_not}"
+        return replace(posterior, diagnostics=diagnostics, warnings=[*posterior.warnings, warning])
     power = explored.density.powers[-1] / POWERS[-1]
-    diagnostics = replace(posterior.diagnostics, settled_power=power, unexplained_nats=explored.unexplained_nats)
+    diagnostics = replace(diagnostics, settled_power=power, unexplained_nats=explored.unexplained_nats)
     return replace(posterior, explored=explored, diagnostics=diagnostics)
 
 

@@ -72,13 +72,6 @@ class SensorView:
         """Whether depths are measured."""
         return self.contact is not None and self.contact.height is not None
 
-    @property
-    def outline(self) -> float:
-        """Length of the contact's outline within the window [m], whichever way it runs (Cauchy and Crofton)."""
-        dx, dy = 2 * self.refiner.space.sensor.half_window / self.mask.shape[::-1]
-        across, down = self.mask[:, 1:] != self.mask[:, :-1], self.mask[1:] != self.mask[:-1]
-        return float(np.pi / 4 * (across.sum() * dy + down.sum() * dx))
-
     def log_likelihood(self, T: Array) -> Array:
         """Log likelihood (n,) of the image, with the object at ``T`` (n, 4, 4) in the first sensor's frame.
 

@@ -3,13 +3,15 @@
 One run does not show what it has missed. So two are compared: where they disagree on the evidence, one has missed what the other
 found; where the masses of the modes add up to more than 1, both have. Then more contacts are cut, or the sharpest powers are left
 out.
+
+How likely the contacts are at all is known even where the runs do not agree, only less exactly.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +29,9 @@ from geomtact.inference.systematic_errors import NODES, NODES_BESIDE, random_err
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
+EVIDENCE_POWER = POWERS[
+    3
+]  # of the likelihood, by which objects are compared: of those above 0 it tells them apart best
 # poses that are kept in the end, at least, which is as many as with several sensors, and at most; and contacts for each
 _POSES, _FOR_EACH = (300, 600), 20
 # nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
@@ -38,6 +43,25 @@ _SHARPEST = 100, 40  # poses beside these from which modes may grow, of one sens
 _WEIGHING = 0.5  # contacts that weigh the modes, for each that finds them
 
 
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """What two runs found.
+
+    Attributes
+    ----------
+    explored : the distribution of the pose; None where they do not agree, or found no pose
+    log_evidence : log of the mean under the prior of the likelihood of all contacts, to the power ``EVIDENCE_POWER``; -inf where
+        no pose was found that touches all sensors which show contact
+    misfit_nats : as of ``facts.Diagnostics``
+    why_not : why there is no distribution; empty where there is
+    """
+
+    explored: Explored | None
+    log_evidence: float = -np.inf
+    misfit_nats: float = np.inf
+    why_not: str = ""
+
+
 def explore_twice(
     index: Index,
     query: ContactQuery,
@@ -47,47 +71,91 @@ def explore_twice(
     prior: PosePrior | None = None,
     others: Sequence[OtherSensor] = (),
     register: Register | None = None,
-) -> Explored:
+) -> Finding:
     """The distribution of the pose with its modes, by two runs that share a sixteenth of the ``contacts`` of each sensor, or a
     quarter where there are several, and have to agree on the evidence; arguments as of :func:`explore`.
 
     Where they do not, the largest powers of the likelihood are left out until they do, ``_LEFT_OUT`` of them at most. If that
     does not help, both are repeated with four times the contacts, until these are all; then as many powers are left out as need
     be. So are runs of several sensors that found no pose which explains all contacts.
+    """
+    cut, found = 0, Finding(None)
+    attempts = (contacts // _MORE, contacts) if others else (contacts // _MORE**2, contacts // _MORE, contacts)
+    for asked in attempts:
+        try:
+            one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, register)
+            cut += one.contacts + other.contacts
+            found = Finding(None, _log_evidence(one, other), _misfit(one, other))
+            least = 0 if asked == attempts[-1] else POWERS[len(POWERS) - _LEFT_OUT - 1]
+            explored, cut = _agreed(one, other, least, asked, cut, rng)
+        except InputError as error:
+            found = replace(found, why_not=str(error))
+            continue
+        if explored is not None:
+            return replace(found, explored=explored)
+    settle = f"{cut:,} contacts do not settle how likely the observed one is; allow more by Effort(contacts=)"
+    return replace(found, why_not=found.why_not or f"{index.mesh.name}: {settle}")
+
+
+def _agreed(
+    one: Run, other: Run, least: float, asked: int, cut: int, rng: np.random.Generator
+) -> tuple[Explored | None, int]:
+    """The distribution of the pose by the largest power of the likelihood at which two runs agree, of ``least`` or more, if there
+    is one; and how many contacts were cut until then, ``cut`` of them before.
 
     Raises
     ------
     InputError
-        No pose that was drawn touches the sensor, or the runs agree on nothing.
+        No pose that was found touches the sensor.
     """
-    cut = 0
-    attempts = (contacts // _MORE, contacts) if others else (contacts // _MORE**2, contacts // _MORE, contacts)
-    for asked in attempts:
-        one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, register)
-        cut += one.contacts + other.contacts
-        unexplained = _unexplained(one, other) if others else None
-        if unexplained is not None and unexplained > UNEXPLAINED_NATS:
+    several = bool(one.density.target.others)
+    if several and _unexplained(one, other) > UNEXPLAINED_NATS:
+        return None, cut
+    for last in range(len(one.log_evidence) - 1, 0, -1):
+        if one.density.powers[last] < least:
+            break
+        run = replace(pooled(one, other, last, rng), contacts=cut)
+        apart = np.abs(np.subtract(one.log_evidence, other.log_evidence))[_kept(one, last)]
+        if run.density.weights @ apart >= _AGREE * run.density.target.sensors:
             continue
-        least = 0 if asked == attempts[-1] else POWERS[len(POWERS) - _LEFT_OUT - 1]
-        for last in range(len(one.log_evidence) - 1, 0, -1):
-            if one.density.powers[last] < least:
-                break
-            run = replace(pooled(one, other, last, rng), contacts=cut)
-            apart = np.abs(np.subtract(one.log_evidence, other.log_evidence))[_kept(one, last)]
-            if run.density.weights @ apart < _AGREE * run.density.target.sensors:
-                found = _explored_from(run, _POSES[0] if others else int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
-                further = _sharpest(one, other)
-                if others:
-                    led_to = (one.about.led_to, one.about.origin) if one.about else None
-                    found = counted(found, further, _draws_left(one, last) + _draws_left(other, last), led_to)
-                    return replace(found, unexplained_nats=_unexplained_in_place(one, other, found))
-                found, log_sum = weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
-                if log_sum < 0:
-                    return found
-                cut = found.contacts
-    raise InputError(
-        f"{index.mesh.name}: {cut:,} contacts do not settle how likely the observed one is; allow more by Effort(contacts=)"
-    )
+        found = _explored_from(run, _POSES[0] if several else int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
+        further = _sharpest(one, other)
+        if several:
+            led_to = (one.about.led_to, one.about.origin) if one.about else None
+            found = counted(found, further, _draws_left(one, last) + _draws_left(other, last), led_to)
+            return replace(found, unexplained_nats=_unexplained_in_place(one, other, found)), cut
+        found, log_sum = weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
+        if log_sum < 0:
+            return found, cut
+        cut = found.contacts
+    return None, cut
+
+
+def _log_evidence(one: Run, other: Run) -> float:
+    """As of :class:`Finding`."""
+    if EVIDENCE_POWER not in one.density.powers:
+        return -np.inf
+    stop, out = one.density.powers.index(EVIDENCE_POWER), []
+    for run in (one, other):
+        # the coarse density says where poses are drawn, and is taken out again
+        log_coarse = run.particles[stop].log_coarse
+        out.append(
+            run.log_evidence[stop] + np.logaddexp.reduce((EVIDENCE_POWER - 1) * log_coarse) - np.log(len(log_coarse))
+        )
+    return float(np.logaddexp.reduce(out) - np.log(2))
+
+
+def _misfit(one: Run, other: Run) -> float:
+    """As of :class:`Finding`."""
+    target = one.density.target
+    found = one.particles[-1].joined(other.particles[-1])
+    best = found.log_likelihood[~found.missed].max(initial=-np.inf)
+    if one.about is not None:
+        registered = target.particles_at(one.about.led_to)
+        best = max(best, registered.log_likelihood[~registered.missed].max(initial=-np.inf))
+    queries = [target.query, *(other.query for other in target.others)]
+    outline = np.exp([query.log_outline for query in queries if query.touched.any()]).sum()
+    return float(-POWERS[-1] * best / outline)
 
 
 def _kept(run: Run, last: int) -> list[int]:

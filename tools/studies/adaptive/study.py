@@ -13,7 +13,6 @@ from geomtact.contact_space.contact_class import contact_class
 from geomtact.contact_space.contact_maps import located
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touches import Touch
-from geomtact.errors import InputError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.effort import EFFORTS
 from geomtact.inference.explored import Density
@@ -110,9 +109,8 @@ def _found(
     index: Index, query: ContactQuery, mass: Array, contacts: int, touch: Touch, rng: np.random.Generator
 ) -> _Found:
     T = touch.T_sensor_object[None]
-    try:
-        explored = explore_twice(index, query, mass, contacts, rng)
-    except InputError:
+    explored = explore_twice(index, query, mass, contacts, rng).explored
+    if explored is None:
         density = np.log(mass / index.weight.sum(0, dtype=float))
         at = float(density[located(index, T)[0].place[0]])
         level = float(mass[density > at].sum())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,6 +20,14 @@ if TYPE_CHECKING:
 SCHEMA = "geomtact/touches/1"
 
 
+class SceneName(StrEnum):
+    """What holds the sensors."""
+
+    anyhow = "anyhow"
+    jaw = "jaw"
+    loose_jaw = "loose-jaw"
+
+
 def judge_touches(
     parts: study_options.ThesisParts = None,
     unit: Unit = None,
@@ -28,6 +37,13 @@ def judge_touches(
     ] = 200,
     noise: study_options.NoiseLevel = NoiseName.moderate,
     felt: study_options.Felt = study_options.FeltName.both,
+    scene: Annotated[
+        SceneName,
+        typer.Option(
+            help="Five sensors anyhow, or the two opposed fingers of a jaw that measures its opening to 0.1 mm; or of "
+            "one that is known to 0.5 mm and 0.5 degrees."
+        ),
+    ] = SceneName.anyhow,
     effort: study_options.EffortLevel = Effort.balanced,
     seed: Seed = 1,
     out: study_options.Out = None,
@@ -40,21 +56,29 @@ def judge_touches(
     """
     from geomtact.contact_space.touches import GEL_KINDS
     from geomtact.evaluation import describe, simultaneous_touches
+    from tools.studies.touches import jaw
     from tools.studies.touches import study as sensors_study
 
     content, strength = study_file.load(out, SCHEMA), study_options.noise_named(noise)
+    std = {SceneName.jaw: jaw.OPENING, SceneName.loose_jaw: jaw.LOOSE}.get(scene)
     for localizer in study_options.localizers(parts, unit, sensor, cache_dir):
         settings = describe(localizer) | {
             "scenes": scenes,
             "noise": {"name": noise.value, **asdict(strength)},
             "elastic": GEL_KINDS[felt],
+            "scene": scene.value,
             "effort": effort.value,
             "seed": seed,
         }
 
         def more(first: int, localizer: Localizer = localizer) -> Iterator[Any]:
-            made = simultaneous_touches(localizer.space, scenes, sensors_study.SENSORS, seed, strength, GEL_KINDS[felt])
-            return sensors_study.fuse_scenes(localizer, made, effort, seed, first)
+            space, elastic = localizer.space, GEL_KINDS[felt]
+            made = (
+                simultaneous_touches(space, scenes, sensors_study.SENSORS, seed, strength, elastic)
+                if std is None
+                else jaw.grasps(space, scenes, seed, strength, elastic, std)
+            )
+            return sensors_study.fuse_scenes(localizer, made, first, effort=effort, seed=seed, extrinsics_std=std)
 
         study_file.judged(
             out, content, settings, scenes, "fusing", more, sensors_study.FusedOutcome, sensors_study.summarise

@@ -50,14 +50,15 @@ class FusedOutcome:
 
 
 def fuse_scenes(
-    localizer: Localizer, scenes: Iterable[SimultaneousTouches], effort: str, seed: int, first: int = 0
+    localizer: Localizer, scenes: Iterable[SimultaneousTouches], first: int = 0, **options: Any
 ) -> Iterator[list[FusedOutcome]]:
-    """Each scene from ``first`` on localized from its first sensor, its first two, and so on."""
+    """Each scene from ``first`` on localized, with ``options`` of ``Localizer.localize``, from its first sensor, its first two,
+    and so on."""
     distance, points = PoseDistance(localizer.mesh), localizer.mesh.surface_points(_POINTS)
     for number, scene in enumerate(islice(scenes, first, None), first):
         out = []
         for n in range(1, len(scene.touches) + 1):
-            posterior, ms = localized(localizer, scene, n, effort, seed)
+            posterior, ms = localized(localizer, scene, n, **options)
             if posterior is None:
                 out.append(FusedOutcome(number, n, -np.inf, 0.0, 1.0, np.inf, np.inf, np.inf, np.inf, 0.0, True, ms))
                 continue
