@@ -121,7 +121,7 @@ class Localizer(PreparedObject):
             posterior, log_prior = touches[0]
             posterior, prior = drop_lost_contact_prior(posterior, prior)
             posterior = resolve_touch(posterior, prior, log_prior, self.scorer, resolved)
-            posterior = refine_modes(posterior, log_prior, self.mode_refiner, resolved)
+            posterior = refine_modes(posterior, self.mode_refiner, resolved)
         else:
             refiners = [one.mode_refiner for one in each]
             posterior = fused_posterior([touch for touch, _ in touches], refiners, prior, resolved, extrinsics_std)

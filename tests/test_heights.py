@@ -11,8 +11,9 @@ from typer.testing import CliRunner
 
 from geomtact import GaussianPrior, Localizer, Mesh, Sensor, contact_mask
 from geomtact.cli import app
+from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.touch import simulate_depth_map, simulate_mask
-from geomtact.scoring.likelihood import depth_map_log_likelihood
+from geomtact.scoring.contact_likelihood import ContactQuery, indentation_of
 from geomtact.se3 import transform
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.elastic import elastic_contact
@@ -66,13 +67,13 @@ def test_beside_an_elastic_contact_the_gel_sinks_and_is_not_touched():
 
 
 @pytest.mark.parametrize("radius", [1 * MM, 2 * MM, 3 * MM])
-def test_beside_a_flat_punch_hardly_anything_that_is_not_touched_counts_as_surely_touched(radius):
+def test_beside_a_flat_punch_hardly_anything_that_is_not_touched_counts_as_touched(radius):
     x, y = SENSOR.pixel_centres()
     punch = np.where(np.hypot(x[None], y[:, None]) < radius, 0.6 * MM, -1 * MM)
     touched, height = elastic_contact(punch, SENSOR.pixel_pitch)
     found = Contact.of_height(height)
-    assert (found.sure & touched).sum() == touched.sum()
-    assert found.sure.sum() < 1.35 * touched.sum() < found.mask.sum()
+    assert (found.mask & touched).sum() >= 0.99 * touched.sum() and found.mask.sum() < 1.2 * touched.sum()
+    assert found.sure.sum() <= found.mask.sum()
 
 
 @pytest.mark.slow
@@ -85,22 +86,31 @@ def test_sensors_of_one_kind_keep_their_own_calibration(tmp_path):
     assert [each.sensor.height_noise for each in (both, *both.others)] == pytest.approx([0.02 * MM, 0.2 * MM])
 
 
-def test_of_all_penetrations_the_true_one_is_likeliest_on_any_gel():
-    depths = 0.05 * MM * np.arange(1, 31)
-    cast = np.stack([under_ball(d) for d in depths])
-    for height in (np.maximum(under_ball(0.8 * MM), 0), elastic_contact(under_ball(0.8 * MM), SENSOR.pixel_pitch)[1]):
-        contact = Contact.of_height(height.astype(np.float32))
-        likely = depth_map_log_likelihood(cast, height, contact.sure, SENSOR.pixel_area(height.shape), 0.02 * MM)
-        assert depths[likely.argmax()] == pytest.approx(0.8 * MM, abs=0.03 * MM)
+@pytest.mark.parametrize("elastic", [False, True])
+def test_of_all_penetrations_the_true_one_is_likeliest_on_any_gel(balls, elastic):
+    ball, depths = balls[0], 0.05 * MM * np.arange(1, 31)
+    T = np.stack([transform(np.eye(3), [1 * MM, -0.7 * MM, BALL - d]) for d in depths])
+    at = np.abs(depths - 0.8 * MM).argmin()
+    contact = Contact.of_height(simulate_depth_map(ball.space, T[at], elastic))
+    query = ContactQuery.of(contact.soft_mask, SENSOR, indentation=indentation_of(contact, SENSOR))
+    poses, membrane = located(ball.index, T)
+    assert depths[query.compare(ball.index, poses, membrane)[1].argmax()] == pytest.approx(depths[at], abs=0.06 * MM)
 
 
-def test_gel_without_contact_lowers_only_poses_that_would_enter_it():
-    height, touched = np.zeros((4, 4)), np.zeros((4, 4), bool)
-    above, below = np.full((1, 4, 4), -1 * MM), np.full((1, 4, 4), 1 * MM)
-    free, in_it = (depth_map_log_likelihood(d, height, touched, 1e-6, 0.1 * MM)[0] for d in (above, below))
-    assert free == 0 and in_it < -4
-    height[0] = np.nan
-    assert depth_map_log_likelihood(below, height, touched, 1e-6, 0.1 * MM)[0] == pytest.approx(in_it * 3 / 4)
+def test_gel_without_contact_lowers_only_poses_that_would_enter_it(balls):
+    """And depths that were not measured count for nothing."""
+    ball = balls[0]
+    T = np.stack([transform(np.eye(3), [0, 0, BALL + z * MM]) for z in (0.1, -0.8)])
+    poses, membrane = located(ball.index, T)
+    maps, samples = ContactMaps.of(ball.index), ContactQuery.of(np.zeros((120, 160), bool), SENSOR).samples
+    losses = []
+    for measured in (160, 80, 0):
+        height = np.zeros((120, 160), np.float32)
+        height[:, measured:] = np.nan
+        indentation = indentation_of(Contact(height > 0, height), SENSOR)
+        losses.append(maps.depth_loss(samples, indentation, poses, membrane))
+    assert [each[0] for each in losses] == [0, 0, 0] and losses[0][1] > 10 and losses[2][1] == 0
+    assert losses[1][1] == pytest.approx(losses[0][1] / 2, rel=0.1)
 
 
 def test_the_sinking_of_a_thin_gel_dies_away_sooner():

@@ -159,7 +159,7 @@ def test_the_robot_touches_again_with_one_finger_or_two(steps):
 
 
 def test_the_same_seed_believes_and_chooses_the_same(plug, steps):
-    one, same = (believe(plug.space, steps[0].posterior, steps[0].felt, np.random.default_rng(5)) for _ in range(2))
+    one, same = (believe(steps[0].posterior, np.random.default_rng(5)) for _ in range(2))
     assert np.array_equal(one.T, same.T)
     made = steps[0].felt.T_world_sensor
     jaws = [choose_jaw(steps[0].posterior, one, made, np.random.default_rng(0)) for _ in range(2)]

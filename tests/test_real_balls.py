@@ -87,7 +87,7 @@ def presses(data_folder, balls):
         mask = found.observation.contact.mask
         evidence = {
             row["ball_mm"]: found.log_evidence,
-            other: balls[other].localize(mask, kind="mask", effort="fast").log_evidence,
+            other: balls[other].localize(mask, kind="mask").log_evidence,
         }
         out.append(Press(row["file"], row["ball_mm"], row["inside"] == "1", seen, found, evidence))
     print_table(out)

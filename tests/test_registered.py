@@ -7,11 +7,11 @@ from geomtact import se3
 from geomtact.evaluation import simultaneous_touches
 from geomtact.inference.distribution import cell_densities
 from geomtact.inference.effort import Effort
+from geomtact.inference.fusion import joint_problem
 from geomtact.inference.particles import SURE, OtherSensor
 from geomtact.inference.population import Population
 from geomtact.inference.registered import AboutModes, bridged, united
 from geomtact.inference.sampler import explore
-from geomtact.inference.search import SensorView, joint_problem
 from geomtact.scoring.contact_likelihood import ContactQuery
 
 
@@ -34,11 +34,9 @@ def target_of(localizer, scene, seed=0, contacts=6_000):
     first, second = (ContactQuery.of(mask, localizer.sensor) for mask in masks)
     other = OtherSensor(index, second, T_other_first)
     runs = explore(index, first, coarse, contacts, np.random.default_rng(seed), None, [other], runs=2)
-    views = [
-        SensorView(localizer.mode_refiner, observation.contact, T)
-        for observation, T in zip(cells.observations, (np.eye(4), T_other_first), strict=True)
-    ]
-    return runs[0].density.target, runs, localizer.mode_refiner.registering(index, joint_problem(views, 20))
+    shown = [(observation.contact, localizer.sensor) for observation in cells.observations]
+    problem = joint_problem(shown, np.stack([np.eye(4), se3.inverse(T_other_first)]), 20)
+    return runs[0].density.target, runs, localizer.mode_refiner.registering(index, problem)
 
 
 @pytest.mark.slow

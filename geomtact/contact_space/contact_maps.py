@@ -9,11 +9,12 @@ from __future__ import annotations
 import contextlib
 import os
 import zipfile
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -25,6 +26,7 @@ from geomtact.contact_space.index import Index
 from geomtact.files import write_whole
 from geomtact.geometry.approach import facing
 from geomtact.kernels.contact_energy import BLOCK, COARSER, Cut, Maps, Poses, Samples, contact_energy
+from geomtact.kernels.depth_loss import Indentation, depth_loss
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
@@ -34,6 +36,7 @@ _THREADS = 2
 _CENTRING = 1.5  # samples of the window
 _PART = 256  # poses that a thread takes at a time
 _FORMAT = 1  # of the file in an index's folder
+_T = TypeVar("_T")
 _LEVELS = 65_534  # of the heights in it, besides one for where the object is not
 
 
@@ -109,23 +112,37 @@ class ContactMaps:
         membrane : (n,) how far the membrane's apex is beyond the object's centre [m], or else
         depth : (n,) the penetration [m]; by default the deepest
         """
+        deepest = self.index.sensor.max_penetration
+        found = self._by_parts(
+            lambda asked: contact_energy(self.maps, samples, asked, deepest, area), poses, membrane, depth
+        )
+        return Cut(*(np.concatenate(each) for each in zip(*found, strict=True)))
+
+    def depth_loss(self, samples: Samples, indentation: Indentation, poses: Placements, membrane: Array) -> Array:
+        """How badly a depth map fits the object (n,) at ``poses``, with the ``membrane`` as of :meth:`compare`."""
+        deepest = self.index.sensor.max_penetration
+        found = self._by_parts(
+            lambda asked: depth_loss(self.maps, samples, asked, indentation, deepest), poses, membrane, None
+        )
+        return np.concatenate(found).astype(float)
+
+    def _by_parts(
+        self, of: Callable[[Poses], _T], poses: Placements, membrane: Array | None, depth: Array | None
+    ) -> list[_T]:
+        """``of`` some poses after the others."""
         # from the frame of each map into the sensor's
         tilt = poses.rotation @ self.from_maps[poses.direction]
-        n, deepest = len(poses.reach), self.index.sensor.max_penetration
+        n = len(poses.reach)
         membrane = np.full(n, np.nan) if membrane is None else membrane
-        depth = np.full(n, deepest) if depth is None else depth
+        depth = np.full(n, self.index.sensor.max_penetration) if depth is None else depth
         numbers = [each.astype(np.float32) for each in (tilt, poses.centre, poses.reach, membrane, depth)]
 
-        def some(start: int) -> Cut:
+        def some(start: int) -> _T:
             part = slice(start, start + _PART)
-            asked = Poses(poses.direction[part], *(each[part] for each in numbers))
-            return contact_energy(self.maps, samples, asked, deepest, area)
+            return of(Poses(poses.direction[part], *(each[part] for each in numbers)))
 
         starts = range(0, max(n, 1), _PART)
-        if len(starts) == 1:
-            return some(0)
-        found = list(_pool(os.getpid()).map(some, starts))
-        return Cut(*(np.concatenate(each) for each in zip(*found, strict=True)))
+        return [some(0)] if len(starts) == 1 else list(_pool(os.getpid()).map(some, starts))
 
 
 def located(index: Index, T: Array) -> tuple[Placements, Array]:

@@ -15,16 +15,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.cell_transfer import ExtrinsicsStd
-from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
+from geomtact.contact_space.contact_maps import Placements, located
 from geomtact.contact_space.index import Index
 from geomtact.inference.particles import OtherSensor, Particles, Target, tempered
 from geomtact.inference.pose_prior import CellPrior, NormalPrior, pose_prior_of
 from geomtact.inference.systematic_errors import nodes, nodes_beside, undisplaced
+from geomtact.kernels.depth_loss import Indentation
 from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
 from geomtact.se3 import Array, check_pose, check_transforms
 
 _PART = 512  # poses whose density is made at a time
-_OF_OTHER = ("touched", "source", "sensor", "index", "T_sensor_first", "extrinsics_std")  # what files hold of a sensor
+# what files hold of a sensor
+_OF_QUERY = ("touched", "source", "depths", "lying", "weight")
+_OF_OTHER = (*_OF_QUERY, "sensor", "index", "T_sensor_first", "extrinsics_std")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +98,8 @@ class Density:
         place = index.place_of(index.rotation[poses.place[rows]].astype(np.int64), flat)
         reach = poses.reach[rows] + flat[:, 2] - membrane[rows]
         asked = Placements(place, poses.direction[rows], poses.rotation[rows], flat[:, :2], reach)
-        cut = ContactMaps.of(index).compare(query.samples, query.area, asked, flat[:, 2])
-        each = self.by_power(query.log_likelihood(cut.energy), self.target.log_coarse[place])
+        cut, log_likelihood = query.compare(index, asked, flat[:, 2])
+        each = self.by_power(log_likelihood, self.target.log_coarse[place])
         if isinstance(self.target.prior, CellPrior):
             each += self.target.prior.log_density(asked, cut.reach - flat[:, 2])[:, None]
         # volumes with errors are larger
@@ -126,7 +129,6 @@ class Explored:
     contacts : that were cut
     hearts : (m, 4, 4) the densest pose that was found of each leading mode, the most probable mode first
     masses : (m,) of these modes
-    unexplained_nats : as of ``facts.Diagnostics``, None for one sensor; it is not saved
     """
 
     density: Density
@@ -136,7 +138,6 @@ class Explored:
     contacts: int
     hearts: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     masses: Array = field(default_factory=lambda: np.zeros(0))
-    unexplained_nats: float | None = None
 
     @property
     def index(self) -> Index:
@@ -254,7 +255,9 @@ class Explored:
 
 
 def _of_query(query: ContactQuery) -> dict[str, NDArray[Any]]:
-    return {"touched": query.touched, "source": np.array(query.source)}
+    none = np.zeros((0, 0), np.float32)
+    depths = query.indentation or Indentation(none, none.astype(bool), none)
+    return dict(zip(_OF_QUERY, (query.touched, np.array(query.source), *depths), strict=True))
 
 
 def _of_other(other: OtherSensor) -> dict[str, NDArray[Any]]:
@@ -279,4 +282,6 @@ def _query(arrays: Mapping[str, NDArray[Any]], index: Index) -> ContactQuery:
     source = str(arrays["source"])
     if source not in INTERCEPT:
         raise ValueError(f"a contact of another source: {source}")
-    return ContactQuery.showing(arrays["touched"].astype(bool), index.sensor, source)
+    depths = Indentation(arrays["depths"], arrays["lying"].astype(bool), arrays["weight"])
+    found = depths if depths.weight.size else None
+    return ContactQuery.showing(arrays["touched"].astype(bool), index.sensor, source, found)

@@ -28,7 +28,7 @@ class Diagnostics:
         the best pose of each sensor alone; inf where no pose suits all; None where no poses were searched
     misfit_nats : by how much the contacts that are cut at the likeliest pose miss the masks, for every 15 mm of outline; inf
         where no pose suits all, None where no contacts were cut
-    evidence_of : what ``log_evidence`` compares: "moments" or "pixels" of the cells, or "contacts" that are cut at poses
+    evidence_of : what ``log_evidence`` compares: the "moments" of a contact, or "contacts" that are cut at poses
     settled_power : largest power of the likelihood that the contacts settle within the cells, 1 the sharpest; None where the
         posterior is that of the cells
     frame : number of the frame in a sequence, from 1; None outside of one

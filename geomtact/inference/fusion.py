@@ -25,16 +25,19 @@ from geomtact.inference.densities import NoContactDensity
 from geomtact.inference.distribution import Refined, cell_densities
 from geomtact.inference.effort import Effort
 from geomtact.inference.extrinsics import extrinsics_covariance
-from geomtact.inference.facts import Diagnostics
-from geomtact.inference.joint_refinement import refine_jointly
+from geomtact.inference.facts import UNEXPLAINED_NATS, Diagnostics
 from geomtact.inference.mode_refiner import ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.resolve import resolve_touches
-from geomtact.inference.search import ROUGH_POINTS, SensorView, joint_problem
 from geomtact.inference.timing import timed
 from geomtact.log_mass import normalised
+from geomtact.registration.contact_problem import make_problem
+from geomtact.registration.protocol import Problem
 from geomtact.se3 import Array, inverse
+from geomtact.sensing.contact import Contact
+from geomtact.sensing.moments import cleaned
+from geomtact.sensing.sensor import Sensor
 
 # Least correlation between the log densities of two sensors, because a cell's width hides the same part of the pose from both.
 # Hand-set; its effect was measured on simulated scenes apart from those of the study (docs/several-sensors.md).
@@ -42,11 +45,10 @@ _LEAST_CORRELATION = 0.1
 _NEGLIGIBLE_NATS = 25.0  # log density below that of the most probable place from which a place has no weight; hand-set
 _UNLIKELY_DENSITY = 0.1  # density relative to the uniform below which a place is transferred by one pose; hand-set
 _DISAGREES_NATS = -2.0  # support of the other sensors for an image below which a disagreement is reported; hand-set
-# Unexplained nats per contact above which poor agreement is reported: 2 of 100 simulated scenes of the pin and the head with
-# exact sensor poses exceed it.
-_UNEXPLAINED_NATS = 1.75
-# The same of poses that are resolved within the cells: 2 of 26 scenes of the pin, the connector plug and the head exceed it.
-_UNEXPLAINED_WITHIN = 20.0
+# Unexplained nats per contact above which poor agreement is reported of poses that are resolved: 2 of 26 scenes of the pin, the
+# connector plug and the head exceed it. Of others, those by which they are not.
+_UNEXPLAINED_NATS = 20.0
+_POINTS, _ROUGH_POINTS = 60, 20  # of an outline, at most, to register modes, and many poses; hand-set
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,36 +177,36 @@ def fused_posterior(
     )
     others = [touch.T_frame_sensor for touch in touches if touch.contact and touch is not first]
     uncertain = bool(others) and extrinsics_std not in (None, ExtrinsicsStd())
-    views = [
-        SensorView(
-            mode_refiner,
-            touch.observation.contact if touch.contact and touch.observation else None,
-            inverse(touch.T_frame_sensor) @ first.T_frame_sensor,
-        )
-        for touch, mode_refiner in zip(touches, mode_refiners, strict=True)
-    ]
+    touching = [(touch, touch.observation) for touch in touches if touch.contact and touch.observation]
+    shown = [(observation.contact, touch.sensor) for touch, observation in touching]
+    T_first_sensor = inverse(first.T_frame_sensor) @ np.stack([touch.T_frame_sensor for touch, _ in touching])
+    refiner = mode_refiners[posterior.provenance.base]
     register = None
-    if effort.several and not any(view.has_height for view in views):
-        register = mode_refiners[posterior.provenance.base].registering(
-            posterior.index, joint_problem(views, ROUGH_POINTS)
-        )
+    if effort.several:
+        register = refiner.registering(posterior.index, joint_problem(shown, T_first_sensor, _ROUGH_POINTS))
     posterior = resolve_touches(posterior, touches, prior, log_prior, effort, extrinsics_std, register)
-    if not effort.modes:
-        return posterior
-    with timed(timing, "refine"):
-        if posterior.explored is not None:
-            refiner = mode_refiners[posterior.provenance.base]
-            posterior = refiner.register(posterior, joint_problem(views), effort.modes, effort.thorough)
-        else:
-            posterior = refine_jointly(posterior, views, effort.modes, first.seed, log_prior)
+    within = posterior.explored is not None
+    if within and effort.modes:
+        with timed(timing, "refine"):
+            posterior = refiner.register(posterior, joint_problem(shown, T_first_sensor), effort.modes, effort.thorough)
     if uncertain:
         assert extrinsics_std is not None
         posterior = replace(posterior, refined=_widened(posterior, np.stack(others), extrinsics_std))
     elif others and against is None:
-        most = _UNEXPLAINED_NATS if posterior.explored is None else _UNEXPLAINED_WITHIN
+        most = _UNEXPLAINED_NATS if within else UNEXPLAINED_NATS
         warnings = poor_agreement(posterior.diagnostics.unexplained_nats, most, prior is not None)
         posterior = replace(posterior, warnings=posterior.warnings + warnings)
     return posterior
+
+
+def joint_problem(shown: Sequence[tuple[Contact, Sensor]], T_first_sensor: Array, max_points: int = _POINTS) -> Problem:
+    """All contacts, each ``shown`` by a sensor at ``T_first_sensor`` (n, 4, 4), together, with so many points of each outline at
+    most."""
+    problems = [
+        make_problem(cleaned(contact.soft_mask, sensor), sensor, contact.height, max_points=max_points)
+        for contact, sensor in shown
+    ]
+    return Problem.joined(problems, T_first_sensor)
 
 
 def _widened(posterior: Posterior, T_frame_sensor: Array, extrinsics_std: ExtrinsicsStd) -> dict[int, Refined]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geomtact.contact_space.cell_transfer import MISSED_CONTACT_SHARE, ExtrinsicsStd
-from geomtact.contact_space.contact_maps import ContactMaps, Placements, located
+from geomtact.contact_space.contact_maps import Placements, located
 from geomtact.contact_space.index import Index
 from geomtact.inference.pose_prior import CellPrior, NormalPrior, PosePrior
 from geomtact.inference.systematic_errors import ERRORS, displaced, errors_of, stand_of
@@ -109,15 +109,15 @@ class OtherSensor:
         by ``stand`` (n, 4, 4); and by how much a contact that it shows is missed (n,) [m]."""
         query, sensor = self.query, self.index.sensor
         poses, membrane = located(self.index, inverse(stand) @ self.T_sensor_first @ T)
-        cut = ContactMaps.of(self.index).compare(query.samples, query.area, poses, membrane)
+        cut, likely = query.compare(self.index, poses, membrane)
         depth = np.where(np.isfinite(cut.reach), cut.reach - membrane, -_FARTHEST)
         if not query.touched.any():
             # the largest power stands for the whole likelihood
             return np.where(depth > 0, np.log(MISSED_CONTACT_SHARE) / POWERS[-1], 0.0), np.zeros(len(T))
         missed = np.clip(np.maximum(-depth, depth - sensor.max_penetration), 0, _FARTHEST)
         log_likelihood = np.full(len(T), query.log_likelihood_of_nothing)
-        touches = np.isfinite(cut.energy[:, 0])
-        log_likelihood[touches] = query.log_likelihood(cut.energy[touches])
+        touches = np.isfinite(likely)
+        log_likelihood[touches] = likely[touches]
         missed[~touches] = np.maximum(missed[~touches], 1e-6)
         return log_likelihood, missed
 
@@ -174,15 +174,13 @@ class Target:
         n = len(poses.reach)
         if errors is None:
             errors = np.full((n, self.carried, ERRORS), 0.5)
-        cut = ContactMaps.of(self.index).compare(self.query.samples, self.query.area, poses, membrane, depth)
+        cut, log_likelihood = self.query.compare(self.index, poses, membrane, depth)
         found = replace(poses, reach=cut.reach.astype(float))
         if depth is None:
             assert membrane is not None
             depth = found.reach - membrane
-        ok = np.isfinite(cut.energy[:, 0]) & (depth <= self.index.sensor.max_penetration)
-        depth = np.where(ok, depth, 0.0)
-        log_likelihood = np.full(len(depth), -np.inf)
-        log_likelihood[ok] = self.query.log_likelihood(cut.energy[ok])
+        ok = np.isfinite(log_likelihood) & (depth <= self.index.sensor.max_penetration)
+        depth, log_likelihood = np.where(ok, depth, 0.0), np.where(ok, log_likelihood, -np.inf)
         log_prior = self.prior.log_density(poses, depth) if isinstance(self.prior, CellPrior) else np.zeros(n)
         missed, by_sensor = np.zeros(n, bool), np.full(errors.shape[:2], -np.inf)
         if self.carried and ok.any():

@@ -19,7 +19,7 @@ from geomtact.inference.posterior import Posterior
 from geomtact.inference.registered import Register
 from geomtact.inference.timing import timed
 from geomtact.inference.two_runs import explore_twice
-from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
+from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, indentation_of
 from geomtact.scoring.fitted import FittedScorer
 from geomtact.se3 import Array, inverse
 
@@ -36,7 +36,7 @@ def resolve_touch(
 ) -> Posterior:
     """The ``posterior`` of one mask, resolved within the cells by the contacts of ``effort``.
 
-    It is as it was without contact, or with depths. ``prior`` and ``log_prior`` are as of ``single_touch.touch_posterior``,
+    It is as it was without contact. ``prior`` and ``log_prior`` are as of ``single_touch.touch_posterior``,
     ``alone`` is the posterior of the same image without them, where that is known.
     """
     if log_prior is None or not _can_resolve([posterior], effort):
@@ -61,15 +61,14 @@ def resolve_touches(
 ) -> Posterior:
     """The ``posterior`` of several sensors' masks, resolved within the cells of the first with contact.
 
-    It is as it was with depths. ``touches``, ``prior`` and ``log_prior`` are as of ``fusion.fused_posterior``.
+    ``touches``, ``prior`` and ``log_prior`` are as of ``fusion.fused_posterior``.
     """
     return _resolved(posterior, touches, None, prior, log_prior, effort, extrinsics_std, register)
 
 
 def _can_resolve(touches: Sequence[Posterior], effort: Effort) -> bool:
-    shown = [touch.observation.contact for touch in touches if touch.contact and touch.observation]
     contacts = effort.contacts if len(touches) == 1 else effort.several
-    return bool(contacts and shown and all(contact.height is None for contact in shown))
+    return bool(contacts) and any(touch.contact and touch.observation for touch in touches)
 
 
 def _resolved(
@@ -106,15 +105,19 @@ def _resolved(
         rng = np.random.default_rng(posterior.seed)
         contacts = effort.several if others else effort.contacts
         found = explore_twice(index, _query(first), coarse, contacts, rng, at_poses, others, register)
-    diagnostics = replace(posterior.diagnostics, evidence_of="contacts", misfit_nats=found.misfit_nats)
+    diagnostics = replace(
+        posterior.diagnostics,
+        evidence_of="contacts",
+        misfit_nats=found.misfit_nats,
+        unexplained_nats=found.unexplained_nats,
+    )
     posterior = replace(posterior, log_evidence=found.log_evidence)
     explored = found.explored
     if explored is None:
         warning = f"the pose is not resolved within the grid's cells: {found.why_not}"
         return replace(posterior, diagnostics=diagnostics, warnings=[*posterior.warnings, warning])
     power = explored.density.powers[-1] / POWERS[-1]
-    diagnostics = replace(diagnostics, settled_power=power, unexplained_nats=explored.unexplained_nats)
-    return replace(posterior, explored=explored, diagnostics=diagnostics)
+    return replace(posterior, explored=explored, diagnostics=replace(diagnostics, settled_power=power))
 
 
 def _mass_of_places(index: Index, density: NDArray[np.floating]) -> Array:
@@ -125,4 +128,5 @@ def _mass_of_places(index: Index, density: NDArray[np.floating]) -> Array:
 def _query(touch: Posterior) -> ContactQuery:
     assert touch.observation is not None
     source = "mask" if touch.observation.method is None else "image"
-    return ContactQuery.of(touch.observation.contact.soft_mask, touch.sensor, source)
+    contact = touch.observation.contact
+    return ContactQuery.of(contact.soft_mask, touch.sensor, source, indentation_of(contact, touch.sensor))

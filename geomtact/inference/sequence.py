@@ -107,10 +107,8 @@ def make_filter(
 
 def _resolved_by(prepared: PreparedObject, effort: Effort) -> Resolve:
     def resolve(posterior: Posterior, prior: Any, log_prior: LogMass, alone: Posterior) -> Posterior:
-        if posterior.observation is None or posterior.observation.contact.height is not None:
-            return posterior
         posterior = resolve_touch(posterior, prior, log_prior, prepared.scorer, effort, alone)
-        return refine_modes(posterior, log_prior, prepared.mode_refiner, effort)
+        return refine_modes(posterior, prepared.mode_refiner, effort)
 
     return resolve
 

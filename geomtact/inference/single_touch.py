@@ -10,13 +10,11 @@ import numpy as np
 from geomtact.contact_space.index import Index
 from geomtact.inference.effort import Effort
 from geomtact.inference.facts import Diagnostics, Provenance, ViewRecord
-from geomtact.inference.joint_refinement import refine_jointly
 from geomtact.inference.mode_refiner import ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import lost_contact, prior_log_density, prior_log_mass
 from geomtact.inference.repeated_images import digest
 from geomtact.inference.resolve import LogMass
-from geomtact.inference.search import SensorView
 from geomtact.inference.timing import timed
 from geomtact.inference.views import Placed
 from geomtact.registration.contact_problem import make_problem
@@ -103,23 +101,19 @@ def drop_lost_contact_prior(posterior: Posterior, prior: Any) -> tuple[Posterior
     return replace(posterior, off_contact_log_density=None, warnings=[*posterior.warnings, warning]), None
 
 
-def refine_modes(posterior: Posterior, log_prior: LogMass, refiner: ModeRefiner, effort: Effort) -> Posterior:
+def refine_modes(posterior: Posterior, refiner: ModeRefiner, effort: Effort) -> Posterior:
     """The ``posterior`` of one image with its leading modes refined below the grid.
 
-    Masks are registered mode by mode. With depths, a search over cells refines and reweights.
-    ``log_prior`` is as of :func:`touch_posterior`.
+    Where it is not resolved within the cells, depths are not used.
     """
     if not posterior.contact or posterior.observation is None or not effort.modes:
         return posterior
     with timed(posterior.timing_ms, "refine"):
         contact = posterior.observation.contact
         if posterior.explored is not None:
-            problem = make_problem(cleaned(contact.soft_mask, posterior.sensor), posterior.sensor)
+            problem = make_problem(cleaned(contact.soft_mask, posterior.sensor), posterior.sensor, contact.height)
             return refiner.register(posterior, problem, effort.modes, effort.thorough)
-        if contact.height is None:
-            return refiner.refine(posterior, contact, effort.modes, effort.thorough)
-        view = SensorView(refiner, contact, np.eye(4))
-        return refine_jointly(posterior, [view], effort.modes, posterior.seed, log_prior)
+        return refiner.refine(posterior, contact, effort.modes, effort.thorough)
 
 
 def _scored(contact: Contact) -> tuple[SoftMask, float]:

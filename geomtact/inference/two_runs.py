@@ -52,13 +52,14 @@ class Finding:
     explored : the distribution of the pose; None where they do not agree, or found no pose
     log_evidence : log of the mean under the prior of the likelihood of all contacts, to the power ``EVIDENCE_POWER``; -inf where
         no pose was found that touches all sensors which show contact
-    misfit_nats : as of ``facts.Diagnostics``
+    misfit_nats, unexplained_nats : as of ``facts.Diagnostics``
     why_not : why there is no distribution; empty where there is
     """
 
     explored: Explored | None
     log_evidence: float = -np.inf
     misfit_nats: float = np.inf
+    unexplained_nats: float | None = None
     why_not: str = ""
 
 
@@ -79,20 +80,25 @@ def explore_twice(
     does not help, both are repeated with four times the contacts, until these are all; then as many powers are left out as need
     be. So are runs of several sensors that found no pose which explains all contacts.
     """
-    cut, found = 0, Finding(None)
+    cut, found = 0, Finding(None, unexplained_nats=np.inf if others else None)
     attempts = (contacts // _MORE, contacts) if others else (contacts // _MORE**2, contacts // _MORE, contacts)
     for asked in attempts:
         try:
             one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, register)
             cut += one.contacts + other.contacts
-            found = Finding(None, _log_evidence(one, other), _misfit(one, other))
+            unexplained = _unexplained(one, other) if others else None
+            found = Finding(None, _log_evidence(one, other), _misfit(one, other), unexplained)
+            if unexplained is not None and unexplained > UNEXPLAINED_NATS:
+                continue
             least = 0 if asked == attempts[-1] else POWERS[len(POWERS) - _LEFT_OUT - 1]
             explored, cut = _agreed(one, other, least, asked, cut, rng)
         except InputError as error:
             found = replace(found, why_not=str(error))
             continue
         if explored is not None:
-            return replace(found, explored=explored)
+            if others:
+                unexplained = _unexplained_in_place(one, other, explored)
+            return replace(found, explored=explored, unexplained_nats=unexplained)
     settle = f"{cut:,} contacts do not settle how likely the observed one is; allow more by Effort(contacts=)"
     return replace(found, why_not=found.why_not or f"{index.mesh.name}: {settle}")
 
@@ -109,8 +115,6 @@ def _agreed(
         No pose that was found touches the sensor.
     """
     several = bool(one.density.target.others)
-    if several and _unexplained(one, other) > UNEXPLAINED_NATS:
-        return None, cut
     for last in range(len(one.log_evidence) - 1, 0, -1):
         if one.density.powers[last] < least:
             break
@@ -122,8 +126,7 @@ def _agreed(
         further = _sharpest(one, other)
         if several:
             led_to = (one.about.led_to, one.about.origin) if one.about else None
-            found = counted(found, further, _draws_left(one, last) + _draws_left(other, last), led_to)
-            return replace(found, unexplained_nats=_unexplained_in_place(one, other, found)), cut
+            return counted(found, further, _draws_left(one, last) + _draws_left(other, last), led_to), cut
         found, log_sum = weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
         if log_sum < 0:
             return found, cut

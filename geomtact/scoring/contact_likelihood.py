@@ -13,6 +13,9 @@ How far a contact is from any simulated one is not known either: by the noise al
 the posterior is a mixture of posteriors, each by a power of the likelihood: 0 gives the coarse one, 1 that of the whole
 likelihood. Errors are correlated along an outline, so information grows more slowly than its length: the weights depend on it.
 They are fitted like all else by the log score ("covariate-dependent stacking", Yao et al. 2022).
+
+Where depths are measured, the likelihood of a contact is that of its outline times that of the depths: normally distributed about
+those of the object, where the gel lies on it.
 """
 
 from __future__ import annotations
@@ -26,11 +29,13 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 from scipy.stats import beta
 
-from geomtact.contact_space.contact_maps import SHAPE
-from geomtact.kernels.contact_energy import BLOCK, SHARES, Samples
+from geomtact.contact_space.contact_maps import SHAPE, ContactMaps, Placements
+from geomtact.contact_space.index import Index
+from geomtact.kernels.contact_energy import BLOCK, SHARES, Cut, Samples
+from geomtact.kernels.depth_loss import Indentation
 from geomtact.kernels.gel_likelihood import gel_log_likelihood
 from geomtact.se3 import Array
-from geomtact.sensing.contact import SoftMask
+from geomtact.sensing.contact import Contact, SoftMask
 from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
 
@@ -50,6 +55,9 @@ SHIFT_ERROR = 0.05e-3  # m: that of errors of where a contact is, along each axi
 OUTLINE = 15e-3  # m, the length of a usual outline
 RIGID = 0.5  # share of touches on a rigid gel
 _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more is added
+_SCALE = 0.05  # standard deviation of a depth, as a share of it, beside the sensor's noise; hand-set
+_INDEPENDENT = 1e-6  # m^2 of a depth map that count as one observation; hand-set
+_EVERY = 2  # samples of the window along each axis, of whose depths one is compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +72,7 @@ class ContactQuery:
     area : of the contact, in samples
     log_outline : log of the length of its outline over ``OUTLINE``
     source : "mask", or "image" where it was found in one
+    indentation : the depths, where they are measured
     """
 
     touched: NDArray[np.bool_]
@@ -72,14 +81,19 @@ class ContactQuery:
     area: float
     log_outline: float
     source: str
+    indentation: Indentation | None = None
 
     @classmethod
-    def of(cls, mask: SoftMask, sensor: Sensor, source: str = "mask") -> ContactQuery:
-        """From the observed ``mask`` (H, W), which shows contact."""
-        return cls.showing(cleaned(mask, sensor) > 0.5, sensor, source)
+    def of(
+        cls, mask: SoftMask, sensor: Sensor, source: str = "mask", indentation: Indentation | None = None
+    ) -> ContactQuery:
+        """From the observed ``mask`` (H, W), and the depths of :func:`indentation_of`."""
+        return cls.showing(cleaned(mask, sensor) > 0.5, sensor, source, indentation)
 
     @classmethod
-    def showing(cls, touched: NDArray[np.bool_], sensor: Sensor, source: str) -> ContactQuery:
+    def showing(
+        cls, touched: NDArray[np.bool_], sensor: Sensor, source: str, indentation: Indentation | None = None
+    ) -> ContactQuery:
         """From the contact ``touched`` (H, W) without specks."""
         pitch = float(np.sqrt(sensor.pixel_area(touched.shape)))
         count = touched.sum()
@@ -89,12 +103,26 @@ class ContactQuery:
         # a straight line at any angle crosses 4 / pi times as many pairs of neighbours as its length has pixels
         crossed = (touched[:, 1:] != touched[:, :-1]).sum() + (touched[1:] != touched[:-1]).sum()
         log_outline = float(np.log(max(0.25 * np.pi * pitch * crossed, pitch) / OUTLINE))
-        return cls(touched, _samples(touched, pitch, sensor), centroid, float(area), log_outline, source)
+        samples = _samples(touched, pitch, sensor)
+        return cls(touched, samples, centroid, float(area), log_outline, source, indentation)
 
-    def log_likelihood(self, energy: NDArray[np.float32]) -> Array:
-        """Log likelihood (n,) of the contact at poses whose contacts have ``energy`` (n, SHARES), up to a constant of the image;
-        -inf where that is inf."""
-        return gel_log_likelihood(energy, RATE, _LOG_SHARE)
+    def compare(
+        self, index: Index, poses: Placements, membrane: Array | None = None, depth: Array | None = None
+    ) -> tuple[Cut, Array]:
+        """The contacts at n ``poses`` of ``index``, and how likely this one is there: log likelihood (n,), up to a constant of
+        the image; -inf where nothing is touched. Parameters are those of ``ContactMaps.compare``, one of the last two."""
+        maps = ContactMaps.of(index)
+        cut = maps.compare(self.samples, self.area, poses, membrane, depth)
+        out = gel_log_likelihood(cut.energy, RATE, _LOG_SHARE)
+        touches = np.flatnonzero(np.isfinite(out))
+        if self.indentation is not None and len(touches):
+            at = cut.reach - depth if depth is not None else membrane
+            assert at is not None
+            some = Placements(*(each[touches] for each in vars(poses).values()))
+            loss = maps.depth_loss(self.samples, self.indentation, some, at[touches])
+            # the largest power stands for the whole likelihood
+            out[touches] -= loss * _observations(index.sensor) / POWERS[-1]
+        return cut, out
 
     @property
     def log_likelihood_of_nothing(self) -> float:
@@ -142,6 +170,36 @@ def from_outline(mask: NDArray[np.bool_], pitch: float) -> NDArray[np.float32]:
     return np.asarray(pitch * np.where(mask, -off[1], off[0]), np.float32)
 
 
+def _observations(sensor: Sensor) -> float:
+    """How many independent depths one that is compared stands for."""
+    return min(1.0, _EVERY**2 * sensor.pixel_area(sensor.along(SHAPE)) / _INDEPENDENT)
+
+
+def indentation_of(contact: Contact, sensor: Sensor) -> Indentation | None:
+    """The depths of a ``contact``, where they are measured."""
+    height, shape = contact.height, sensor.along(SHAPE)
+    if height is None:
+        return None
+    measured = np.isfinite(height)
+    share = cv2.resize(measured.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
+    depth = cv2.resize(np.where(measured, height, 0).astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
+    depth = depth / np.maximum(share, 1e-6)
+    lying = cv2.resize(contact.sure.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
+    weight = np.zeros(shape)
+    some = np.s_[::_EVERY, ::_EVERY]
+    weight[some] = np.where(share > 0.5, 1 / (sensor.height_noise**2 + (_SCALE * depth) ** 2), 0)[some]
+    return Indentation(
+        _blockwise(depth), np.ascontiguousarray(_blockwise(lying.astype(np.float32)) > 0.5), _blockwise(weight)
+    )
+
+
+def _blockwise(image: NDArray[np.floating]) -> NDArray[np.float32]:
+    """``image`` of the window's samples in their blocks (B, S)."""
+    h, w = image.shape
+    parts = image.reshape(h // BLOCK, BLOCK, w // BLOCK, BLOCK).swapaxes(1, 2)
+    return np.ascontiguousarray(parts.reshape(-1, BLOCK**2), np.float32)
+
+
 def _samples(touched: NDArray[np.bool_], pitch: float, sensor: Sensor) -> Samples:
     """Samples of the window, weighed by their distance from the outline of ``touched`` (H, W)."""
     shape = sensor.along(SHAPE)
@@ -150,12 +208,8 @@ def _samples(touched: NDArray[np.bool_], pitch: float, sensor: Sensor) -> Sample
     blocks = (shape[0] // BLOCK, shape[1] // BLOCK)
     points = sensor.lift(np.stack(np.meshgrid(*sensor.pixel_centres(shape)), -1))
 
-    def blockwise(image: NDArray[np.floating]) -> NDArray[np.float32]:
-        parts = image.reshape(blocks[0], BLOCK, blocks[1], BLOCK).swapaxes(1, 2)
-        return np.ascontiguousarray(parts.reshape(-1, BLOCK**2), np.float32)
-
-    x, y, z = (blockwise(points[..., k]) for k in range(3))
-    weight = blockwise(weight)
+    x, y, z = (_blockwise(points[..., k]) for k in range(3))
+    weight = _blockwise(weight)
     least = float(np.minimum(weight, 0).sum())
     block = np.stack([x.mean(1), y.mean(1)], -1)
     within = np.stack([x, y], -1) - block[:, None]

@@ -25,8 +25,6 @@ from geomtact.sensing.moments import cleaned
 THRESHOLDS = (0.0, 0.25, 0.5)  # least depth of a pixel in contact, as a share of the penetration; equally likely
 SOFTNESS = (0.1e-3, 0.4e-3)  # width of the boundary between contact and none, in depth [m]; equally likely
 _CORRELATED = 4e-6  # area within which pixels count as one observation [m^2]
-_SCALE = 0.05  # standard deviation of a depth, as a share of it, that all depths of a touch share
-_FAR = 0.05  # height above the membrane that counts as infinite [m]
 _OUTLIERS = 0.02  # share of pixels that are outliers, such as dust and glare
 
 
@@ -75,33 +73,6 @@ def cast_log_likelihood(depths: NDArray[np.floating], seen: NDArray[np.bool_], a
     for t, s in product(THRESHOLDS, SOFTNESS):
         each.append(weight * np.log(_contact_probability(sign * (depths - t * deepest), s)).sum((1, 2)))
     return np.asarray(log_mean_exp(np.stack(each, 1)), float)
-
-
-def depth_map_log_likelihood(
-    depths: NDArray[np.floating],
-    height: NDArray[np.floating],
-    touched: NDArray[np.bool_],
-    area: float,
-    noise: float,
-) -> NDArray[np.floating]:
-    """Log likelihood (n,) of the gel's indentation, given how far the object lies below the membrane, up to a constant that no
-    pose or object changes.
-
-    Where it is touched the gel lies on the object; elsewhere the object is not in the gel. Some pixels are outliers.
-
-    Parameters
-    ----------
-    depths : (n, h, w) how far the object lies below the undeformed membrane [m], -inf where it is not
-    height : (h, w) how deep the gel is pressed in [m]; NaN where it was not measured
-    touched : (h, w) where the object touches
-    area : of a pixel [m^2]
-    noise : standard deviation of depths [m], beside a share of them
-    """
-    measured = np.isfinite(height)
-    beside = height[measured] - np.maximum(depths[:, measured], -_FAR)  # of the gel's surface from the object's
-    beside = np.where(touched[measured], beside, np.minimum(beside, 0))
-    off2 = beside**2 / (noise**2 + (_SCALE * height[measured]) ** 2)
-    return _independent(area) * np.log((1 - _OUTLIERS) * np.exp(-0.5 * off2) + _OUTLIERS).sum(1)
 
 
 def _contact_probability(below: NDArray[np.floating], softness: float) -> NDArray[np.floating]:

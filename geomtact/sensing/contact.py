@@ -18,6 +18,15 @@ _BORDER = 2  # px
 # noise: it is 0.29 under a cone, 0.5 under a ball
 _SHALLOW = 0.22
 FAINT = 0.01  # share of the deepest that is no indentation
+# The gel carries pressure where that is at least this share of the largest, and this deep; both hand-set
+_CARRYING, _DEEP = 0.2, 0.2
+_SMOOTHED = (
+    0.8,
+    1.6,
+    3.2,
+    6.4,
+)  # px: widths by which the pressure is smoothed, the first by which it exceeds its noise
+_CLEARLY = 4.0  # standard deviations of the noise of the pressure that the least of it exceeds; hand-set
 
 SoftMask = NDArray[np.bool_] | NDArray[np.float32]  # (H, W) whether each pixel is in contact, or how probably
 
@@ -51,7 +60,7 @@ class Contact:
         """Of a map (H, W) of how deep the gel is pressed in [m].
 
         A rigid gel is pressed in where it is touched. An elastic one sinks beside the object too, and that fades away: then the
-        contact is taken to be where it is more than half as deep as at the deepest.
+        contact is taken to be where the gel carries pressure; or, where noise hides that, where it surely lies on the object.
         """
         pressed = height > FAINT * height.max()
         if not pressed.any():
@@ -64,7 +73,10 @@ class Contact:
             fades |= np.median(height[pressed]) < _SHALLOW * height.max()
         else:  # all of the gel is pressed in: by what fills the window, or less and less towards its border
             fades = np.median(np.r_[height[0], height[-1], height[:, 0], height[:, -1]]) < HALF * height.max()
-        return cls(height > HALF * height.max(), height, SURE) if fades else cls(pressed, height)
+        if not fades:
+            return cls(pressed, height)
+        carrying = _carrying(height)
+        return cls(height > SURE * height.max() if carrying is None else carrying, height, SURE)
 
     @property
     def sure_depth(self) -> float:
@@ -82,6 +94,27 @@ class Contact:
         """Where (H, W) the contact is deeper than ``depth`` [m]."""
         assert self.height is not None
         return self.mask & (self.height > depth)
+
+
+def _carrying(height: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+    """Where (H, W) a gel that is pressed in by ``height`` (H, W) carries pressure; None where noise hides it.
+
+    An elastic half-space takes a pressure of the spatial frequency k in proportion to k times the depth (Johnson 1985), and the
+    gel beside a contact carries none.
+    """
+    h, w = height.shape
+    beyond = max(h, w) // 2
+    wide = np.pad(height, beyond, "edge")
+    k = 2 * np.pi * np.hypot(np.fft.fftfreq(wide.shape[0])[:, None], np.fft.rfftfreq(wide.shape[1]))
+    by_frequency, deepest = np.fft.rfft2(wide) * k, float(height.max())
+    for width in _SMOOTHED:
+        smooth = np.fft.irfft2(by_frequency * np.exp(-0.5 * (k * width) ** 2), wide.shape)
+        pressure = smooth[beyond : beyond + h, beyond : beyond + w]
+        least, free = _CARRYING * pressure.max(), pressure[height < _DEEP * deepest]
+        noise = 1.5 * np.median(np.abs(free - np.median(free))) if free.size else 0.0
+        if least > _CLEARLY * noise:
+            return np.asarray((pressure > least) & (height > _DEEP * deepest))
+    return None
 
 
 def border_of(image: NDArray[Any]) -> NDArray[Any]:

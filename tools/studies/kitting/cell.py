@@ -19,16 +19,13 @@ from geomtact.contact_space.touch import simulate_mask, spoilt
 from geomtact.contact_space.touches import counts, penetrations
 from geomtact.errors import InputError
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.inference.mode_refiner import LIKELIHOOD_POWER, ModeRefiner
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.search import SensorView
 from geomtact.localizer import Localizer
 from geomtact.planning.draws import draw_places
 from geomtact.planning.grid import grid_of_touches
 from geomtact.planning.jaw import OPPOSITE, close_jaw, first_grasp
 from geomtact.planning.next_touch import evaluate
 from geomtact.se3 import Array, inverse, transform
-from geomtact.sensing.contact import Contact
 from geomtact.sensing.noise import MODERATE, Noise
 from tools.studies.kitting.fixture import Fixture
 
@@ -103,28 +100,13 @@ def touch_with_jaw(
     return Felt(np.array(T).reshape(-1, 4, 4), masks)
 
 
-def believe(space: ContactSpace, posterior: Posterior, felt: Felt, rng: np.random.Generator) -> Believed:
-    """Poses drawn from ``posterior``; where it is not resolved, each weighed by the likelihood of all contacts ``felt``.
-
-    Then they scatter about what registration found, and lie anywhere within cells that it did not look into. The grid's cells
-    are wider than any clearance, so their masses are too coarse; the pixels, cast at the pose itself, are finer.
-    """
-    if posterior.explored is not None:
-        first, drawn = posterior.modes(1)[0], posterior.sample(_DRAWS, rng)
-        near = PoseDistance(space.mesh).within(first.T, drawn, mode_radius(space.mesh)).mean()
-        found = min(first.probability / max(near, 1 / _DRAWS), 1.0)
-        return Believed(np.concatenate([first.T[None], drawn]), np.full(1 + _DRAWS, 1 / (1 + _DRAWS)), found)
-    poses = draw_places(posterior, _DRAWS, rng)[0]
-    mode_refiner, log_weight = ModeRefiner(space), np.zeros(len(poses))
-    for T_world_sensor, mask in zip(felt.T_world_sensor, felt.masks, strict=True):
-        seen = SensorView(mode_refiner, Contact(mask) if mask.any() else None, inverse(T_world_sensor))
-        log_weight += (LIKELIHOOD_POWER if mask.any() else _MISSED) * seen.log_likelihood(poses)
-    heaviest = np.argsort(-log_weight)
-    weight = np.exp(log_weight - log_weight.max())[heaviest]
-    weight /= weight.sum()
-    # how many poses of equal weight would be as informative (Kish 1965)
-    effective = 1 / (weight**2).sum()
-    return Believed(poses[heaviest], weight, float(effective / (effective + 1)))
+def believe(posterior: Posterior, rng: np.random.Generator) -> Believed:
+    """The first mode of ``posterior`` and poses drawn from it; the right one is among what was found as far as the mode's
+    probability says less than the draws do."""
+    mesh, first, drawn = posterior.mesh, posterior.modes(1)[0], draw_places(posterior, _DRAWS, rng)[0]
+    near = PoseDistance(mesh).within(first.T, drawn, mode_radius(mesh)).mean()
+    found = min(first.probability / max(near, 1 / _DRAWS), 1.0)
+    return Believed(np.concatenate([first.T[None], drawn]), np.full(1 + _DRAWS, 1 / (1 + _DRAWS)), found)
 
 
 def decide(belief: Believed, fixture: Fixture, clearances: Sequence[float]) -> list[Decision]:
@@ -182,7 +164,7 @@ def kit(
         posterior = localizer.localize(
             felt.masks, "mask", T_world_sensor=felt.T_world_sensor, extrinsics_std=ExtrinsicsStd()
         )
-        belief = believe(localizer.space, posterior, felt, rng)
+        belief = believe(posterior, rng)
         yield Step(felt, posterior, belief, decide(belief, fixture, clearances))
         if touch < touches:
             jaw = choose_jaw(posterior, belief, felt.T_world_sensor, rng)
