@@ -209,9 +209,7 @@ def test_a_contact_found_in_an_image_is_trusted_less(localizer, touch, posterior
     np.testing.assert_array_equal(Posterior.load(tmp_path, localizer.cache_dir).log_prob, found.log_prob)
 
 
-def test_depth_maps_and_several_sensors_stay_on_the_cells(localizer, touch):
-    depth = np.where(touch.mask, np.float32(5e-4), np.float32(0))
-    assert localizer.localize(depth, "height", effort=EFFORT).explored is None
+def test_several_sensors_stay_on_the_cells_where_no_contacts_are_given(localizer):
     scene = next(simultaneous_touches(localizer.space, 1, 2, seed=0))
     masks = [each.mask for each in scene.touches]
     assert localizer.localize(masks, "mask", None, scene.T_world_sensor, effort=EFFORT).explored is None

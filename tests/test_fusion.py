@@ -206,7 +206,7 @@ def test_a_sensor_without_contact_lowers_poses_that_would_touch_it(plug, rng):
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (3, 4, 0, 1, 2), (0, 3, 1, 4, 2)])
 @pytest.mark.slow
-def test_sensors_out_of_reach_do_not_change_refinement(plug, order):
+def test_sensors_out_of_reach_do_not_change_the_posterior(plug, order):
     touches = random_touches(plug.space, 3, 11)
     _, sensors = world(touches, np.random.default_rng(1))
     far = [se3.transform(np.eye(3), [0, 0, z]) @ sensors[0] for z in (2.0, 3.0)]

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -13,6 +14,7 @@ from geomtact import GaussianPrior, Localizer, Mesh, Sensor, contact_mask
 from geomtact.cli import app
 from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.touch import simulate_depth_map, simulate_mask
+from geomtact.contact_space.touches import random_touches
 from geomtact.scoring.contact_likelihood import ContactQuery, indentation_of
 from geomtact.se3 import transform
 from geomtact.sensing.contact import Contact
@@ -142,8 +144,8 @@ def test_heights_measure_the_depth_and_the_size_of_a_ball(balls, elastic):
     posterior = ball.localize(height.astype(np.float32))
     assert posterior.observation.kind == "height"
     mode = posterior.modes(1)[0]
-    assert mode.T[:3, 3] == pytest.approx(T[:3, 3], abs=0.06 * MM)
-    assert posterior.log_evidence > other.localize(height.astype(np.float32)).log_evidence + 1
+    assert mode.T[:3, 3] == pytest.approx(T[:3, 3], abs=0.1 * MM)
+    assert posterior.log_evidence > other.localize(height.astype(np.float32)).log_evidence + 0.5
     masks = [each.localize(simulate_mask(ball.space, T, elastic)).log_evidence for each in (ball, other)]
     # a mask hardly does: by no more than the evidences err that are fitted on so few touches
     assert abs(masks[0] - masks[1]) < 1.5
@@ -226,3 +228,22 @@ def test_a_scan_is_read_with_its_pitch(data_folder):
     height, pitch = read_scan(data_folder / "gelsight_groove_scan" / "heightmap.tmd")
     assert height.shape == (514, 616) and pitch == pytest.approx((0.02746 * MM, 0.02746 * MM), rel=1e-3)
     assert 0.3 * MM < np.ptp(height) < 0.5 * MM
+
+
+@pytest.mark.slow
+def test_depths_take_nothing_away_from_what_the_mask_says(make_localizer, rng):
+    """Twenty elastic touches of a plug, depths off by 0.02 mm over a millimetre: the gain is no smaller with them than by the
+    contact found in them alone, but for chance, and the truth is where it is said to be."""
+    sensor = replace(Sensor.load("gelslim"), height_noise=0.02 * MM)
+    plug = make_localizer("connector_plug", sensor)
+    pitch, gains, levels = np.sqrt(sensor.pixel_area(sensor.image_size_px[::-1])), [], []
+    for touch in random_touches(plug.space, 20, 6, True):
+        noise = cv2.GaussianBlur(rng.normal(size=sensor.image_size_px[::-1]), (0, 0), 1 * MM / pitch)
+        height = simulate_depth_map(plug.space, touch.T_sensor_object) + 0.02 * MM * noise / noise.std()
+        height = np.maximum(height, 0).astype(np.float32)
+        both, mask = plug.localize(height, "height"), plug.localize(Contact.of_height(height).mask, "mask")
+        gains.append([each.log_density(touch.T_sensor_object) for each in (both, mask)])
+        levels.append(both.credible_level(touch.T_sensor_object))
+    more = np.subtract(*np.transpose(gains))
+    assert more.mean() > -2 * more.std() / np.sqrt(20), more
+    assert np.mean(np.array(levels) < 0.9) >= 0.7

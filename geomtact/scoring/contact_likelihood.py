@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -56,7 +57,10 @@ OUTLINE = 15e-3  # m, the length of a usual outline
 RIGID = 0.5  # share of touches on a rigid gel
 _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more is added
 _SCALE = 0.05  # standard deviation of a depth, as a share of it, beside the sensor's noise; hand-set
-_INDEPENDENT = 1e-6  # m^2 of a depth map that count as one observation; hand-set
+# m^2 of a depth map that count as one observation: of 1, 3 and 10 mm^2 what leaves the largest gain on 60 touches of the pin, the
+# head and the connector plug, seed 91
+_INDEPENDENT = 3e-6
+_ALL = 0.99  # of a sample lies on the object, where the gel counts as lying on it
 _EVERY = 2  # samples of the window along each axis, of whose depths one is compared
 
 
@@ -181,13 +185,21 @@ def indentation_of(contact: Contact, sensor: Sensor) -> Indentation | None:
     if height is None:
         return None
     measured = np.isfinite(height)
-    share = cv2.resize(measured.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
-    depth = cv2.resize(np.where(measured, height, 0).astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
-    depth = depth / np.maximum(share, 1e-6)
-    lying = cv2.resize(contact.sure.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
+
+    def sampled(image: NDArray[Any]) -> NDArray[np.floating]:
+        """The mean over each sample of the window."""
+        return np.asarray(cv2.resize(image.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA), float)
+
+    share = sampled(measured)
+    depth = sampled(np.where(measured, height, 0)) / np.maximum(share, 1e-6)
+    pitch = np.sqrt(sensor.pixel_area(shape))
+    # within a sample depths differ by the slope
+    slope = np.hypot(*np.gradient(depth, pitch)) * pitch / np.sqrt(12)
     weight = np.zeros(shape)
     some = np.s_[::_EVERY, ::_EVERY]
-    weight[some] = np.where(share > 0.5, 1 / (sensor.height_noise**2 + (_SCALE * depth) ** 2), 0)[some]
+    variance = sensor.height_noise**2 + (_SCALE * depth) ** 2 + slope**2
+    weight[some] = np.where(share > 0.5, 1 / variance, 0)[some]
+    lying = sampled(contact.sure) > _ALL
     return Indentation(
         _blockwise(depth), np.ascontiguousarray(_blockwise(lying.astype(np.float32)) > 0.5), _blockwise(weight)
     )

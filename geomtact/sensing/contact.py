@@ -73,7 +73,7 @@ class Contact:
             fades |= np.median(height[pressed]) < _SHALLOW * height.max()
         else:  # all of the gel is pressed in: by what fills the window, or less and less towards its border
             fades = np.median(np.r_[height[0], height[-1], height[:, 0], height[:, -1]]) < HALF * height.max()
-        if not fades:
+        if not fades or np.array_equal(pressed, height > HALF * height.max()):
             return cls(pressed, height)
         carrying = _carrying(height)
         return cls(height > SURE * height.max() if carrying is None else carrying, height, SURE)

@@ -97,7 +97,7 @@ def read_observation(
         contact = Contact.of_height(height)
         if not np.array_equal(contact.mask, height > FAINT * height.max()):
             warnings.append(
-                f"{name}: the depths fade away, as beside a contact; what is over half as deep counts as contact"
+                f"{name}: the depths fade away, as beside a contact on a soft gel; the contact is where the gel carries pressure"
             )
     else:
         contact, method = _reading(array, name, sensor, background, warnings)
