@@ -91,7 +91,7 @@ def identify(
     """
     found: list[tuple[str, float, bool]] = []  # name, evidence, is_outlier
     log_odds: list[float] = []
-    best: tuple[float, Localizer, Posterior] | None = None
+    best: tuple[tuple[float, float], Localizer, Posterior] | None = None
     read: dict[tuple[str, ...], list[Observation]] = {}  # by the sensors that read them
     log_weights = None if weights is None else _log_weights(weights)
     if not isinstance(localizers, Iterable):
@@ -109,7 +109,7 @@ def identify(
             for effort in _efforts(options.get("effort", "balanced")):
                 posterior = localizer.localize(read[sensors], **{**options, "effort": effort})
                 odds = weight + _POWER[posterior.diagnostics.evidence_of] * posterior.log_evidence
-                if best is not None and odds < best[0] + np.log(_HARDLY):
+                if best is not None and odds < best[0][0] + np.log(_HARDLY):
                     break
         except NoPoseAgreesError as error:
             found.append((localizer.mesh.name, -np.inf, True))
@@ -118,14 +118,16 @@ def identify(
             continue
         found.append((localizer.mesh.name, posterior.log_evidence, _is_outlier(posterior)))
         log_odds.append(odds)
-        if best is None or odds > best[0]:
-            best = odds, localizer, posterior
+        if best is None or (odds, weight) > best[0]:
+            best = (odds, weight), localizer, posterior
     if not found:
         raise UsageError("identify: expected objects to choose from, got none")
     if log_weights is not None and len(log_weights) != len(found):
         raise UsageError(f"identify: expected a weight for each of {len(found)} objects, got {len(log_weights)}")
     if best is None:
         raise last_error
+    if best[0][1] == -np.inf:
+        raise UsageError("identify: no object with a weight above 0 explains the images; give others a weight")
     missed = _MISSED if best[2].diagnostics.evidence_of == "contacts" else 0.0
     probability = _probability(np.array(log_odds), log_weights, missed)
     order = np.argsort(-probability, kind="stable")
@@ -138,23 +140,18 @@ def _efforts(effort: str | Effort) -> list[Effort]:
     asked = effort_of(effort)
     if not asked.contacts:
         return [asked]
-    return [replace(asked, modes=0, contacts=asked.contacts // _ROUGHLY, several=asked.several // _ROUGHLY), asked]
+    contacts, several = (-(-each // _ROUGHLY) for each in (asked.contacts, asked.several))
+    return [replace(asked, modes=0, contacts=contacts, several=several), asked]
 
 
 def _probability(log_odds: Array, log_weights: Array | None, missed: float) -> Array:
-    """Probability (n,) of each object, where the evidence says nothing with a probability of ``missed``.
-
-    Raises
-    ------
-    UsageError
-        No object with a weight above 0 explains the images.
-    """
-    weights = np.full(len(log_odds), 1 / len(log_odds)) if log_weights is None else np.exp(log_weights)
-    total = np.logaddexp.reduce(log_odds)
-    if total == -np.inf and not missed:
-        raise UsageError("identify: no object with a weight above 0 explains the images; give others a weight")
-    explained = np.exp(log_odds - total) if total > -np.inf else weights
-    return np.asarray((1 - missed) * explained + missed * weights)
+    """Probability (n,) of each object, where the evidence says nothing with a probability of ``missed``: all that have a weight
+    are as probable then."""
+    weights = np.ones(len(log_odds)) if log_weights is None else np.exp(log_weights)
+    total, possible = np.logaddexp.reduce(log_odds), weights > 0
+    if total == -np.inf:
+        return np.asarray(weights / weights.sum())
+    return np.asarray((1 - missed) * np.exp(log_odds - total) + missed * possible / possible.sum())
 
 
 def _read(

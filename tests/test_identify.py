@@ -10,7 +10,7 @@ import trimesh
 from speed import slow_but
 from typer.testing import CliRunner
 
-from geomtact import InputError, Mesh, UsageError
+from geomtact import GaussianPrior, InputError, Mesh, Sensor, UsageError
 from geomtact.cli import app
 from geomtact.cli.several import objects_of
 from geomtact.errors import NoPoseAgreesError
@@ -141,6 +141,48 @@ def test_the_evidence_of_contacts_does_not_depend_on_the_cells(drawer, make_loca
         for mask in masks
     ]
     assert abs(np.mean(apart)) < 0.2 + 3 * np.std(apart) / np.sqrt(len(apart)), "each is found to about a nat"
+
+
+def test_a_prior_that_says_nothing_leaves_the_evidence(drawer):
+    """A Gaussian far wider than the contact pose space; its evidence is a mean over the prior, which is then uniform."""
+    T = drawer[2].space.sample(1, np.random.default_rng(2))[0][0]
+    wide = GaussianPrior(T, np.diag([3.0**2] * 3 + [0.3**2] * 3))
+    apart = []
+    for mask in touches(drawer[2], 5, seed=6):
+        with_prior, alone = (drawer[2].localize(mask, "mask", prior=prior).log_evidence for prior in (wide, None))
+        apart.append(with_prior - alone)
+    assert abs(np.mean(apart)) < 0.5 + 2 * np.std(apart) / np.sqrt(len(apart))
+
+
+def test_the_posterior_is_that_of_the_most_probable():
+    """Whatever the weights, also where no object has a pose that was found; an object without weight is never it."""
+
+    def localizer(name, evidence):
+        posterior = SimpleNamespace(
+            contact=True, log_evidence=evidence, diagnostics=Diagnostics(evidence_of="contacts", misfit_nats=0.0)
+        )
+        mesh = SimpleNamespace(name=name)
+        return SimpleNamespace(mesh=mesh, sensors=[Sensor.load("gelslim")], localize=lambda image, effort: posterior)
+
+    image = np.zeros((320, 427), bool)
+    for evidences, weights, best in (
+        ((0.0, 4.4), (0.9, 0.1), "b"),
+        ((0.0, 4.3), (0.9, 0.1), "a"),
+        ((-np.inf, -np.inf), (0.3, 0.7), "b"),
+        ((0.0, -np.inf), (0.1, 0.9), "a"),
+    ):
+        both = [localizer(name, evidence) for name, evidence in zip("ab", evidences, strict=True)]
+        found = identify(both, image, weights, effort="balanced")
+        assert found.candidates[0].name == found.localizer.mesh.name == best
+        assert sum(each.probability for each in found.candidates) == pytest.approx(1)
+
+    def refuses(image, effort):
+        raise NoPoseAgreesError("none")
+
+    refusing = localizer("c", 0.0)
+    refusing.localize = refuses
+    with pytest.raises(UsageError, match="no object with a weight"):
+        identify([localizer("b", 9.0), refusing], image, (0.0, 1.0))
 
 
 @pytest.mark.parametrize("scenes", slow_but((1, 2), 1))

@@ -118,12 +118,10 @@ class ContactMaps:
         )
         return Cut(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
-    def depth_loss(self, samples: Samples, indentation: Indentation, poses: Placements, membrane: Array) -> Array:
+    def depth_loss(self, indentation: Indentation, poses: Placements, membrane: Array) -> Array:
         """How badly a depth map fits the object (n,) at ``poses``, with the ``membrane`` as of :meth:`compare`."""
         deepest = self.index.sensor.max_penetration
-        found = self._by_parts(
-            lambda asked: depth_loss(self.maps, samples, asked, indentation, deepest), poses, membrane, None
-        )
+        found = self._by_parts(lambda asked: depth_loss(self.maps, asked, indentation, deepest), poses, membrane, None)
         return np.concatenate(found).astype(float)
 
     def _by_parts(

@@ -20,8 +20,7 @@ from geomtact.contact_space.index import Index
 from geomtact.inference.particles import OtherSensor, Particles, Target, tempered
 from geomtact.inference.pose_prior import CellPrior, NormalPrior, pose_prior_of
 from geomtact.inference.systematic_errors import nodes, nodes_beside, undisplaced
-from geomtact.kernels.depth_loss import Indentation
-from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery
+from geomtact.scoring.contact_likelihood import INTERCEPT, POWERS, ContactQuery, placed_indentation
 from geomtact.se3 import Array, check_pose, check_transforms
 
 _PART = 512  # poses whose density is made at a time
@@ -255,8 +254,7 @@ class Explored:
 
 
 def _of_query(query: ContactQuery) -> dict[str, NDArray[Any]]:
-    none = np.zeros((0, 0), np.float32)
-    depths = query.indentation or Indentation(none, none.astype(bool), none)
+    depths = query.indentation[:3] if query.indentation else 3 * (np.zeros((0, 0), np.float32),)
     return dict(zip(_OF_QUERY, (query.touched, np.array(query.source), *depths), strict=True))
 
 
@@ -282,6 +280,6 @@ def _query(arrays: Mapping[str, NDArray[Any]], index: Index) -> ContactQuery:
     source = str(arrays["source"])
     if source not in INTERCEPT:
         raise ValueError(f"a contact of another source: {source}")
-    depths = Indentation(arrays["depths"], arrays["lying"].astype(bool), arrays["weight"])
-    found = depths if depths.weight.size else None
+    depths = arrays["depths"], arrays["lying"].astype(bool), arrays["weight"]
+    found = placed_indentation(*depths, index.sensor) if depths[0].size else None
     return ContactQuery.showing(arrays["touched"].astype(bool), index.sensor, source, found)

@@ -11,8 +11,8 @@ import numpy as np
 from geomtact.inference.effort import Effort
 from geomtact.se3 import Array
 
-# Where the likeliest pose leaves more of each contact unexplained (see ``Diagnostics``), a search for poses is not believed,
-# nor is the object taken for the one that is touched. Chosen on 22 simulated scenes (docs/which-part.md).
+# Where the likeliest pose leaves more of each of several contacts unexplained (see ``Diagnostics``), the poses that were found
+# are not believed. Chosen on 22 simulated scenes.
 UNEXPLAINED_NATS = 8.0
 
 
@@ -25,9 +25,9 @@ class Diagnostics:
     is_outlier : whether a contact is out of distribution: no simulated touch of the object resembles it
     disagrees : whether the other sensors, or the prior, contradict a sensor's image
     unexplained_nats : per contact, by how much the likeliest pose, with sensors where they are said to be, explains less than
-        the best pose of each sensor alone; inf where no pose suits all; None where no poses were searched
-    misfit_nats : by how much the contacts that are cut at the likeliest pose miss the masks, for every 15 mm of outline; inf
-        where no pose suits all, None where no contacts were cut
+        the best pose of each sensor alone; inf where no pose suits all; None for one sensor, and where no contacts were cut
+    misfit_nats : by how much the contacts that are cut at the likeliest pose miss the masks, and their depths those that were
+        measured, for every 15 mm of outline; inf where no pose suits all, None where no contacts were cut
     evidence_of : what ``log_evidence`` compares: the "moments" of a contact, or "contacts" that are cut at poses
     settled_power : largest power of the likelihood that the contacts settle within the cells, 1 the sharpest; None where the
         posterior is that of the cells

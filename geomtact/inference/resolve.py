@@ -1,4 +1,4 @@
-"""Poses resolved within the cells of the grid, by the contacts that are cut at them: of one sensor's mask, or of several."""
+"""Poses resolved within the cells of the grid, by the contacts that are cut at them: on one sensor, or on several."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def resolve_touch(
     effort: Effort,
     alone: Posterior | None = None,
 ) -> Posterior:
-    """The ``posterior`` of one mask, resolved within the cells by the contacts of ``effort``.
+    """The ``posterior`` of one image, resolved within the cells by the contacts of ``effort``.
 
     It is as it was without contact. ``prior`` and ``log_prior`` are as of ``single_touch.touch_posterior``,
     ``alone`` is the posterior of the same image without them, where that is known.
@@ -59,7 +59,7 @@ def resolve_touches(
     extrinsics_std: ExtrinsicsStd | None = None,
     register: Register | None = None,
 ) -> Posterior:
-    """The ``posterior`` of several sensors' masks, resolved within the cells of the first with contact.
+    """The ``posterior`` of several sensors, resolved within the cells of the first with contact.
 
     ``touches``, ``prior`` and ``log_prior`` are as of ``fusion.fused_posterior``.
     """

@@ -22,7 +22,7 @@ from geomtact.inference.facts import UNEXPLAINED_NATS
 from geomtact.inference.mode_mass import counted, weighed
 from geomtact.inference.particles import OtherSensor, Particles
 from geomtact.inference.population import systematic
-from geomtact.inference.pose_prior import PosePrior
+from geomtact.inference.pose_prior import NormalPrior, PosePrior
 from geomtact.inference.registered import Register
 from geomtact.inference.sampler import Run, explore
 from geomtact.inference.systematic_errors import NODES, NODES_BESIDE, random_errors
@@ -142,8 +142,15 @@ def _log_evidence(one: Run, other: Run) -> float:
     for run in (one, other):
         # the coarse density says where poses are drawn, and is taken out again
         log_coarse = run.particles[stop].log_coarse
+        usual = 0.0
+        if isinstance(run.density.target.prior, NormalPrior):  # its density is known up to a constant
+            first = run.particles[0].log_coarse
+            usual = run.log_evidence[0] + np.logaddexp.reduce(-first) - np.log(len(first))
         out.append(
-            run.log_evidence[stop] + np.logaddexp.reduce((EVIDENCE_POWER - 1) * log_coarse) - np.log(len(log_coarse))
+            run.log_evidence[stop]
+            + np.logaddexp.reduce((EVIDENCE_POWER - 1) * log_coarse)
+            - np.log(len(log_coarse))
+            - usual
         )
     return float(np.logaddexp.reduce(out) - np.log(2))
 

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.kernels.contact_energy import Maps, Poses, Samples
+from geomtact.kernels.contact_energy import Maps, Poses
 
 MOST = 4.0  # nats that one sample counts at most: an outlier, such as dust or glare; hand-set
 
@@ -24,16 +24,18 @@ class Indentation(NamedTuple):
     depths : (B, S) how deep the gel is pressed in [m]
     lying : (B, S) whether the gel surely lies on the object
     weight : (B, S) one over the variance of the depth [1/m^2]; 0 where it was not measured
+    place : (B, S, 2) where the gel is that is seen there, at its depth, along x and y [m]
+    sag : (B, S) by how much the membrane lies below its apex there [m]
     """
 
     depths: NDArray[np.float32]
     lying: NDArray[np.bool_]
     weight: NDArray[np.float32]
+    place: NDArray[np.float32]
+    sag: NDArray[np.float32]
 
 
-def depth_loss(
-    maps: Maps, samples: Samples, poses: Poses, indentation: Indentation, deepest: float
-) -> NDArray[np.float32]:
+def depth_loss(maps: Maps, poses: Poses, indentation: Indentation, deepest: float) -> NDArray[np.float32]:
     """Half the sum of squared deviations (n,) of the depth, in standard deviations, at n poses whose ``membrane`` is known.
 
     Parameters
@@ -42,10 +44,7 @@ def depth_loss(
     """
     out = np.zeros(len(poses.direction), np.float32)
     numbers = np.float32(1 / maps.pixel), np.float32(deepest), np.float32(MOST)
-    where = samples.block, samples.within, samples.sag
-    _depth_loss(
-        maps.heights, *numbers, *where, poses.direction, poses.tilt, poses.centre, poses.membrane, *indentation, out
-    )
+    _depth_loss(maps.heights, *numbers, poses.direction, poses.tilt, poses.centre, poses.membrane, *indentation, out)
     return out
 
 
@@ -55,9 +54,6 @@ def _depth_loss(  # type: ignore[no-untyped-def]
     per_pixel,
     deepest,
     most,
-    block,
-    within,
-    sag,
     direction,
     tilt,
     centre,
@@ -65,10 +61,12 @@ def _depth_loss(  # type: ignore[no-untyped-def]
     depths,
     lying,
     weight,
+    place,
+    sag,
     out,
 ):
     """The loop of :func:`depth_loss`, which writes ``out``; the window meets a map as in ``contact_energy``."""
-    blocks, samples = within.shape[0], within.shape[1]
+    blocks, samples = depths.shape
     size = heights.shape[1]
     half, one, none = np.float32(size // 2 + 0.5), np.float32(1), np.float32(0)
     for i in range(len(direction)):
@@ -82,12 +80,11 @@ def _depth_loss(  # type: ignore[no-untyped-def]
         off_x, off_y = centre[i, 0] - tx * plane / up, centre[i, 1] - ty * plane / up
         total = none
         for k in range(blocks):
-            x, y = block[k, 0] - off_x, block[k, 1] - off_y
             for j in range(samples):
                 if weight[k, j] == 0:
                     continue
-                xj, yj = x + within[k, j, 0], y + within[k, j, 1]
-                u, v = a * xj + b * yj, c * xj + d * yj
+                x, y = place[k, j, 0] - off_x, place[k, j, 1] - off_y
+                u, v = a * x + b * y, c * x + d * y
                 column, row = int(u * per_pixel + half), int(v * per_pixel + half)
                 pressed = -one
                 if 0 <= column < size and 0 <= row < size:

@@ -123,7 +123,7 @@ class ContactQuery:
             at = cut.reach - depth if depth is not None else membrane
             assert at is not None
             some = Placements(*(each[touches] for each in vars(poses).values()))
-            loss = maps.depth_loss(self.samples, self.indentation, some, at[touches])
+            loss = maps.depth_loss(self.indentation, some, at[touches])
             # the largest power stands for the whole likelihood
             out[touches] -= loss * _observations(index.sensor) / POWERS[-1]
         return cut, out
@@ -199,10 +199,27 @@ def indentation_of(contact: Contact, sensor: Sensor) -> Indentation | None:
     some = np.s_[::_EVERY, ::_EVERY]
     variance = sensor.height_noise**2 + (_SCALE * depth) ** 2 + slope**2
     weight[some] = np.where(share > 0.5, 1 / variance, 0)[some]
-    lying = sampled(contact.sure) > _ALL
-    return Indentation(
-        _blockwise(depth), np.ascontiguousarray(_blockwise(lying.astype(np.float32)) > 0.5), _blockwise(weight)
-    )
+    lying = _blockwise((sampled(contact.sure) > _ALL).astype(float)) > 0.5
+    return placed_indentation(_blockwise(depth), lying, _blockwise(weight), sensor)
+
+
+def placed_indentation(
+    depths: NDArray[np.float32], lying: NDArray[np.bool_], weight: NDArray[np.float32], sensor: Sensor
+) -> Indentation:
+    """Depths at the samples of a window, all (B, S), seen along the rays of the ``sensor``.
+
+    Raises
+    ------
+    ValueError
+        They are of another window.
+    """
+    xy = np.stack(np.meshgrid(*sensor.pixel_centres(sensor.along(SHAPE))), -1)
+    x, y = _blockwise(xy[..., 0]), _blockwise(xy[..., 1])
+    if not x.shape == depths.shape == lying.shape == weight.shape:
+        raise ValueError("depths of another window")
+    points = sensor.lift(np.stack([x, y], -1), depths)
+    place, sag = np.ascontiguousarray(points[..., :2], np.float32), (-points[..., 2] - depths).astype(np.float32)
+    return Indentation(depths, np.ascontiguousarray(lying), weight, place, sag)
 
 
 def _blockwise(image: NDArray[np.floating]) -> NDArray[np.float32]:
