@@ -31,7 +31,7 @@ from geomtact.se3 import Array
 
 EVIDENCE_POWER = POWERS[
     3
-]  # of the likelihood, by which objects are compared: of those above 0 it tells them apart best
+]  # of the likelihood, by which objects are compared: of the larger ones the one that distinguishes them best
 # poses that are kept in the end, at least, which is as many as with several sensors, and at most; and contacts for each
 _POSES, _FOR_EACH = (300, 600), 20
 # nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
