@@ -129,9 +129,8 @@ def _tracked(
         frame, at = ("sensor", np.eye(4)) if T is None else ("world", T)
         try:
             (view,) = read_views(image, T, prepared.sensors, options["kind"], options["background"])
-            # masks are resolved after the filter's step, by the modes of its posterior
-            to_resolve = effort.contacts and view.observation.contact.height is None
-            over_cells = replace(effort, contacts=0, modes=0) if to_resolve else replace(effort, contacts=0)
+            # frames are resolved after the filter's step, by the modes of its posterior
+            over_cells = replace(effort, contacts=0, modes=0 if effort.contacts else effort.modes)
             seen = localize(view.observation, T_world_sensor=T, **options | {"effort": over_cells})
             seen = replace(
                 seen,
