@@ -36,8 +36,8 @@ _THREADS = 2
 _CENTRING = 1.5  # samples of the window
 _PART = 256  # poses that a thread takes at a time
 _FORMAT = 1  # of the file in an index's folder
-_T = TypeVar("_T")
 _LEVELS = 65_534  # of the heights in it, besides one for where the object is not
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,12 +135,6 @@ def leading_rows(posterior: CellDistribution, n: int = LEADING_CELLS) -> NDArray
     return rows[p[rows] > -np.inf]
 
 
-def likeliest_cells(posterior: CellDistribution, n: int) -> NDArray[np.int64]:
-    """Pose ids (m,) of the ``n`` most probable cells, the most probable first."""
-    rows = leading_rows(posterior, n)
-    return posterior.cells[rows[np.argsort(-posterior.cell_log_prob[rows], kind="stable")[:n]]]
-
-
 def nearest_images(posterior: CellDistribution, T: Array) -> Array:
     """The images (n, 4, 4) of poses ``T`` (n, 4, 4), in the sensor frame, that are nearest to the posterior's reference;
     themselves without one."""

@@ -29,9 +29,8 @@ from geomtact.inference.systematic_errors import NODES, NODES_BESIDE, random_err
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array
 
-EVIDENCE_POWER = POWERS[
-    3
-]  # of the likelihood, by which objects are compared: of the larger ones the one that distinguishes them best
+# of the likelihood, by which objects are compared: of the larger ones the one that distinguishes them best
+EVIDENCE_POWER = POWERS[3]
 # poses that are kept in the end, at least, which is as many as with several sensors, and at most; and contacts for each
 _POSES, _FOR_EACH = (300, 600), 20
 # nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
@@ -158,11 +157,9 @@ def _log_evidence(one: Run, other: Run) -> float:
 def _misfit(one: Run, other: Run) -> float:
     """As of :class:`Finding`."""
     target = one.density.target
-    found = one.particles[-1].joined(other.particles[-1])
-    best = found.log_likelihood[~found.missed].max(initial=-np.inf)
+    best = _likeliest(one.particles[-1].joined(other.particles[-1]))
     if one.about is not None:
-        registered = target.particles_at(one.about.led_to)
-        best = max(best, registered.log_likelihood[~registered.missed].max(initial=-np.inf))
+        best = max(best, _likeliest(target.particles_at(one.about.led_to)))
     queries = [target.query, *(other.query for other in target.others)]
     outline = np.exp([query.log_outline for query in queries if query.touched.any()]).sum()
     return float(-POWERS[-1] * best / outline)
@@ -247,6 +244,10 @@ def _unexplained(one: Run, other: Run) -> float:
 
 def _short_of_best(one: Run, other: Run, found: Particles) -> float:
     """Nats by which the likeliest of the ``found`` poses explains each contact less, as of :func:`_unexplained`."""
-    together = found.log_likelihood[~found.missed].max(initial=-np.inf)
     best = np.maximum(one.best, other.best)
-    return float(POWERS[-1] * (best.sum() - together) / len(best))
+    return float(POWERS[-1] * (best.sum() - _likeliest(found)) / len(best))
+
+
+def _likeliest(found: Particles) -> float:
+    """The largest log likelihood of poses that miss no sensor."""
+    return float(found.log_likelihood[~found.missed].max(initial=-np.inf))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 BLOCK = 4  # samples along each side of a block
 COARSER = 4  # pixels of a height map along each side of one of its block heights
 SHARES = 40  # of the depth at which contacts are compared: ((j + 1) / SHARES)^2, the last one a rigid gel's
+FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}  # of the loops over samples; heights are never NaN
 _ROUNDS = 3  # cuts at most, until the height of the membrane over the map is known
 _NOTHING = -500.0  # m: lower heights mean that the object is not there
 _SETTLED = 2e-5  # m: by how much a further round may move the window over the map
@@ -110,7 +111,7 @@ def contact_energy(maps: Maps, samples: Samples, poses: Poses, deepest: float, a
     return cut
 
 
-@numba.njit(fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(fastmath=FASTMATH, nogil=True, cache=True)  # type: ignore[untyped-decorator]
 def _contact_energy(  # type: ignore[no-untyped-def]
     heights,
     widest,
@@ -151,14 +152,10 @@ def _contact_energy(  # type: ignore[no-untyped-def]
     for k in range(blocks):
         least_sag[k] = sag[k].min()
     for i in range(n):
-        height, wide, r = heights[direction[i]], widest[direction[i]], tilt[i]
-        tx, ty, lean_x, lean_y, up = r[0, 2], r[1, 2], r[2, 0], r[2, 1], r[2, 2]
+        height, wide = heights[direction[i]], widest[direction[i]]
         # where the map is met by the window, on the plane in the middle of the deepest contact; it is known at once where the
         # membrane is, else once the reach is
-        a, b = r[0, 0] - tx * lean_x / up, r[0, 1] - tx * lean_y / up
-        c, d = r[1, 0] - ty * lean_x / up, r[1, 1] - ty * lean_y / up
-        scale = one / (a * d - b * c)
-        a, b, c, d = d * scale, -b * scale, -c * scale, a * scale
+        tx, ty, lean_x, lean_y, up, a, b, c, d = onto_map(tilt[i])
         slack = (abs(lean_x) + abs(lean_y)) * beside
         guess, best = reach[i], nothing
         for _ in range(_ROUNDS):
@@ -230,6 +227,17 @@ def _contact_energy(  # type: ignore[no-untyped-def]
             if count < area:
                 count, sum_x, sum_y = count + sums[e, 0], sum_x + sums[e, 1], sum_y + sums[e, 2]
         centroid[i, 0], centroid[i, 1] = sum_x / count, sum_y / count
+
+
+@numba.njit(fastmath=FASTMATH, nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def onto_map(r):  # type: ignore[no-untyped-def]
+    """How a map lies under the membrane, by the rotation ``r`` (3, 3) from its frame: by how much its heights move along x and y,
+    its lean along both, its share along z; and the inverse (a, b, c, d) of the shear by which the window meets it."""
+    tx, ty, lean_x, lean_y, up = r[0, 2], r[1, 2], r[2, 0], r[2, 1], r[2, 2]
+    a, b = r[0, 0] - tx * lean_x / up, r[0, 1] - tx * lean_y / up
+    c, d = r[1, 0] - ty * lean_x / up, r[1, 1] - ty * lean_y / up
+    scale = np.float32(1) / (a * d - b * c)
+    return tx, ty, lean_x, lean_y, up, d * scale, -b * scale, -c * scale, a * scale
 
 
 @numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]

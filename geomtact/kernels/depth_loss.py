@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.kernels.contact_energy import Maps, Poses
+from geomtact.kernels.contact_energy import FASTMATH, Maps, Poses, onto_map
 
 MOST = 4.0  # nats that one sample counts at most: an outlier, such as dust or glare; hand-set
 
@@ -48,7 +48,7 @@ def depth_loss(maps: Maps, poses: Poses, indentation: Indentation, deepest: floa
     return out
 
 
-@numba.njit(fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(fastmath=FASTMATH, nogil=True, cache=True)  # type: ignore[untyped-decorator]
 def _depth_loss(  # type: ignore[no-untyped-def]
     heights,
     per_pixel,
@@ -70,12 +70,8 @@ def _depth_loss(  # type: ignore[no-untyped-def]
     size = heights.shape[1]
     half, one, none = np.float32(size // 2 + 0.5), np.float32(1), np.float32(0)
     for i in range(len(direction)):
-        height, r = heights[direction[i]], tilt[i]
-        tx, ty, lean_x, lean_y, up = r[0, 2], r[1, 2], r[2, 0], r[2, 1], r[2, 2]
-        a, b = r[0, 0] - tx * lean_x / up, r[0, 1] - tx * lean_y / up
-        c, d = r[1, 0] - ty * lean_x / up, r[1, 1] - ty * lean_y / up
-        scale = one / (a * d - b * c)
-        a, b, c, d = d * scale, -b * scale, -c * scale, a * scale
+        height = heights[direction[i]]
+        tx, ty, lean_x, lean_y, up, a, b, c, d = onto_map(tilt[i])
         plane = membrane[i] + np.float32(0.5) * deepest
         off_x, off_y = centre[i, 0] - tx * plane / up, centre[i, 1] - ty * plane / up
         total = none

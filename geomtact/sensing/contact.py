@@ -20,12 +20,8 @@ _SHALLOW = 0.22
 FAINT = 0.01  # share of the deepest that is no indentation
 # The gel carries pressure where that is at least this share of the largest, and this deep; both hand-set
 _CARRYING, _DEEP = 0.2, 0.2
-_SMOOTHED = (
-    0.8,
-    1.6,
-    3.2,
-    6.4,
-)  # px: widths by which the pressure is smoothed, the first by which it exceeds its noise
+# px: widths by which the pressure is smoothed, the first by which it exceeds its noise
+_SMOOTHED = (0.8, 1.6, 3.2, 6.4)
 _CLEARLY = 4.0  # standard deviations of the noise of the pressure that the least of it exceeds; hand-set
 
 SoftMask = NDArray[np.bool_] | NDArray[np.float32]  # (H, W) whether each pixel is in contact, or how probably

@@ -32,7 +32,6 @@ from tools.studies.kitting.fixture import Fixture
 SURE = 0.95  # estimated probability of fitting from which the object is placed
 _DRAWS = 1000  # poses that are believed
 _ASKED = 60  # of these, by their weights, of which it is asked whether they fit
-_MISSED = 2.0  # a jaw that met nothing swept its path: the missing contact counts twice
 _TRIED, _PLACES, _PRESSES = 16, 40, 3  # touches to choose from, places to distinguish, depths at which each is pressed
 
 
