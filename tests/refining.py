@@ -4,7 +4,8 @@ import numpy as np
 import trimesh
 
 from geomtact import se3
-from geomtact.registration.protocol import Refinement, Surface
+from geomtact.registration.protocol import Refinement
+from geomtact.registration.surface import Surface
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.sensor import Sensor
 

@@ -19,7 +19,8 @@ from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.observability import Spread, motion_of
-from geomtact.registration.protocol import Problem, Surface
+from geomtact.registration.protocol import Problem
+from geomtact.registration.surface import Surface
 from geomtact.scoring import fitted
 from geomtact.scoring.calibration import FLOORS, simulate_touches
 from geomtact.scoring.catalogue import SCORERS

@@ -16,7 +16,8 @@ from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.rotations import Directions
 from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.observability import Spread, motion_of, moved
-from geomtact.registration.protocol import Problem, Surface
+from geomtact.registration.protocol import Problem
+from geomtact.registration.surface import Surface
 from geomtact.sensing.noise import CLEAN, MODERATE, Noise
 from geomtact.sensing.sensor import Sensor
 from tools.studies.__main__ import app as studies

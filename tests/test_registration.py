@@ -15,7 +15,8 @@ from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread
-from geomtact.registration.protocol import Problem, Surface
+from geomtact.registration.protocol import Problem
+from geomtact.registration.surface import Surface
 from geomtact.sensing.elastic import elastic_contact
 from geomtact.sensing.sensor import Sensor
 

@@ -7,12 +7,10 @@ size, so what a touch constrains within a cell is lost. Here the contact is made
 from __future__ import annotations
 
 import contextlib
-import os
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
@@ -27,6 +25,7 @@ from geomtact.files import write_whole
 from geomtact.geometry.approach import facing
 from geomtact.kernels.contact_energy import BLOCK, COARSER, Cut, Maps, Poses, Samples, contact_energy
 from geomtact.kernels.depth_loss import Indentation, depth_loss
+from geomtact.kernels.parts import by_parts
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
@@ -135,12 +134,10 @@ class ContactMaps:
         depth = np.full(n, self.index.sensor.max_penetration) if depth is None else depth
         numbers = [each.astype(np.float32) for each in (tilt, poses.centre, poses.reach, membrane, depth)]
 
-        def some(start: int) -> _T:
-            part = slice(start, start + _PART)
+        def some(part: slice) -> _T:
             return of(Poses(poses.direction[part], *(each[part] for each in numbers)))
 
-        starts = range(0, max(n, 1), _PART)
-        return [some(0)] if len(starts) == 1 else list(_pool(os.getpid()).map(some, starts))
+        return by_parts(some, n, _PART)
 
 
 def located(index: Index, T: Array) -> tuple[Placements, Array]:
@@ -151,12 +148,6 @@ def located(index: Index, T: Array) -> tuple[Placements, Array]:
     place = index.place_of(index.directions.first_turn[direction] + turn, centre)
     reach = centre[:, 2] + 0.5 * index.sensor.max_penetration
     return Placements(place, direction.astype(np.int32), R, centre[:, :2], reach), centre[:, 2]
-
-
-@cache
-def _pool(process: int) -> ThreadPoolExecutor:
-    """The threads of a process, by its number: a process that it forks has none of them."""
-    return ThreadPoolExecutor(_THREADS)
 
 
 _OPENED: WeakKeyDictionary[Index, tuple[Maps, Array]] = WeakKeyDictionary()

@@ -181,10 +181,10 @@ def fused_posterior(
     shown = [(observation.contact, touch.sensor) for touch, observation in touching]
     T_first_sensor = inverse(first.T_frame_sensor) @ np.stack([touch.T_frame_sensor for touch, _ in touching])
     refiner = mode_refiners[posterior.provenance.base]
-    register = None
+    search = None
     if effort.several:
-        register = refiner.registering(posterior.index, joint_problem(shown, T_first_sensor, _ROUGH_POINTS))
-    posterior = resolve_touches(posterior, touches, prior, log_prior, effort, extrinsics_std, register)
+        search = refiner.searching(posterior.index, joint_problem(shown, T_first_sensor, _ROUGH_POINTS))
+    posterior = resolve_touches(posterior, touches, prior, log_prior, effort, extrinsics_std, search)
     within = posterior.explored is not None
     if within and effort.modes:
         with timed(timing, "refine"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -15,12 +15,14 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.distribution import Refined
 from geomtact.inference.modes import leading_cells
 from geomtact.inference.posterior import Posterior
+from geomtact.inference.registered import Search
 from geomtact.inference.reweight import reweight_cells
 from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread
-from geomtact.registration.protocol import Problem, Refinement, Refiner, Surface
+from geomtact.registration.protocol import Problem, Refinement, Refiner
+from geomtact.registration.surface import Surface
 from geomtact.scoring.likelihood import cast_log_likelihood
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array
@@ -49,13 +51,15 @@ class ModeRefiner:
 
     def refiners(self, index: Index, thorough: bool) -> list[Refiner]:
         """FilterReg for the grid of ``index``; ICP too if ``thorough``."""
-        spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
-        filterreg, icp = FilterReg(self.surface, spread), Icp(self.surface, spread)
-        return [filterreg, icp] if thorough else [filterreg]
+        filterreg = self._filterreg(index)
+        return [filterreg, Icp(self.surface, filterreg.spread)] if thorough else [filterreg]
 
-    def registering(self, index: Index, problem: Problem) -> Callable[[Array], Refinement]:
-        """What registers poses (n, 4, 4) to all contacts of ``problem``."""
-        return partial(self.refiners(index, thorough=False)[0].refine, problem)
+    def _filterreg(self, index: Index) -> FilterReg:
+        return FilterReg(self.surface, Spread.of_grid(index.angle_step, index.resolution.step, index.approach))
+
+    def searching(self, index: Index, problem: Problem) -> Search:
+        """What registers many poses (n, 4, 4) to all contacts of ``problem``."""
+        return partial(self._filterreg(index).search, problem)
 
     def refine(self, posterior: Posterior, contact: Contact, k: int, thorough: bool = True) -> Posterior:
         """``posterior`` with its ``k`` leading modes refined against the observed ``contact``, and reweighted.

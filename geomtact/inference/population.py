@@ -56,8 +56,11 @@ class Population:
     def move(self, log_density: Callable[[Particles], Array]) -> None:
         """Every pose by ``MOVES`` Metropolis steps, after which they still have the density, known up to a constant."""
         faster = self.target.sensors**2  # several contacts narrow sooner
+        density = log_density(self.particles)
         for _ in range(MOVES):
-            self.particles, accepted = _moved(self.target, self.particles, self.runs, log_density, self.size, self.rng)
+            self.particles, density, accepted = _moved(
+                self.target, self.particles, density, self.runs, log_density, self.size, self.rng
+            )
             self.size = float(np.clip(self.size * np.exp(faster * (accepted - _ACCEPTED)), 1e-3, 1))
             self.best = np.maximum(self.best, self.particles.by_sensor.max(0, initial=-np.inf))
             self.contacts += len(self.particles) * self.target.sensors
@@ -104,6 +107,12 @@ def systematic(weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.in
     return np.minimum(np.searchsorted(total, (np.arange(n) + rng.random()) / n * total[-1]), len(total) - 1)
 
 
+def different(log_weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """``n`` rows by their weight (m,), none of them twice; fewer where fewer have one."""
+    drawn = np.where(np.isfinite(log_weight), log_weight + rng.gumbel(size=len(log_weight)), -np.inf)
+    return np.argsort(-drawn, kind="stable")[: min(n, int(np.isfinite(log_weight).sum()))]
+
+
 def _next_step(change: Array, most: float) -> float:
     """By how much, ``most`` at most, the exponent may grow so that weights of exp(step ``change``) (runs, n) leave a share
     ``_KEPT`` of the poses of each run effective."""
@@ -123,12 +132,13 @@ def _next_step(change: Array, most: float) -> float:
 def _moved(
     target: Target,
     particles: Particles,
+    density: Array,
     runs: int,
     log_density: Callable[[Particles], Array],
     size: float,
     rng: np.random.Generator,
-) -> tuple[Particles, float]:
-    """Every pose after one Metropolis step, and the share of small motions that was accepted.
+) -> tuple[Particles, Array, float]:
+    """Every pose after one Metropolis step, the log ``density`` (n,) of each, and the share of small motions that was accepted.
 
     Half of the poses move at a time: some by small motions, some by multiples of the motion from one pose of the other half of
     their run to another near it (ter Braak 2006), which follow the directions that the contact leaves open. Both keep the
@@ -153,13 +163,16 @@ def _moved(
         new = target.evaluated(replace(poses, reach=membrane + now.depth), membrane=membrane, errors=errors)
         new = replace(new, draw=now.draw)
         images = _log_images(target, poses.rotation) - _log_images(target, now.poses.rotation)
-        gain = log_density(new) - log_density(now) + images
+        found = log_density(new)
+        gain = found - density[some] + images
         taken = np.flatnonzero(np.log(rng.random(len(some))) < gain)
         new = new.take(taken)
         allowed = target.admits(new)  # of those alone, because it takes as long as a contact
         accepted[some[taken[allowed]]] = True
         particles = particles.put(some[taken[allowed]], new.take(np.flatnonzero(allowed)))
-    return particles, float(accepted[small].mean()) if small.any() else _ACCEPTED
+        density = density.copy()
+        density[some[taken[allowed]]] = found[taken[allowed]]
+    return particles, density, float(accepted[small].mean()) if small.any() else _ACCEPTED
 
 
 def _nudged_errors(shares: Array, rng: np.random.Generator) -> Array:

@@ -7,9 +7,9 @@ distribution whose density is known, and go step by step from there to the poste
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial, reduce
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,14 @@ from geomtact.inference.systematic_errors import ERRORS
 from geomtact.registration.protocol import Refinement
 from geomtact.se3 import Array, exp, inverse, log
 
-Register = Callable[[Array], Refinement]  # poses (n, 4, 4) in the first sensor's frame to all contacts
+# as ``registration.filterreg.FilterReg.search``, to all contacts, in the first sensor's frame
+Search = Callable[[Array, Callable[[Array], Array], int], tuple[NDArray[np.int64], Refinement]]
 
 # All choose where poses are drawn: they change how precise the evidence is, not what is estimated.
-_STARTS = 256  # poses that are registered
+_SEARCHED, _FEWEST = (
+    1 / 8,
+    96,
+)  # of the poses that are registered roughly, those that are registered to the end; at least
 _MODES = 12  # about which poses are drawn, at most
 _APART = 2e-3  # m: mean distance by which two modes differ, at least
 _WIDER = 3.0  # standard deviations of the draws over those of registration, whose likelihood is sharper
@@ -57,9 +61,13 @@ class AboutModes:
     origin: NDArray[np.int64]
 
     @classmethod
-    def of(cls, target: Target, seen: Particles, register: Register) -> AboutModes | None:
-        """About the likeliest of the poses to which registration moves those ``seen``; None if all miss a sensor."""
-        refinement = register(target.poses(seen))
+    def of(cls, target: Target, drawn: Particles, search: Search) -> AboutModes | None:
+        """About the likeliest of the poses to which registration moves those ``drawn``; None if all miss a sensor."""
+
+        def rate(T: Array) -> Array:
+            return target.particles_at(T).log_likelihood
+
+        kept, refinement = search(target.poses(drawn), rate, max(int(_SEARCHED * len(drawn)), _FEWEST))
         found = target.particles_at(refinement.T)
         likely = np.where(found.missed, -np.inf, found.log_likelihood)
         touching, distance = np.isfinite(likely), PoseDistance(target.index.mesh)
@@ -80,7 +88,7 @@ class AboutModes:
             along = np.linalg.pinv(basis)
             scale = along.T @ (_WIDER**2 * covariance + np.diag(least**2)) @ along
             students.append(Student(np.zeros(len(basis)), np.linalg.cholesky(scale)))
-        return cls(target, hearts, bases, students, refinement.T[touching], seen.draw[touching])
+        return cls(target, hearts, bases, students, refinement.T[touching], drawn.draw[kept[touching]])
 
     @cached_property
     def _distance(self) -> PoseDistance:
@@ -136,13 +144,6 @@ def bridged(about: AboutModes, power: float, runs: int, n: int, rng: np.random.G
         if share >= 1:
             return population
         share = min(share + population.reweigh(change(population.particles), 1 - share), 1.0)
-
-
-def starts(seen: Sequence[Particles], rng: np.random.Generator) -> Particles:
-    """Poses (s,) to register: half of them from the first of those ``seen``, which come from most draws, the others from all."""
-    numbers = [_STARTS // 2, *[-(-_STARTS // 2 // max(len(seen) - 1, 1))] * (len(seen) - 1)]
-    some = [each.take(rng.permutation(len(each))[:number]) for each, number in zip(seen, numbers, strict=True)]
-    return reduce(Particles.joined, some)
 
 
 def united(one: Population | None, other: Population | None) -> Population | None:

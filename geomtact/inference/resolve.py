@@ -16,7 +16,7 @@ from geomtact.inference.effort import Effort
 from geomtact.inference.particles import OtherSensor
 from geomtact.inference.pose_prior import prior_at_poses
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.registered import Register
+from geomtact.inference.registered import Search
 from geomtact.inference.timing import timed
 from geomtact.inference.two_runs import explore_twice
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, indentation_of
@@ -57,13 +57,13 @@ def resolve_touches(
     log_prior: LogMass,
     effort: Effort,
     extrinsics_std: ExtrinsicsStd | None = None,
-    register: Register | None = None,
+    search: Search | None = None,
 ) -> Posterior:
     """The ``posterior`` of several sensors, resolved within the cells of the first with contact.
 
     ``touches``, ``prior`` and ``log_prior`` are as of ``fusion.fused_posterior``.
     """
-    return _resolved(posterior, touches, None, prior, log_prior, effort, extrinsics_std, register)
+    return _resolved(posterior, touches, None, prior, log_prior, effort, extrinsics_std, search)
 
 
 def _can_resolve(touches: Sequence[Posterior], effort: Effort) -> bool:
@@ -79,7 +79,7 @@ def _resolved(
     log_prior: LogMass,
     effort: Effort,
     extrinsics_std: ExtrinsicsStd | None = None,
-    register: Register | None = None,
+    search: Search | None = None,
 ) -> Posterior:
     """``coarse`` (n,) is the mass of the places without the prior, by default that of ``posterior``, divided by the prior."""
     if not _can_resolve(touches, effort):
@@ -104,7 +104,7 @@ def _resolved(
         ]
         rng = np.random.default_rng(posterior.seed)
         contacts = effort.several if others else effort.contacts
-        found = explore_twice(index, _query(first), coarse, contacts, rng, at_poses, others, register)
+        found = explore_twice(index, _query(first), coarse, contacts, rng, at_poses, others, search)
     diagnostics = replace(
         posterior.diagnostics,
         evidence_of="contacts",

@@ -25,9 +25,9 @@ from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.explored import Density
 from geomtact.inference.particles import SURE, OtherSensor, Particles, Target, poses_of
-from geomtact.inference.population import MOVES, Population, effective, resampled, systematic
+from geomtact.inference.population import MOVES, Population, different, effective, resampled, systematic
 from geomtact.inference.pose_prior import ALIGNED, NormalPrior, PosePrior
-from geomtact.inference.registered import AboutModes, Register, bridged, starts, united
+from geomtact.inference.registered import AboutModes, Search, bridged, united
 from geomtact.inference.systematic_errors import ERRORS, errors_of
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
 from geomtact.se3 import Array, transform
@@ -39,6 +39,7 @@ _DRAWS = 4  # draws for each pose that is kept
 # Of several sensors: poses that are kept, by power, over those with one: hardly any touch all sensors at first. The largest power
 # is left out.
 _OF_SEVERAL = (16, 8, 6, 4)
+_REGISTERED = 2 / 3  # of the draws of several sensors
 _OF_SEVERAL_COST = 12  # contacts that this takes, over those with one sensor
 _MEASURED = 2000  # draws by which the measure of what touches is known, where a prior is no one of the cells
 _STEPS = 11  # that are usual, for the budget
@@ -85,7 +86,7 @@ def explore(
     prior: PosePrior | None = None,
     others: Sequence[OtherSensor] = (),
     runs: int = 1,
-    register: Register | None = None,
+    search: Search | None = None,
 ) -> tuple[Run, ...]:
     """The distribution of the pose, found ``runs`` times from about ``contacts`` contacts on each sensor, all at once.
 
@@ -94,7 +95,7 @@ def explore(
     coarse : (n,) mass of the places of the index in a coarse posterior; a share of the uniform one is mixed in
     prior : None for the uniform
     others : the other sensors that touch the object, or do not
-    register : poses to all contacts together, where there are several
+    search : registers poses to all contacts together, where there are several
 
     Raises
     ------
@@ -119,10 +120,14 @@ def explore(
     log_measure = np.full(runs, _log_measure(target, rng)) if isinstance(prior, NormalPrior) else known - whole
     stops, power, population = _begun(target, drawn, log_weight + log_measure[:, None], number, rng)
     population.contacts = cut
-    seen, about = [population.particles], None
+    about = None
+    if others and search:
+        weight = log_weight + drawn.log_target(power).reshape(runs, -1)
+        about = AboutModes.of(
+            target, drawn.take(different(weight.ravel(), round(_REGISTERED * len(drawn)), rng)), search
+        )
     while True:
         population.move(partial(Particles.log_target, power=power))
-        seen.append(population.particles)
         sure = population if not others or power >= SURE else population.that_touch()
         if sure and (others or power in number):
             stops.append((power, sure.log_evidence, sure.particles))
@@ -134,7 +139,6 @@ def explore(
         step = population.reweigh(population.particles.log_likelihood - population.particles.log_coarse, after - power)
         power = after if step == after - power else power + step
         if others and power == SURE:
-            about = AboutModes.of(target, starts(seen, rng), register) if register else None
             surely = _surely(population, about, log_measure)
             if surely is None:
                 break

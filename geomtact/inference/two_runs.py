@@ -23,7 +23,7 @@ from geomtact.inference.mode_mass import counted, weighed
 from geomtact.inference.particles import OtherSensor, Particles
 from geomtact.inference.population import systematic
 from geomtact.inference.pose_prior import NormalPrior, PosePrior
-from geomtact.inference.registered import Register
+from geomtact.inference.registered import Search
 from geomtact.inference.sampler import Run, explore
 from geomtact.inference.systematic_errors import NODES, NODES_BESIDE, random_errors
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery
@@ -70,7 +70,7 @@ def explore_twice(
     rng: np.random.Generator,
     prior: PosePrior | None = None,
     others: Sequence[OtherSensor] = (),
-    register: Register | None = None,
+    search: Search | None = None,
 ) -> Finding:
     """The distribution of the pose with its modes, by two runs that share a sixteenth of the ``contacts`` of each sensor, or a
     quarter where there are several, and have to agree on the evidence; arguments as of :func:`explore`.
@@ -83,7 +83,7 @@ def explore_twice(
     attempts = (contacts // _MORE, contacts) if others else (contacts // _MORE**2, contacts // _MORE, contacts)
     for asked in attempts:
         try:
-            one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, register)
+            one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, search)
             cut += one.contacts + other.contacts
             unexplained = _unexplained(one, other) if others else None
             found = Finding(None, _log_evidence(one, other), _misfit(one, other), unexplained)

@@ -145,7 +145,9 @@ def _contact_energy(  # type: ignore[no-untyped-def]
     highest = np.empty(blocks, np.float32)
     cut = np.empty(blocks, np.uint8)
     sums = np.empty((SHARES, 3), np.float32)
-    deep, wide_deep = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
+    deepest_in, deep = np.empty(blocks, np.float32), np.empty((rows, columns), np.float32)
+    wide_deep, between = np.empty((rows, columns), np.float32), _between_blocks()
+    about, share = np.empty(samples, np.float32), np.empty(samples, np.int32)
     # how much higher than at its centre a tilted block may be
     beside = max(np.abs(within[:, :, 0]).max(), np.abs(within[:, :, 1]).max()) + np.float32(0.5) / per_pixel
     least_sag = np.empty(blocks, np.float32)
@@ -206,16 +208,28 @@ def _contact_energy(  # type: ignore[no-untyped-def]
         energy[i] = 0
         sums[:] = 0
         for k in range(blocks):
-            deep[k // columns, k % columns] = max(surface[k].max() - lowest, np.float32(0)) if cut[k] else np.float32(0)
+            deepest_in[k] = 0
+            if cut[k]:
+                for j in range(samples):
+                    deepest_in[k] = max(deepest_in[k], surface[k, j] - lowest)
+            deep[k // columns, k % columns] = deepest_in[k]
         _smooth_maximum(deep, wide_deep)
         for k in range(blocks):
-            if not cut[k]:
+            if deepest_in[k] <= 0:
                 continue
+            about[:] = 0
+            for n in range(9):
+                y = min(max(k // columns + n // 3 - 1, 0), rows - 1)
+                x = min(max(k % columns + n % 3 - 1, 0), columns - 1)
+                for j in range(samples):
+                    about[j] += between[n, j] * wide_deep[y, x]
             for j in range(samples):
                 pressed = surface[k, j] - lowest
-                if pressed > 0:
-                    about = _between_blocks(wide_deep, k // columns, k % columns, j // BLOCK, j % BLOCK)
-                    e = int(np.sqrt(max(one - pressed / about, np.float32(0))) * SHARES)
+                e = np.sqrt(max(one - pressed / about[j], np.float32(0))) * SHARES
+                share[j] = int(e) if pressed > 0 else -1
+            for j in range(samples):
+                e = share[j]
+                if e >= 0:
                     energy[i, e] += weight[k, j]
                     sums[e, 0] += one
                     sums[e, 1] += block[k, 0] + within[k, j, 0]
@@ -262,16 +276,17 @@ def _smooth_maximum(field, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
-def _between_blocks(field, y, x, row, column):  # type: ignore[no-untyped-def]
-    """``field`` (h, w), known at the centres of blocks, at a sample of block (y, x)."""
-    h, w = field.shape
-    off_y, off_x = (
-        (row + np.float32(0.5)) / BLOCK - np.float32(0.5),
-        (column + np.float32(0.5)) / BLOCK - np.float32(0.5),
-    )
-    y_1 = max(y - 1, 0) if off_y < 0 else min(y + 1, h - 1)
-    x_1 = max(x - 1, 0) if off_x < 0 else min(x + 1, w - 1)
-    off_y, off_x = abs(off_y), abs(off_x)
-    near = field[y, x] + off_x * (field[y, x_1] - field[y, x])
-    far = field[y_1, x] + off_x * (field[y_1, x_1] - field[y_1, x])
-    return near + off_y * (far - near)
+def _between_blocks():  # type: ignore[no-untyped-def]
+    """Weights (9, S) of a block and those around it, row by row, by which a field that is known at the centres of blocks is
+    interpolated at the block's samples."""
+    weights, one = np.zeros((9, BLOCK * BLOCK), np.float32), np.float32(1)
+    for j in range(BLOCK * BLOCK):
+        y = (np.float32(j // BLOCK) + np.float32(0.5)) / BLOCK - np.float32(0.5)
+        x = (np.float32(j % BLOCK) + np.float32(0.5)) / BLOCK - np.float32(0.5)
+        row, column = (0 if y < 0 else 2), (0 if x < 0 else 2)
+        y, x = abs(y), abs(x)
+        weights[4, j] = (one - y) * (one - x)
+        weights[3 + column, j] = (one - y) * x
+        weights[3 * row + 1, j] = y * (one - x)
+        weights[3 * row + column, j] = y * x
+    return weights

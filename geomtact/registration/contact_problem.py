@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geomtact.registration.protocol import Problem, Surface
+from geomtact.registration.protocol import Problem
+from geomtact.registration.surface import Surface
 from geomtact.se3 import Array, apply, inverse, unit
 from geomtact.sensing.contact import Contact, SoftMask
 from geomtact.sensing.sensor import Sensor

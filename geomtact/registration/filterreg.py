@@ -7,23 +7,26 @@ the object, and membrane outside the contact that lies in it, pulls the surface 
 
 from __future__ import annotations
 
-import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.kernels.parts import by_parts
+from geomtact.kernels.surface_filter import Fit, Outline, meet, pull
 from geomtact.registration.contact_problem import FLAT
 from geomtact.registration.fit import FEWEST, Meeting, accept_or_revert, keep_observable
-from geomtact.registration.observability import Spread, jacobian, moved
-from geomtact.registration.protocol import Problem, Refinement, Surface
-from geomtact.se3 import Array, apply, check_transforms, inverse, unit
+from geomtact.registration.observability import Spread, moved
+from geomtact.registration.protocol import Problem, Refinement
+from geomtact.registration.surface import Surface
+from geomtact.se3 import Array, check_transforms
 
 # All constants are hand-set.
-_A_THREAD = 2000  # points per thread in queries of the nearest surface
-_FEWER = 2  # surface points around each point that is only inside or outside
+_PART = 16  # poses that a thread takes at a time
 _OUTLIER = 0.15  # sum of filter values at which a point counts as half an outlier
+_STEPS_BEFORE = 4  # of many poses, before the best are chosen
 _STEPS_AT_END = 8  # largest number of steps with the narrowest filter
 _REST = 1.0  # largest last step of a converged pose, in its standard deviations
 _SLOPE_NOISE = 0.45  # noise across the membrane, as a share of that along it: a gel sinks unevenly around a contact
@@ -53,22 +56,36 @@ class FilterReg:
         """Refine the poses ``T`` (k, 4, 4) of the object in the problem's frame."""
         start = check_transforms(T, "start pose").reshape(-1, 4, 4)
         contact_filter = ContactFilter(problem, self.surface, self.objective, self.neighbours)
+        return contact_filter.accept_or_revert(start, *self._moved(contact_filter, start), self.spread)
+
+    def search(
+        self, problem: Problem, T: Array, rate: Callable[[Array], Array], keep: int
+    ) -> tuple[NDArray[np.int64], Refinement]:
+        """Of many poses ``T`` (k, 4, 4) the ``keep`` that ``rate`` (k, 4, 4) -> (k,) highest after a few steps, as rows, and
+        refined from there: the filter is wide again, so that they move farther than by :meth:`refine` alone."""
+        contact_filter = ContactFilter(problem, self.surface, self.objective, self.neighbours)
+        nearer = self._moved(contact_filter, T, _STEPS_BEFORE)[0]
+        rows = np.argsort(-rate(nearer), kind="stable")[:keep]
+        return rows, self.refine(problem, nearer[rows])
+
+    def _moved(
+        self, contact_filter: ContactFilter, start: Array, most: int | None = None
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Poses (k, 4, 4) after the steps they need, or ``most``, the sinks of the gel (k, c) [m], and whether they rest."""
+        problem = contact_filter.problem
         # motions zeta and sinks of the gel are held by their spread before: what is not observable stays where it was
         held = np.append(1 / self.spread.metres(problem.length), np.full(problem.contacts, 1 / problem.sink_std)) ** 2
         state, T, at_rest = np.zeros((len(start), len(held))), start.copy(), np.zeros(len(start), bool)
-        sigma, at_end = self.spread.radius(problem.length), 0
+        sigma, at_end, steps = self.spread.radius(problem.length), 0, 0
         going = np.arange(len(start))
-        while len(going) and at_end < _STEPS_AT_END and len(problem.points) >= FEWEST:
-            sigma = max(contact_filter.narrowest, self.narrowing * sigma)
+        while len(going) and at_end < _STEPS_AT_END and steps != most and len(problem.points) >= FEWEST:
+            sigma, steps = max(contact_filter.narrowest, self.narrowing * sigma), steps + 1
             at_end += sigma == contact_filter.narrowest
             meeting = contact_filter.meet(T[going], state[going, 6:], sigma)
             supported = meeting.support >= FEWEST
+            contact_filter.pull(T[going], sigma, meeting)
             slope = meeting.slope - held * state[going]
             information = meeting.information + np.diag(held)
-            if len(problem.around):
-                pull = contact_filter.pull(T[going], sigma)
-                information[:, :6, :6] += pull[0]
-                slope[:, :6] += pull[1]
             step = np.linalg.solve(information, slope[..., None])[..., 0]
             expected = (step * slope).sum(1)[supported]  # the square of the step in its standard deviations
             going, step = going[supported], step[supported]
@@ -77,7 +94,7 @@ class FilterReg:
             if at_end > 1:
                 at_rest[going] = expected < _REST**2
                 going = going[~at_rest[going]]
-        return contact_filter.accept_or_revert(start, T, state[:, 6:], at_rest, self.spread)
+        return T, state[:, 6:], at_rest
 
 
 class ContactFilter:
@@ -91,35 +108,53 @@ class ContactFilter:
     def __init__(self, problem: Problem, surface: Surface, objective: str = "plane", neighbours: int = 6):
         self.problem, self.surface, self.objective, self.neighbours = problem, surface, objective, neighbours
         self.narrowest = float(np.hypot(problem.middle_noise, surface.spacing))
+        self._outline = Outline(
+            np.ascontiguousarray(problem.points),
+            np.ascontiguousarray(problem.facing),
+            np.ascontiguousarray(problem.across),
+            np.ascontiguousarray(problem.sinking),
+            problem.noise,
+            problem.weight,
+            problem.contact,
+        )
 
     def meet(self, T: Array, sinks: Array, sigma: float) -> Meeting:
         """Filter the surface at poses ``T`` (k, 4, 4) with width ``sigma`` [m], the gel sunk by ``sinks`` (k, c) [m]."""
-        problem = self.problem
-        points = problem.points + sinks[:, problem.contact, None] * problem.sinking
-        target, normal, inlier = self._filtered(T, points, sigma)
-        # noise along the membrane shows along the normal only as far as the surface is steep
-        lateral = problem.noise * np.hypot(np.einsum("knj,nj->kn", normal, problem.facing), _SLOPE_NOISE)
-        error = ((points - target) * normal).sum(-1)
-        if self.objective == "plane":
-            planes = [(normal, error, lateral)]
-        else:
-            axes = [np.broadcast_to(axis, points.shape) for axis in np.eye(3)]
-            planes = [(axis, (points - target)[..., i], problem.noise) for i, axis in enumerate(axes)]
-        own = problem.contact[:, None] == np.arange(problem.contacts)
-        size = 6 + problem.contacts
-        information, slope = np.zeros((len(T), size, size)), np.zeros((len(T), size))
-        for axis, off, noise in planes:
-            sunk = np.einsum("knj,nj->kn", axis, problem.sinking)
-            J = np.concatenate([jacobian(points, axis, problem), sunk[..., None] * own], -1)
-            more = _normal_equations(J, off, inlier * problem.weight / noise**2)
-            information, slope = information + more[0], slope + more[1]
-        squared = (inlier * (error / lateral) ** 2).sum(1)
-        return Meeting(
-            information=information,
-            slope=slope,
-            residual=np.sqrt(squared / np.maximum(inlier.sum(1), 1e-12)),
-            support=(inlier > 0.5).sum(1),
-        )
+        problem, surface, k = self.problem, self.surface.at_scale(sigma), len(T)
+        size, to_planes = 6 + problem.contacts, self.objective == "plane"
+        fit = Fit(np.zeros((k, size, size)), np.zeros((k, size)), np.zeros(k), np.zeros(k), np.zeros(k, np.int64))
+
+        def some(part: slice) -> None:
+            about = problem.centre, problem.length, T[part], sinks[part], sigma, self.neighbours
+            found = fit.part(part)
+            meet(
+                surface.voxels,
+                self.surface.far,
+                surface.turn,
+                self._outline,
+                *about,
+                to_planes,
+                _OUTLIER,
+                _SLOPE_NOISE,
+                FLAT,
+                found,
+            )
+
+        by_parts(some, k, _PART)
+        residual = np.sqrt(fit.squared / np.maximum(fit.inliers, 1e-12))
+        return Meeting(fit.information, fit.slope, residual, fit.support)
+
+    def pull(self, T: Array, sigma: float, meeting: Meeting) -> None:
+        """Add the membrane that is on the wrong side of the surface to the normal equations of ``meeting``."""
+        problem, surface = self.problem, self.surface.at_scale(sigma)
+        # all together weigh as much as the points
+        each = problem.weight.sum() / max(len(problem.around), 1) / problem.middle_noise**2
+
+        def some(part: slice) -> None:
+            about = problem.centre, problem.length, T[part], sigma, meeting.information[part], meeting.slope[part]
+            pull(surface.voxels, self.surface.far, problem.around, problem.side, each, *about)
+
+        by_parts(some, len(T), _PART)
 
     def accept_or_revert(
         self, start: Array, T: Array, sinks: Array, at_rest: NDArray[np.bool_], spread: Spread
@@ -127,61 +162,3 @@ class ContactFilter:
         """``T`` (k, 4, 4) moved from ``start`` (k, 4, 4) along observable directions alone, where accepted (see ``fit``)."""
         T = keep_observable(start, T, self.meet(T, sinks, self.narrowest), spread, self.problem)
         return accept_or_revert(start, T, self.meet(T, sinks, self.narrowest), at_rest, spread, self.problem)
-
-    def pull(self, T: Array, sigma: float) -> tuple[Array, Array]:
-        """Normal equations (k, 6, 6), (k, 6) of the membrane that is on the wrong side of the surface."""
-        problem = self.problem
-        points = np.broadcast_to(problem.around, (len(T), *problem.around.shape))
-        near, normals, off = self._nearest(T, points, _FEWER, sigma)
-        distance2 = (off**2).sum(-1)
-        share = np.exp(-0.5 * (distance2 - distance2.min(-1, keepdims=True)) / sigma**2)
-        share /= share.sum(-1, keepdims=True)
-        above = np.einsum("kni,knij,knij->kn", share, normals, off)
-        normal = unit(np.einsum("kni,knij->knj", share, normals)) @ np.swapaxes(T[:, :3, :3], 1, 2)
-        wrong = problem.side * above > 0
-        # all together weigh as much as the points; what is deeper on the wrong side than the filter is wide may itself be wrong
-        each = problem.weight.sum() / len(problem.around) / problem.middle_noise**2
-        return _normal_equations(
-            jacobian(points, normal, problem), above, wrong * each / (1 + (above / (3 * sigma)) ** 2)
-        )
-
-    def _filtered(self, T: Array, points: Array, sigma: float) -> tuple[Array, Array, Array]:
-        """The E-step: where the points (k, n, 3) meet the surface, its normals there, and how surely (k, n)."""
-        R = T[:, :3, :3]
-        facing, across = self.problem.facing @ R, self.problem.across @ R
-        near, normals, off = self._nearest(T, points, self.neighbours, sigma, facing)
-        face, lean = (np.einsum("knij,knj->kni", normals, v) for v in (facing, across))
-        slope = np.hypot(face, lean)
-        # a surface that faces another way, or runs along the membrane, has not made this part of the outline
-        alike = np.where(slope > FLAT, np.clip(face / np.maximum(slope, FLAT), 0, 1), 0)
-        filtered = alike * np.exp(-0.5 * (off**2).sum(-1) / sigma**2)
-        total = filtered.sum(-1)
-        share = filtered / np.maximum(total, 1e-300)[..., None]
-        target, normal = (np.einsum("kni,knij->knj", share, v) for v in (near, normals))
-        return apply(T, target), unit(normal) @ np.swapaxes(R, 1, 2), total / (total + _OUTLIER)
-
-    def _nearest(
-        self, T: Array, points: Array, most: int, sigma: float, facing: Array | None = None
-    ) -> tuple[Array, Array, Array]:
-        """Nearest surface (k, n, i, 3) of points (k, n, 3), its normals, and the points' distance from it: object frame.
-
-        Where ``facing`` (k, n, 3) is given, in the object's frame, surface that looks that way counts as nearer.
-        """
-        at = apply(inverse(T), points)
-        surface = self.surface.at_scale(sigma)
-        most = min(most, len(surface.points))
-        tree, asked = surface.tree, at
-        if facing is not None:
-            tree, asked = surface.facing_tree, np.concatenate([at, surface.turn * facing], -1)
-        asked = asked.reshape(-1, asked.shape[-1])
-        workers = max(1, min(os.cpu_count() or 1, len(asked) // _A_THREAD))  # one touch has too few points for threads
-        index = tree.query(asked, k=range(1, most + 1), workers=workers)[1]
-        index = index.reshape(*at.shape[:-1], most)
-        near = surface.points[index]
-        return near, surface.normals[index], at[..., None, :] - near
-
-
-def _normal_equations(J: Array, error: Array, weight: Array) -> tuple[Array, Array]:
-    """(k, p, p) and (k, p) from the slopes (k, n, p) of errors (k, n) and their weights (k, n)."""
-    weighted = np.swapaxes(J * weight[..., None], 1, 2)
-    return weighted @ J, -(weighted @ error[..., None])[..., 0]

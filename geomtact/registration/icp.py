@@ -16,7 +16,8 @@ from geomtact.registration.contact_problem import near_surface
 from geomtact.registration.filterreg import ContactFilter
 from geomtact.registration.fit import FEWEST
 from geomtact.registration.observability import Spread
-from geomtact.registration.protocol import Problem, Refinement, Surface
+from geomtact.registration.protocol import Problem, Refinement
+from geomtact.registration.surface import Surface
 from geomtact.se3 import Array, check_transforms, inverse
 
 _MAX_ITERATIONS = 20  # of Open3D at each distance; hand-set

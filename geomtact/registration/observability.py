@@ -62,14 +62,6 @@ class Spread:
         return float(np.hypot(self.rotation * length, self.translation))
 
 
-def jacobian(points: Array, normals: Array, problem: Problem) -> Array:
-    """Change of normals . (points - surface) (..., n) by zeta in the problem's axes: (..., n, 6).
-
-    Moving the object by zeta moves it under the points, so distances to its surface shrink along the normals.
-    """
-    return -np.concatenate([np.cross(points - problem.centre, normals) / problem.length, normals], -1)
-
-
 def without_sinks(information: Array, sink_std: float) -> Array:
     """Information (6, 6) about zeta, from that about zeta and the sinks of c contacts (6 + c, 6 + c), when the sinks are free.
 

@@ -3,77 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geomtact.errors import MeshError
 from geomtact.se3 import Array, unit
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
-# All constants are hand-set.
-_LEAST = 2  # least number of points of a surface
-_FEWEST_POINTS = 2000  # number of points above which a surface can be made coarser
-_DENSE = 1.5  # points per width of a filter, along a line
-_TURN = 2.0  # distance that a difference of 1 between normals counts as, in gaps between points
-_DEEP = 1e-3  # least value of that distance [m]: faces parallel to the membrane lie about so deep below it
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """The object's surface as points with normals, dense against the sensor's pixels.
-
-    Attributes
-    ----------
-    points : (M, 3) object frame [m]
-    normals : (M, 3) outward unit normals, object frame
-    """
-
-    points: Array
-    normals: Array
-
-    def __post_init__(self) -> None:
-        if len(self.points) < _LEAST:
-            raise MeshError(f"a surface needs {_LEAST} points or more, got {len(self.points)}; sample it more densely")
-
-    @cached_property
-    def spacing(self) -> float:
-        """Side of the patch of surface that a point stands for, in the median [m]."""
-        some = self.points[:: max(1, len(self.points) // 1000)]
-        return 2 * float(np.median(self.tree.query(some, k=2)[0][:, 1]))
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        from scipy.spatial import cKDTree
-
-        return cKDTree(self.points)
-
-    @cached_property
-    def turn(self) -> float:
-        """How far away a point counts as whose normal differs by 1 [m]."""
-        return max(_TURN * self.spacing, _DEEP)
-
-    @cached_property
-    def facing_tree(self) -> cKDTree:
-        """Of points and normals together (M, 6), normals times :attr:`turn`."""
-        from scipy.spatial import cKDTree
-
-        return cKDTree(np.concatenate([self.points, self.turn * self.normals], 1))
-
-    @cached_property
-    def coarser(self) -> Surface | None:
-        """Every fourth point: the surface at twice the spacing; None where few are left."""
-        return Surface(self.points[::4], self.normals[::4]) if len(self.points) > _FEWEST_POINTS else None
-
-    def at_scale(self, sigma: float) -> Surface:
-        """The surface by as many points as a filter ``sigma`` [m] wide needs."""
-        if sigma < _DENSE * 2 * self.spacing or self.coarser is None:
-            return self
-        return self.coarser.at_scale(sigma)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from tools.studies.common import study_file, study_options
 
 if TYPE_CHECKING:
     from geomtact.geometry.mesh import Mesh
-    from geomtact.registration.protocol import Surface
+    from geomtact.registration.surface import Surface
     from geomtact.sensing.sensor import Sensor
 
 SCHEMA = "geomtact/registration/2"

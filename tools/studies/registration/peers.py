@@ -13,7 +13,7 @@ import numpy as np
 
 from geomtact.registration.contact_problem import near_surface
 from geomtact.registration.observability import Spread
-from geomtact.registration.protocol import Surface
+from geomtact.registration.surface import Surface
 from geomtact.se3 import Array, inverse
 from tools.studies.registration.study import End, Method, Seen
 

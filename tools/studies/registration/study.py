@@ -23,7 +23,8 @@ from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
 from geomtact.registration.icp import Icp
 from geomtact.registration.observability import Spread, motion_of, moved, zeta_of_xi
-from geomtact.registration.protocol import Problem, Refiner, Surface
+from geomtact.registration.protocol import Problem, Refiner
+from geomtact.registration.surface import Surface
 from geomtact.scoring.overlap import to_grid
 from geomtact.se3 import Array, inverse, log, transform
 from geomtact.sensing.noise import Noise
