@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from tools.page_tables import DOCS, PARTS, TABLES, between, filled, page_path, study, with_tables
+from tools.page_tables import DOCS, TABLES, filled, page_path, study, with_tables
 from tools.studies.stability.command import _answers
 
 pytestmark = pytest.mark.studies
@@ -28,18 +28,6 @@ def listed(values, form=".0f"):
     """Values as a sentence names them."""
     *most, last = (f"{value:{form}}" for value in values)
     return f"{', '.join(most)} and {last}"
-
-
-def of_a_known_contact_face(content):
-    scenes = [content["parts"][name]["scenes"]["known side"] for name in PARTS]
-    variants = "this side alone", "this side, 1 mode", "balanced"
-    five, one, unknown = (listed([s["figures"][variant]["mssd_mm_median"] for s in scenes]) for variant in variants)
-    (more,) = zip(*(scene["modelled"].values() for scene in scenes), strict=True)
-    times = sorted(f["time_ratio"] for f in more)
-    yield f"they add {listed([between(f['adds']) for f in more], '')} on the pin, the damping pin, the head and the elbow"
-    yield f"{five} mm off for {one} (largest distance"
-    yield f"Such a touch takes {times[0]:.1f} to {times[-1]:.1f} times as long with them"
-    yield f"{five} mm off for {unknown}. Gains"
 
 
 def counted(some):
@@ -105,7 +93,6 @@ SENTENCES = [
     "({jaw[0][gain_mean]:.1f} nats gained, {jaw[0][claimed_mean]:.1f} expected)",
 ]
 COUNTS = [
-    ("no-more-than-needed", of_a_known_contact_face, "modes"),
     ("stability", endured, "stability"),
     ("stability", stated_together, "stability"),
 ]

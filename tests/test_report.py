@@ -474,7 +474,7 @@ def test_several_sensors_are_shown_in_their_order(plug, rng):
     ("study", "which", "picture"),
     [
         ("choices", None, "speed-accuracy"),
-        ("choices", "modelled", "no-more-than-needed"),
+        ("choices", "ablations", "no-more-than-needed"),
         ("kitting", None, "kitting"),
         ("localize", None, "calibration"),
         ("next_touch", None, "next_touch"),

@@ -6,9 +6,11 @@ A cell that no file holds, as a name in words, stays what it is, and what is bol
 """
 
 import json
+import math
 import re
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
+from statistics import geometric_mean
 
 from tools.studies.common.study_file import inside
 from tools.studies.registration.shapes import SHAPES
@@ -68,34 +70,60 @@ def balls(content):
             yield cells(row + "{off_mm_largest:.2f} mm", camera * (k == 0), *told, **f)
 
 
-def modelled(part, content):
-    one, three, side = (scene["modelled"] for scene in content["parts"][part]["scenes"].values())
-    for name in one | side:
-        both = one.get(name), (three | side).get(name)
-        adds = [f and ("0.00" if not any(f["adds"]) else between(f["adds"], "+.2f")) for f in both]
-        times = [f and f"x {cut(f['time_ratio'])}" for f in both]
-        figures = (adds[0], times[0], adds[1], times[1])
-        yield [name.replace("known side", "known contact face"), *(figure or "" for figure in figures)]
+def of_variant(content, scene, name):
+    """Mean gain [nats], error of mode 1 [mm] and time [ms] of a variant over all objects, or none; errors and times are multiplied."""
+    each = [part["scenes"][scene]["figures"].get(name) for part in content["parts"].values()]
+    if None in each:
+        return None
+    gain = sum(f["gain_mean"] for f in each) / len(each)
+    mm, ms = (geometric_mean(f) for f in zip(*((f["mssd_mm_median"], f["ms_quantiles"][1]) for f in each), strict=True))
+    return gain, mm, ms
 
 
-def ways(part, content):
-    part, gain = content["parts"][part], "{gain_mean:.2f} ± {gain_standard_error:.2f}"
-    for way, f in part["scenes"]["one touch"]["figures"].items():
-        about, three = part["ways"][way], part["scenes"]["three sensors"]["figures"].get(way)
-        if about["choice"] == "calibration" or way == "encoder":  # the default by another name
-            continue
-        name = {"grid": f"{about['poses']:,} poses", "score": f"`{way}`"}.get(about["choice"], KEPT)
-        one = cells(gain + " | {}", cut(f["ms_quantiles"][1]), **f)
-        more = three and cells(gain + " | {mssd_mm_median:.1f} | {}", cut(three["ms_quantiles"][1]), **three)
-        ready = "" if about["prepare_s"] is None else f"{about['prepare_s']:.0f}"
-        yield [KEPT if way == "the thesis's network" else name, *one, *(more or ["", "", ""]), ready]
+VARIANTS = (
+    "fast",
+    "a quarter of the contacts",
+    "balanced",
+    "exact",
+    "no mode refined",
+    "75k poses",
+    "cosine, fast",
+    "depth map",
+)
 
 
-def sides(content):
-    row = "{gain_mean:.2f} / {mssd_mm_median:.0f} / {ms_quantiles[1]:.0f}"
-    for way in ("balanced", "within 30 degrees", "this side alone", "this side, exact"):
-        scenes = [content["parts"][part]["scenes"]["known side"] for part in PARTS]
-        yield [KEPT, *(row.format(**scene["figures"][way]) for scene in scenes)]
+def variants(content):
+    for name in VARIANTS:
+        row = [KEPT]
+        for scene in ("one touch", "three sensors"):
+            f = of_variant(content, scene, name)
+            row += ["", "", ""] if f is None else [f"{f[0]:.1f}", cut(f[1]), f"{f[2]:.0f}"]
+        yield row
+
+
+def known_face(content):
+    row = "{gain_mean:.1f} / {mssd_mm_median:.0f} / {ms_quantiles[1]:.0f}"
+    for name in ("balanced", "face to 30 degrees", "known face", "known face, exact"):
+        scenes = [content["parts"][part]["scenes"]["known contact face"] for part in PARTS]
+        yield [KEPT, *(row.format(**scene["figures"][name]) for scene in scenes)]
+
+
+def ablations(content):
+    parts = content["parts"].values()
+    names = dict.fromkeys(name for part in parts for scene in part["scenes"].values() for name in scene["ablations"])
+    for name in names:
+        row = [name]
+        for scenes in (("one touch", "known contact face"), ("three sensors",)):
+            found = [part["scenes"][scene]["ablations"].get(name) for part in parts for scene in scenes]
+            found = [f for f in found if f]
+            if not found:
+                row += ["", ""]
+                continue
+            mean = sum(f["gain"][0] for f in found) / len(found)
+            half = math.hypot(*((f["gain"][2] - f["gain"][1]) / 2 for f in found)) / len(found)
+            ratio = geometric_mean([f["time_ratio"] for f in found])
+            row += [f"{mean:+.2f} ± {half:.2f}", f"x {ratio:.1f}"]
+        yield row
 
 
 def touches(content):
@@ -290,9 +318,9 @@ TABLES = [
     ("README", "| images |", expected, "touches", "triplets"),
     ("readings", "| set |", contacts, "readings"),
     ("readings", "| camera |", balls, "readings"),
-    *(("no-more-than-needed", f"The {PARTS[part]}:", partial(modelled, part), "choices") for part in PARTS),
-    *(("speed-accuracy", f"The {PARTS[part]}:", partial(ways, part), "choices") for part in PARTS),
-    ("speed-accuracy", "| gain [nats] /", sides, "choices"),
+    ("no-more-than-needed", "| choice |", ablations, "choices"),
+    ("speed-accuracy", "| variant |", variants, "choices"),
+    ("speed-accuracy", "| gain [nats] /", known_face, "choices"),
     ("several-sensors", "| object |", touches, "touches"),
     ("several-sensors", "| shown |", elsewhere_simulated, "triplets"),
     ("tracking", "| method |", followed, "track"),

@@ -1,4 +1,4 @@
-"""``python -m tools.studies choices``: information gain and cost of each variant, on the same touches."""
+"""``python -m tools.studies choices``: information gain, error and time of each variant, on the same touches."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from geomtact.localizer import Localizer
     from geomtact.sensing.sensor import Sensor
 
-SCHEMA = "geomtact/choices/1"
+SCHEMA = "geomtact/choices/2"
 
 
 def judge_choices(
@@ -40,18 +40,16 @@ def judge_choices(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            "--way", help="Judge this variant beside the default, not all; may be given again.", show_default=False
+            "--variant", help="Judge this variant beside the default, not all; may be given again.", show_default=False
         ),
     ] = None,
     out: study_options.Out = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="PNG of information and error against the time of a touch.")
-    ] = None,
-    plot_modelled: Annotated[
-        Path | None, typer.Option("--plot-modelled", help="PNG of what each thing modelled adds.")
+    plot: Annotated[Path | None, typer.Option("--plot", help="PNG of information gain and error against time.")] = None,
+    plot_ablations: Annotated[
+        Path | None, typer.Option("--plot-ablations", help="PNG of the gain of each choice.")
     ] = None,
 ) -> None:
-    """Judge choices: efforts, grids, scores, registration, calibration and contact faces, each against the default.
+    """Judge choices: efforts, grids, registration, images and contact faces, each against the default.
 
     All variants meet each touch in turn. Everything is prepared anew in a folder that is removed afterwards, so that the time of
     preparing is measured. Prints tables, and writes all estimates to --out.
@@ -63,7 +61,7 @@ def judge_choices(
     from tools.studies.choices import study as choices
 
     content, gel = study_file.load(out, SCHEMA), Sensor.load(sensor)
-    ways = choices.ways_of(weights or [], only or [])
+    variants = choices.variants_of(weights or [], only or [])
     for mesh in study_options.meshes(parts, unit, gel):
         settings = plain(
             identity(mesh, gel)
@@ -71,21 +69,23 @@ def judge_choices(
                 "index_format": FORMAT,
                 "touches": touches,
                 "seed": seed,
-                "ways": {name: asdict(way) | {"scorer": Path(way.scorer).name} for name, way in ways.items()},
+                "variants": {
+                    name: asdict(variant) | {"scorer": Path(variant.scorer).name} for name, variant in variants.items()
+                },
             }
         )
         found = content["parts"].get(mesh.name)
-        known = dict(found) if study_file.begun(found, settings) else {"ways": {}, "scenes": {}}
+        known = dict(found) if study_file.begun(found, settings) else {"variants": {}, "scenes": {}}
         part = known | {"settings": settings}
-        done = {kind: list(part["scenes"].get(kind, {}).get("answers", [])) for kind in choices.scenes_of(ways)}
+        done = {kind: list(part["scenes"].get(kind, {}).get("answers", [])) for kind in choices.scenes_of(variants)}
         if any(len(some) < touches for some in done.values()):
-            _judge(mesh, gel, ways, part, done, touches, seed, lambda part=part: _keep(out, content, part))
+            _judge(mesh, gel, variants, part, done, touches, seed, lambda part=part: _keep(out, content, part))
         _summarise(part)
         _keep(out, content, part)
         _print(mesh.name, part)
         to_stderr(f"{mesh.name}: done")
     study_file.plot(content, plot)
-    study_file.plot(content, plot_modelled, "modelled")
+    study_file.plot(content, plot_ablations, "ablations")
 
 
 def _keep(out: Path | None, content: dict[str, Any], part: Mapping[str, Any]) -> None:
@@ -95,7 +95,7 @@ def _keep(out: Path | None, content: dict[str, Any], part: Mapping[str, Any]) ->
 def _judge(
     mesh: Mesh,
     sensor: Sensor,
-    ways: Mapping[str, Any],
+    variants: Mapping[str, Any],
     part: dict[str, Any],
     done: dict[str, list],
     n: int,
@@ -111,20 +111,20 @@ def _judge(
     localizers: dict[str, Localizer] = {}
     spent: dict[tuple[Any, ...], float | None] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name, way in ways.items():
+        for name, variant in variants.items():
             with progress_bar(f"preparing {mesh.name}, {name}") as progress:
-                localizers[name], seconds = choices.prepare(mesh, sensor, way, Path(folder), progress)
-            spent.setdefault(way.prepared, seconds)
-            part["ways"][name] = {
-                "choice": way.choice,
+                localizers[name], seconds = choices.prepare(mesh, sensor, variant, Path(folder), progress)
+            spent.setdefault(variant.prepared, seconds)
+            part["variants"][name] = {
+                "choice": variant.choice,
                 "poses": len(localizers[name].index),
                 "bytes_per_pose": bytes_per_pose(localizers[name].scorer.scorer, localizers[name].index),
-                "prepare_s": spent[way.prepared],
+                "prepare_s": spent[variant.prepared],
             }
         for kind in done:
             scenes = choices.make(kind, localizers[choices.DEFAULT], n, seed)
-            todo = choices.localized(localizers, ways, scenes[len(done[kind]) :], kind, seed)
-            rows = ({name: asdict(answer) for name, answer in told.items()} for told in todo)
+            todo = choices.localized(localizers, variants, scenes[len(done[kind]) :], kind, seed)
+            rows = ({name: asdict(answer) for name, answer in each.items()} for each in todo)
 
             def keep(answers: list, kind: str = kind) -> None:
                 part["scenes"][kind] = {"answers": answers}
@@ -139,7 +139,7 @@ def _summarise(part: dict[str, Any]) -> None:
 
     for scene in part["scenes"].values():
         answers = {
-            name: [choices.Timed(**study_file.numbers(told[name])) for told in scene["answers"]]
+            name: [choices.Timed(**study_file.numbers(each[name])) for each in scene["answers"]]
             for name in scene["answers"][0]
         }
         figures = choices.summarise(answers)
@@ -149,27 +149,36 @@ def _summarise(part: dict[str, Any]) -> None:
             "mssd_mm_median": choices.front(figures, "mssd_mm_median", -1),
         }
         scene["beaten_by"] = choices.beaten_by(answers, figures)
-        scene["modelled"] = choices.modelled(answers)
+        scene["ablations"] = choices.ablations(answers)
 
 
 def _print(name: str, part: Mapping[str, Any]) -> None:
     headings = ["gain [nats]", "MSSD [mm]", "ms", "poses", "ready [s]"]
     for kind, scene in part["scenes"].items():
         rows = []
-        for way, f in scene["figures"].items():
+        for variant, f in scene["figures"].items():
             gain = "-" if f["gain_mean"] is None else f"{f['gain_mean']:.2f} ± {f['gain_standard_error'] or 0:.2f}"
             ms = f"{f['ms_quantiles'][1]:.1f} ({f['ms_quantiles'][0]:.1f}-{f['ms_quantiles'][2]:.1f})"
-            ready = part["ways"][way]["prepare_s"]
-            numbers = [f"{part['ways'][way]['poses']:,}", study_file.figure(ready, 0)]
-            on_front = "*" if way in scene["front"]["gain_mean"] else ""
-            rows.append([way + on_front, part["ways"][way]["choice"], gain, f"{f['mssd_mm_median']:.1f}", ms, *numbers])
+            ready = part["variants"][variant]["prepare_s"]
+            numbers = [f"{part['variants'][variant]['poses']:,}", study_file.figure(ready, 0)]
+            on_front = "*" if variant in scene["front"]["gain_mean"] else ""
+            rows.append(
+                [
+                    variant + on_front,
+                    part["variants"][variant]["choice"],
+                    gain,
+                    f"{f['mssd_mm_median']:.1f}",
+                    ms,
+                    *numbers,
+                ]
+            )
         typer.echo(f"{name}, {kind}; * Pareto-optimal in time and gain")
-        print_table(["way", "choice", *headings], rows, headings)
+        print_table(["variant", "choice", *headings], rows, headings)
         if scene["beaten_by"]:
             typer.echo(f"the default is slower and gains less than: {', '.join(scene['beaten_by'])}")
         rows = [
-            [what, "{:+.2f} ({:+.2f} to {:+.2f})".format(*f["adds"]), f"{f['time_ratio']:.2f}"]
-            for what, f in scene["modelled"].items()
+            [what, "{:+.2f} ({:+.2f} to {:+.2f})".format(*f["gain"]), f"{f['time_ratio']:.2f}"]
+            for what, f in scene["ablations"].items()
         ]
         if rows:
-            print_table(["modelled", "adds [nats]", "time"], rows, ["adds [nats]", "time"])
+            print_table(["ablation", "gain [nats]", "time"], rows, ["gain [nats]", "time"])

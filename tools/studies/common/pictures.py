@@ -11,7 +11,7 @@ from geomtact.errors import InputError, UsageError, nearest_name
 # by schema: the study's pictures by name, the first the default, each drawn by a function of its folder's plot.py
 PICTURES = {
     "geomtact/adaptive/3": {"adaptive": "adaptive.draw_adaptive"},
-    "geomtact/choices/1": {"costs": "choices.draw_costs", "modelled": "choices.draw_modelled"},
+    "geomtact/choices/2": {"costs": "choices.draw_costs", "ablations": "choices.draw_ablations"},
     "geomtact/identification/1": {"identification": "identify.draw_identification"},
     "geomtact/kitting/1": {"kitting": "kitting.draw_kitting"},
     "geomtact/next-touch-study/1": {"touches": "next_touch.draw_touches_until_sure"},

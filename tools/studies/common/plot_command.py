@@ -17,7 +17,7 @@ def plot_study(
         str | None,
         typer.Option(
             "--picture",
-            help="Which one, where a study has several: costs (the default) or modelled, of choices.",
+            help="Which one, where a study has several: costs (the default) or ablations, of choices.",
             show_default=False,
         ),
     ] = None,
