@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from speed import slow_but
 from typer.testing import CliRunner
 
 from geomtact.cli.next_touch import next_touch as next_touch_command
@@ -16,7 +15,6 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError, InputError, PoseError, UsageError
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
-from geomtact.inference.effort import Effort
 from geomtact.planning.actions import Probe, Touch
 from geomtact.planning.draws import draw_places
 from geomtact.planning.grid import grid_of_touches
@@ -29,7 +27,7 @@ from geomtact.planning.next_touch import (
     likelihoods,
     next_touch,
 )
-from geomtact.se3 import exp, inverse, log, transform
+from geomtact.se3 import exp, inverse, transform
 from geomtact.sensing.noise import MODERATE
 from geomtact.sensing.sensor import Sensor
 from tools.studies.kitting.fixture import upwards
@@ -303,20 +301,6 @@ def test_cells_are_drawn_by_their_probability(plug, posterior, rng):
     held = plug.index.lookup(T.reshape(-1, 4, 4), plug.space.penetration(T.reshape(-1, 4, 4)))
     assert set(held.reshape(5, 20)[0]) <= set(posterior.cells[:2])
     assert (held.reshape(5, 20) == held.reshape(5, 20)[0]).mean() > 0.9
-
-
-@pytest.mark.parametrize("n", slow_but((600, 4000), 600))
-def test_a_refined_cell_is_drawn_as_registration_left_it(plug, a_touch, n):
-    world = plug.localize(a_touch(plug)[1], T_world_sensor=T_MOVED, effort=Effort(5))
-    mode = next(mode for mode in world.modes() if mode.refined)
-    cell = next(c for c, found in world.refined.items() if np.allclose(T_MOVED @ found.T, mode.T))
-    row = np.flatnonzero(world.cells == cell)
-    known = replace(world, cells=world.cells[row], cell_log_prob=np.zeros(1))
-    T = draw_places(known, 2, np.random.default_rng(0), n)
-    white = np.linalg.solve(np.linalg.cholesky(mode.covariance), log(inverse(mode.T) @ T).reshape(-1, 6).T)
-    error = 1 / np.sqrt(2 * n)  # of a mean; of a variance it is sqrt 2 of that
-    assert white.mean(1) == pytest.approx(np.zeros(6), abs=3.5 * error)
-    assert np.cov(white) == pytest.approx(np.eye(6), abs=3.5 * np.sqrt(2) * error)
 
 
 def test_touches_start_clear_of_the_object_and_meet_it(plug, posterior):

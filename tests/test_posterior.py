@@ -15,12 +15,11 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.distribution import cell_log_density, row_poses
 from geomtact.inference.effort import Effort
 from geomtact.inference.posterior import Posterior
-from geomtact.inference.reweight import reweight_cells
 from geomtact.se3 import exp, transform
 
 T_WORLD = exp([0.3, -1.2, 0.5, 0.4, -0.1, 0.7])
 MM = 1e-3
-PLAIN, CELLS = Effort(0), Effort(5, thorough=False)  # what is within the cells: test_explored.py
+CELLS = Effort(0)  # what is within the cells: test_explored.py
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,7 @@ def posteriors(a_touch):
     def of(localizer) -> Posterior:
         key = localizer.index.key
         if key not in found:
-            found[key] = replace(localizer.localize(a_touch(localizer)[1], effort=CELLS), refined={})
+            found[key] = localizer.localize(a_touch(localizer)[1], effort=CELLS)
         return found[key]
 
     return of
@@ -206,9 +205,8 @@ def modes_by_brute_force(posterior, modes):
     return out
 
 
-@pytest.mark.parametrize("effort", [PLAIN, CELLS], ids=["plain", "refined"])
-def test_a_mode_holds_the_mass_within_its_radius(localizer, a_touch, effort):
-    posterior = localizer.localize(a_touch(localizer)[1], effort=effort)
+def test_a_mode_holds_the_mass_within_its_radius(localizer, posteriors):
+    posterior = posteriors(localizer)
     modes = posterior.modes(5)
     assert modes and all(m.probability > 0 for m in modes)
     probability = [m.probability for m in modes]
@@ -221,9 +219,8 @@ def test_a_mode_holds_the_mass_within_its_radius(localizer, a_touch, effort):
         assert np.linalg.eigvalsh(mode.covariance).min() > -1e-12
         rows = mode.observable
         assert np.abs(rows @ rows.T - np.eye(len(rows))).max(initial=0) < 1e-6
-        if effort == PLAIN:
-            others = np.stack([m.T for m in modes[:i]]) if i else np.zeros((0, 4, 4))
-            assert (distance.mean(mode.T, others) > radius).all()
+        others = np.stack([m.T for m in modes[:i]]) if i else np.zeros((0, 4, 4))
+        assert (distance.mean(mode.T, others) > radius).all()
     assert len(posterior.modes(2)) <= 2 and posterior.modes(0) == []
     assert [m.probability for m in posterior.modes(2)] == probability[:2]
 
@@ -249,9 +246,8 @@ def test_modes_are_allowed_poses(localizer, posteriors):
     assert np.isfinite(localizer.space.caster.penetration(localizer.sensor, T)).all()
 
 
-@pytest.mark.parametrize("effort", [PLAIN, CELLS], ids=["plain", "refined"])
-def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_touch, effort):
-    posterior = localizer.localize(a_touch(localizer)[1], T_world_sensor=T_WORLD, effort=effort)
+def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_touch):
+    posterior = localizer.localize(a_touch(localizer)[1], T_world_sensor=T_WORLD, effort=CELLS)
     mass = posterior.log_prob
     poses = posterior.likeliest(10)
     row = [int(np.abs(posterior.poses - T).max((1, 2)).argmin()) for T in poses]
@@ -462,35 +458,6 @@ def test_a_truncated_posterior_is_refused(plug, posteriors, tmp_path):
     (tmp_path / "p.npz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="not a posterior that geomtact saved"):
         Posterior.load(tmp_path / "p.npz")
-
-
-@pytest.fixture(scope="module")
-def exact(ball, a_touch):
-    """The posterior of one touch of a ball, every cell scored, without refinement."""
-    rows = ball.scorer.rows(ball.index, a_touch(ball)[1])
-    return Posterior(ball.index, rows.cells, rows.log_prob)
-
-
-def test_mass_shared_anew_follows_the_likelihood_and_stays_where_it_was(exact):
-    """All other cells keep what they have."""
-    before = exact
-    row = np.argsort(-before.log_prob)[:4]
-    likelihood = np.array([3.0, 0.0, -2.0, 1.0])
-    after = reweight_cells(before, before.cells[row], likelihood)
-    p, q = (np.exp(x.log_prob.astype(float)) for x in (before, after))
-    assert q[row] / q[row].sum() == pytest.approx(p[row] * np.exp(likelihood) / (p[row] @ np.exp(likelihood)), rel=1e-4)
-    assert q[row].sum() == pytest.approx(p[row].sum(), rel=1e-5)
-    others = np.setdiff1d(np.arange(len(p)), row)
-    assert (after.log_prob[others] == before.log_prob[others]).all()
-
-
-def test_a_cell_without_likelihood_keeps_its_mass(exact):
-    before = exact
-    rows = np.argsort(-before.log_prob)[:3]
-    after = reweight_cells(before, before.cells[rows], np.array([-np.inf, 0.0, 2.0]))
-    assert after.log_prob[rows[0]] == before.log_prob[rows[0]]
-    p, q = (np.exp(each.log_prob[rows[1:]].astype(float)).sum() for each in (before, after))
-    assert q == pytest.approx(p, rel=1e-5)
 
 
 def test_a_file_that_cannot_be_written_is_named_as_it_was_given(plug, posteriors, tmp_path):

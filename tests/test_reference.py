@@ -15,7 +15,7 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.distribution import Refined
-from geomtact.inference.modes import carried, leading_cells
+from geomtact.inference.modes import carried, grown
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.reference import Reference
 from geomtact.se3 import exp, inverse, log, transform
@@ -265,5 +265,5 @@ def test_without_symmetry_or_prior_nothing_is_turned(plug, flat_nut, a_touch):
     assert plug.localize(mask, prior=GaussianPrior(T, np.diag(STD**2)), effort="fast").reference is None
     posterior = flat_nut.localize(a_touch(flat_nut)[1], effort="fast")
     assert posterior.reference is None
-    heart = posterior.index.poses(leading_cells(posterior, 1))
+    heart = posterior.index.poses(np.array([cell for cell, _ in grown(posterior, 1)]))
     assert np.array_equal(posterior.modes(1)[0].T, heart[0])

@@ -62,7 +62,9 @@ def test_draws_about_modes_have_their_density(localizer, scenes):
     about = AboutModes.of(target, runs[0].particles[-1].take(np.arange(60)), search)
     assert len(about.hearts) <= 12
     rng = np.random.default_rng(0)
-    few = AboutModes(target, about.hearts[:1], about.bases[:1], about.students[:1], about.led_to, about.origin)
+    few = AboutModes(
+        target, about.hearts[:1], about.bases[:1], about.students[:1], about.led_to, about.origin, about.best, 0
+    )
     some = target.particles_at(about.draw(4000, rng))
     inside = np.isfinite(some.log_target(0))
     ratio = np.exp(few.log_density(some) - about.log_density(some))

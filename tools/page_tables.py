@@ -71,7 +71,7 @@ def balls(content):
 
 
 def of_variant(content, scene, name):
-    """Mean gain [nats], error of mode 1 [mm] and time [ms] of a variant over all objects, or none; errors and times are multiplied."""
+    """Gain [nats], error of mode 1 [mm] and time [ms] of a variant in the mean over all objects, geometric but for the gain."""
     each = [part["scenes"][scene]["figures"].get(name) for part in content["parts"].values()]
     if None in each:
         return None

@@ -20,7 +20,7 @@ LEADING_CELLS = 400  # number of the most probable cells from which modes are gr
 
 @dataclass(frozen=True)
 class Refined:
-    """What registration found at one cell: its pose in the sensor frame, and the observable directions there."""
+    """What registration found at one mode: its pose in the sensor frame, and the observable directions there."""
 
     T: Array
     covariance: Array
@@ -44,7 +44,7 @@ class CellDistribution:
     off_contact_log_density : without contact, the prior's log density at poses (n, 4, 4) in ``frame``; it is not saved
     log_evidence : log of the mean likelihood under the prior, comparable between objects for the same images and effort
     seed : of the random choices made where credible levels tie
-    refined : what registration found, by pose id
+    refined : what registration found at the leading modes, by their number, where the pose is resolved within the cells
     explored : the distribution within the cells, which keep the masses that they had before; None where it is that of the cells
     reference : poses of the prior or of the frame before, by which modes are reported at one of their images under the object's
         symmetry
@@ -99,20 +99,11 @@ def cell_densities(posterior: CellDistribution) -> NDArray[np.float32]:
     return out
 
 
-def cell_poses(posterior: CellDistribution, cells: NDArray[np.int64]) -> Array:
-    """Poses (m, 4, 4) of ``cells`` (m,) in the sensor frame, refined where registration found better."""
-    T = posterior.index.poses(cells)
-    if posterior.refined:
-        for i in np.flatnonzero(np.isin(cells, list(posterior.refined))):
-            T[i] = posterior.refined[int(cells[i])].T
-    return T
-
-
 def row_poses(posterior: CellDistribution, rows: ArrayLike) -> Array:
     """Poses (m, 4, 4) of ``rows`` (m,) in the posterior's frame: those rows of ``Posterior.poses``."""
     if posterior.explored is not None:
         return posterior.T_frame_sensor @ posterior.explored.poses[np.asarray(rows, np.int64)]
-    return posterior.T_frame_sensor @ cell_poses(posterior, posterior.cells[np.asarray(rows, np.int64)])
+    return posterior.T_frame_sensor @ posterior.index.poses(posterior.cells[np.asarray(rows, np.int64)])
 
 
 def row_log_prob(posterior: CellDistribution) -> NDArray[np.floating]:

@@ -13,7 +13,7 @@ class Effort:
 
     Attributes
     ----------
-    modes : that are refined
+    modes : that are refined, where the pose is resolved within the cells
     contacts : of the last attempt to resolve the pose within the cells of the grid (see ``inference.two_runs``), of one mask. The
         first attempt has a sixteenth, and settles most touches; the second has a quarter. Half as many more weigh the modes. 0
         leaves the cells as they are

@@ -188,7 +188,7 @@ def fused_posterior(
     within = posterior.explored is not None
     if within and effort.modes:
         with timed(timing, "refine"):
-            posterior = refiner.register(posterior, joint_problem(shown, T_first_sensor), effort.modes, effort.thorough)
+            posterior = refiner.refine(posterior, joint_problem(shown, T_first_sensor), effort.modes, effort.thorough)
     if uncertain:
         assert extrinsics_std is not None
         posterior = replace(posterior, refined=_widened(posterior, np.stack(others), extrinsics_std))

@@ -80,8 +80,8 @@ def counted(
 
     The mass of a mode is the share of the poses near it: of several contacts there are few modes, and an integral about one would
     be over the errors of all contacts too. All poses come from so many independent ``draws``, or registration was ``led_to``
-    their modes, poses (r, 4, 4), from more (r,): one more would have found a mode that was missed with a probability of
-    1 / (draws + 1) (the rule of succession), which is left out.
+    their modes, poses (r, 4, 4), from more places (r,), where these are not -1: one more would have found a mode that was missed
+    with a probability of 1 / (draws + 1) (the rule of succession), which is left out.
     """
     mesh = explored.index.mesh
     distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
@@ -91,7 +91,7 @@ def counted(
         near = np.stack(
             [distance.within(heart, T, radius) for heart, rows in zip(hearts, members, strict=True) if len(rows)]
         )
-        draws = max(draws, len(np.unique(origin[near.any(0)])))
+        draws = max(draws, len(np.unique(origin[near.any(0) & (origin >= 0)])))
     mass = _shared_out(explored, members, np.array([explored.weight[rows].sum() for rows in members]))
     order = np.argsort(-mass, kind="stable")
     return replace(explored, hearts=hearts[order], masses=mass[order] * draws / (draws + 1))

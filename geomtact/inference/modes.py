@@ -12,7 +12,6 @@ from geomtact.inference.distribution import (
     CellDistribution,
     Refined,
     cell_log_density,
-    cell_poses,
     leading_rows,
     nearest_images,
     rows_of,
@@ -39,7 +38,7 @@ class Mode:
     observable : (r, 6) orthonormal rows: the observable directions of xi, rotations scaled by ``length``; no rows where
         they were not computed, as for modes that are not refined
     length : metres by which rotations are scaled before directions are compared
-    refined : whether T was moved off the grid, because the contact simulated there agrees better with the observed one
+    refined : whether registration found a denser pose
     """
 
     T: Array
@@ -54,16 +53,14 @@ class Mode:
         return f"Mode({100 * self.probability:.2g} %, object's origin at ({x:.2f}, {y:.2f}, {z:.2f}) mm)"
 
 
-def grown(posterior: CellDistribution, k: int, full: bool = True) -> list[tuple[int, float]]:
+def grown(posterior: CellDistribution, k: int) -> list[tuple[int, float]]:
     """The cell at the heart of each of the ``k`` leading modes and the mass of the mode, most probable first.
 
-    A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most. Unless
-    ``full``, the mass is that of the mode's most probable cells.
+    A few more are grown than asked for: the cell with the most mass need not lie in the mode with the most.
     """
-    moved = np.array(sorted(posterior.refined), np.int64)
-    seeds = np.union1d(moved, posterior.cells[leading_rows(posterior)])
+    seeds = np.sort(posterior.cells[leading_rows(posterior)])
     seeds = seeds[np.argsort(-cell_log_density(posterior, seeds) - posterior.index.log_weight[seeds], kind="stable")]
-    poses = cell_poses(posterior, seeds)
+    poses = posterior.index.poses(seeds)
     distance, radius = PoseDistance(posterior.index.mesh, _POINTS), mode_radius(posterior.index.mesh)
     members: list[tuple[int, NDArray[np.int64]]] = []
     covered: set[int] = set()
@@ -71,7 +68,7 @@ def grown(posterior: CellDistribution, k: int, full: bool = True) -> list[tuple[
         if len(members) == max(k, _LEAST) + _SPARE:
             break
         if cell not in covered:
-            near = _within(posterior, T, distance, radius, moved) if full else seeds[distance.within(T, poses, radius)]
+            near = _within(posterior, T, distance, radius)
             members.append((cell, np.union1d(near, [cell])))
             covered.update(near.tolist())
     return _share_out(posterior, members)[:k]
@@ -101,18 +98,10 @@ def modes_within(posterior: CellDistribution, k: int) -> list[Mode]:
     return out
 
 
-def leading_cells(posterior: CellDistribution, k: int) -> NDArray[np.int64]:
-    """Pose ids (m,) of the index in the middle of the ``k`` leading modes, weighed by the most probable cells alone."""
-    found = grown(posterior, k, full=False) if posterior.contact and k > 0 else []
-    return np.array([cell for cell, _ in found], np.int64)
-
-
 def mode_at(posterior: CellDistribution, cell: int, mass: float) -> Mode:
     """The mode with its heart at ``cell`` that holds ``mass``, in the posterior's frame."""
-    found = posterior.refined.get(cell)
-    if found is None:
-        T = _touching_pose(posterior, cell)
-        found = Refined(T, posterior.index.cell_covariance(T), np.zeros((0, 6)), posterior.index.mesh.radius_rms, False)
+    T = _touching_pose(posterior, cell)
+    found = Refined(T, posterior.index.cell_covariance(T), np.zeros((0, 6)), posterior.index.mesh.radius_rms, False)
     found = carried(found, nearest_images(posterior, found.T[None])[0])
     T = posterior.T_frame_sensor @ found.T
     return Mode(T, mass, found.covariance, found.observable, found.length, found.moved)
@@ -121,7 +110,7 @@ def mode_at(posterior: CellDistribution, cell: int, mass: float) -> Mode:
 def _touching_pose(posterior: CellDistribution, cell: int) -> Array:
     """The pose (4, 4) of ``cell`` in the sensor frame, moved along z where it presses too deep: the index measures depths on
     height maps, which miss what lies between their pixels."""
-    T = cell_poses(posterior, np.array([cell]))
+    T = posterior.index.poses(np.array([cell]))
     if np.isnan(posterior.index.space.penetration(T)[0]):
         settled, ok = posterior.index.space.settle(
             T, posterior.index.resolution.penetrations[cell // posterior.index.places]
@@ -157,12 +146,10 @@ def _share_out(posterior: CellDistribution, members: list[tuple[int, NDArray[np.
     return out
 
 
-def _within(
-    posterior: CellDistribution, T: Array, distance: PoseDistance, radius: float, moved: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _within(posterior: CellDistribution, T: Array, distance: PoseDistance, radius: float) -> NDArray[np.int64]:
     """Cells whose poses lie within ``radius`` [m] of ``T`` (4, 4) in mean point distance; sensor frame."""
-    cells = np.union1d(posterior.index.perhaps_within(T, distance, radius), moved)
-    return cells[distance.within(T, cell_poses(posterior, cells), radius)]
+    cells = posterior.index.perhaps_within(T, distance, radius)
+    return cells[distance.within(T, posterior.index.poses(cells), radius)]
 
 
 def _mass_of(posterior: CellDistribution, cells: NDArray[np.int64]) -> Array:

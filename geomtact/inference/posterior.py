@@ -19,7 +19,6 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.inference.distribution import (
     CellDistribution,
     cell_log_density,
-    cell_poses,
     leading_rows,
     nearest_images,
     row_log_density,
@@ -82,8 +81,7 @@ class Posterior(CellDistribution):
 
     @cached_property
     def poses(self) -> Array:
-        """Poses (N, 4, 4) of the object in ``frame``, one per particle or cell; refined ones where registration
-        found better."""
+        """Poses (N, 4, 4) of the object in ``frame``, one per particle or cell."""
         return row_poses(self, np.arange(len(self.log_prob)))
 
     @cached_property
@@ -121,8 +119,7 @@ class Posterior(CellDistribution):
         return [mode_at(self, cell, mass) for cell, mass in grown(self, k)]
 
     def likeliest(self, n: int) -> Array:
-        """The ``n`` most probable poses (m, 4, 4) in ``frame``, most probable first: one a cell, refined
-        where registration found better.
+        """The ``n`` most probable poses (m, 4, 4) in ``frame``, most probable first: particles, or one a cell.
 
         Fewer where there are fewer, none without contact. Most are neighbours; for places that are apart see :meth:`modes`, which
         has the same images under the object's symmetry.
@@ -132,7 +129,7 @@ class Posterior(CellDistribution):
             return self.T_frame_sensor @ nearest_images(self, self.explored.poses[rows])
         rows = leading_rows(self, n) if self.contact and n > 0 else np.zeros(0, np.int64)
         rows = rows[np.argsort(-self.cell_log_prob[rows], kind="stable")]
-        return self.T_frame_sensor @ nearest_images(self, cell_poses(self, self.cells[rows]))
+        return self.T_frame_sensor @ nearest_images(self, self.index.poses(self.cells[rows]))
 
     def log_density(self, T: ArrayLike) -> Any:
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
@@ -185,7 +182,7 @@ class Posterior(CellDistribution):
 
     def sample(self, n: int, rng: np.random.Generator | int) -> Array:
         """``n`` poses (n, 4, 4) drawn by ``rng``, or by one of that seed, from the posterior: among its particles, or uniform
-        within each cell, even a refined one; and over the symmetry.
+        within each cell; and over the symmetry.
 
         Raises
         ------

@@ -50,7 +50,9 @@ class AboutModes:
     bases : m arrays (d, 6) that motions are along
     students : of their coordinates
     led_to : poses (r, 4, 4) to which registration moved some, of those that touch all sensors
-    origin : (r,) from which draws of the sampler these came
+    origin : (r,) places of the index from which these came; -1 of those that registration left where they were
+    best : (S,) the largest log likelihood by each sensor of all of them
+    contacts : that were cut on all sensors
     """
 
     target: Target
@@ -59,6 +61,8 @@ class AboutModes:
     students: list[Student]
     led_to: Array
     origin: NDArray[np.int64]
+    best: Array
+    contacts: int
 
     @classmethod
     def of(cls, target: Target, drawn: Particles, search: Search) -> AboutModes | None:
@@ -88,7 +92,10 @@ class AboutModes:
             along = np.linalg.pinv(basis)
             scale = along.T @ (_WIDER**2 * covariance + np.diag(least**2)) @ along
             students.append(Student(np.zeros(len(basis)), np.linalg.cholesky(scale)))
-        return cls(target, hearts, bases, students, refinement.T[touching], drawn.draw[kept[touching]])
+        origin = np.where(refinement.converged, drawn.poses.place[kept], -1)[touching]
+        contacts = (len(drawn) + len(kept)) * target.sensors
+        best = found.by_sensor[touching].max(0)
+        return cls(target, hearts, bases, students, refinement.T[touching], origin, best, contacts)
 
     @cached_property
     def _distance(self) -> PoseDistance:

@@ -121,11 +121,13 @@ def explore(
     stops, power, population = _begun(target, drawn, log_weight + log_measure[:, None], number, rng)
     population.contacts = cut
     about = None
-    if others and search:
-        weight = log_weight + drawn.log_target(power).reshape(runs, -1)
-        about = AboutModes.of(
-            target, drawn.take(different(weight.ravel(), round(_REGISTERED * len(drawn)), rng)), search
-        )
+    if search and power < SURE:
+        weight = (log_weight + drawn.log_target(power).reshape(runs, -1)).ravel()
+        some = different(weight, round(_REGISTERED * len(drawn)), rng)
+        about = AboutModes.of(target, drawn.take(some), search)
+    if about:
+        population.best = np.maximum(population.best, about.best)
+        population.contacts += about.contacts
     while True:
         population.move(partial(Particles.log_target, power=power))
         sure = population if not others or power >= SURE else population.that_touch()

@@ -102,18 +102,13 @@ def drop_lost_contact_prior(posterior: Posterior, prior: Any) -> tuple[Posterior
 
 
 def refine_modes(posterior: Posterior, refiner: ModeRefiner, effort: Effort) -> Posterior:
-    """The ``posterior`` of one image with its leading modes refined below the grid.
-
-    Where it is not resolved within the cells, depths are not used.
-    """
-    if not posterior.contact or posterior.observation is None or not effort.modes:
+    """The ``posterior`` of one image with its leading modes refined, where it is resolved within the cells."""
+    if posterior.explored is None or posterior.observation is None or not effort.modes:
         return posterior
     with timed(posterior.timing_ms, "refine"):
         contact = posterior.observation.contact
-        if posterior.explored is not None:
-            problem = make_problem(cleaned(contact.soft_mask, posterior.sensor), posterior.sensor, contact.height)
-            return refiner.register(posterior, problem, effort.modes, effort.thorough)
-        return refiner.refine(posterior, contact, effort.modes, effort.thorough)
+        problem = make_problem(cleaned(contact.soft_mask, posterior.sensor), posterior.sensor, contact.height)
+        return refiner.refine(posterior, problem, effort.modes, effort.thorough)
 
 
 def _scored(contact: Contact) -> tuple[SoftMask, float]:

@@ -24,7 +24,7 @@ from geomtact.scoring.contact_likelihood import SCALE_ERROR, SHIFT_ERROR
 from geomtact.se3 import Array, exp
 
 NODES = 32  # errors over which a density is averaged, a power of two
-NODES_BESIDE = 128  # those of a sensor beside the first
+NODES_BESIDE = 256  # those of a sensor beside the first
 ERRORS = (
     7  # of a contact: four of the first one; of any other how well its sensor's pose is known, and six of where that is
 )

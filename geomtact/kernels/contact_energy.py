@@ -226,7 +226,7 @@ def _contact_energy(  # type: ignore[no-untyped-def]
             for j in range(samples):
                 pressed = surface[k, j] - lowest
                 e = np.sqrt(max(one - pressed / about[j], np.float32(0))) * SHARES
-                share[j] = int(e) if pressed > 0 else -1
+                share[j] = min(int(e), SHARES - 1) if pressed > 0 else -1
             for j in range(samples):
                 e = share[j]
                 if e >= 0:

@@ -46,7 +46,8 @@ class Nearest(NamedTuple):
 
     Attributes
     ----------
-    points, normals : (X Y Z, 3) nearest to the centre of each voxel
+    points : (X Y Z, 3) nearest to the centre of each voxel
+    normals : (X Y Z, 3) in the mean over a few that are nearest
     distance : (X Y Z,) how far away they are [m]
     shape, low, side : of the voxels, as of :class:`Voxels`
     """

@@ -7,14 +7,13 @@ import numpy as np
 from geomtact.contact_space.draw import draw_within
 from geomtact.errors import InputError
 from geomtact.inference.posterior import Posterior
-from geomtact.se3 import Array, exp
+from geomtact.se3 import Array
 
 
 def draw_places(posterior: Posterior, n: int, rng: np.random.Generator, within: int = 1) -> Array:
     """Poses (d, n, 4, 4) of the object: ``n`` places drawn from the posterior, and d = ``within`` poses in each.
 
-    A place of a resolved posterior is one pose, d times. Of another it is a cell: its poses lie anywhere within, but around
-    refined modes they scatter by their covariance: two such cells can differ by less than the grid's step.
+    A place of a resolved posterior is one pose, d times. Of another it is a cell: its poses lie anywhere within.
     """
     if posterior.explored is not None:
         return np.tile(posterior.T_frame_sensor @ posterior.explored.draw(n, rng), (within, 1, 1, 1))
@@ -22,9 +21,6 @@ def draw_places(posterior: Posterior, n: int, rng: np.random.Generator, within: 
     row = rng.choice(len(p), n, p=p / p.sum())
     cells = posterior.cells[row]
     T = draw_within(posterior.index, posterior.space, np.tile(cells, within), rng)[0].reshape(-1, n, 4, 4)
-    for i in np.flatnonzero(np.isin(cells, list(posterior.refined))):
-        found = posterior.refined[int(cells[i])]
-        T[:, i] = found.T @ exp(rng.multivariate_normal(np.zeros(6), found.covariance, within))
     return posterior.T_frame_sensor @ T
 
 

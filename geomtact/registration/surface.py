@@ -10,7 +10,7 @@ import numpy as np
 
 from geomtact.errors import MeshError
 from geomtact.kernels.surface_filter import Nearest, Voxels
-from geomtact.se3 import Array
+from geomtact.se3 import Array, unit
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -23,6 +23,7 @@ _TURN = 2.0  # distance that a difference of 1 between normals counts as, in gap
 _DEEP = 1e-3  # least value of that distance [m]: faces parallel to the membrane lie about so deep below it
 _SIDE = 3.0  # side of a voxel, in gaps between points
 _MOST_VOXELS = 100_000  # of places far from the surface
+_FACES = 4  # nearest points whose normals are averaged there
 _MARGIN = 10e-3  # around the surface that these fill [m]
 
 
@@ -78,8 +79,10 @@ class Surface:
         side = _side(extent, _DEEP, _MOST_VOXELS)
         shape = np.ceil(extent / side).astype(np.int64)
         places = low + side * (np.indices(shape).reshape(3, -1).T + 0.5)
-        distance, nearest = self.tree.query(places, workers=-1)
-        return Nearest(self.points[nearest], self.normals[nearest], distance, shape, low, side)
+        # beside an edge the mean normal of the faces that meet there says which side a place is on, that of one does not
+        distance, nearest = self.tree.query(places, k=range(1, min(_FACES, len(self.points)) + 1), workers=-1)
+        normals = unit(self.normals[nearest].mean(1))
+        return Nearest(self.points[nearest[:, 0]], normals, distance[:, 0], shape, low, side)
 
     @cached_property
     def coarser(self) -> Surface | None:

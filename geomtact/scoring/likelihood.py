@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from geomtact.contact_space.index import Index
 from geomtact.log_mass import log_mean_exp
 from geomtact.scoring.overlap import overlaps, to_grid
-from geomtact.se3 import Array
 from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.moments import cleaned
 
@@ -58,21 +57,6 @@ class PixelLikelihood:
             logs = weight * np.concatenate([np.log(yes), np.log1p(-yes)]).astype(np.float32)  # (2 (P + 1), K)
             out[p] = log_mean_exp(counts @ logs)
         return out
-
-
-def cast_log_likelihood(depths: NDArray[np.floating], seen: NDArray[np.bool_], area: float) -> Array:
-    """Log likelihood (n,) of the observed ``seen`` (h, w) at poses where the object lies ``depths`` (n, h, w) [m] below
-    the membrane.
-
-    ``area`` is that of a pixel [m^2].
-    """
-    deepest = np.maximum(depths.max((1, 2)), 0)[:, None, None]
-    weight = _independent(area)
-    sign = np.where(seen, 1, -1).astype(depths.dtype)  # no contact is as likely as contact with the object as far above
-    each = []
-    for t, s in product(THRESHOLDS, SOFTNESS):
-        each.append(weight * np.log(_contact_probability(sign * (depths - t * deepest), s)).sum((1, 2)))
-    return np.asarray(log_mean_exp(np.stack(each, 1)), float)
 
 
 def _contact_probability(below: NDArray[np.floating], softness: float) -> NDArray[np.floating]:

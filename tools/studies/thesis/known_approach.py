@@ -19,12 +19,11 @@ from geomtact.geometry.approach import Approach, approach_of
 from geomtact.geometry.distance import PoseDistance
 from geomtact.geometry.mesh import Mesh
 from geomtact.inference.effort import effort_of
-from geomtact.inference.modes import leading_cells
+from geomtact.inference.modes import grown
 from geomtact.localizer import Localizer
 from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.observability import Spread
 from geomtact.se3 import Array
-from geomtact.sensing.contact import Contact
 from geomtact.sensing.moments import cleaned
 from geomtact.sensing.noise import Noise
 from geomtact.sensing.sensor import Sensor
@@ -107,10 +106,9 @@ def _answers(localizer: Localizer, touch: Touch, effort: str) -> list[Array]:
     refined = localizer.localize(touch.mask, "mask", effort=effort)
     modes = [np.stack([mode.T for mode in posterior.modes(MODES)]) for posterior in (grid, refined)]
     poses = [posterior.likeliest(MODES) for posterior in (grid, refined)]
-    first = leading_cells(grid, 1)
-    best = index.poses(first)
-    ours = localizer.mode_refiner.refine(grid, Contact(touch.mask), 1).refined[int(first[0])].T[None]
+    best = index.poses(np.array([cell for cell, _ in grown(grid, 1)]))
     mask = cleaned(touch.mask, sensor)
+    ours = localizer.mode_refiner.refiners(index, thorough=False)[0].refine(make_problem(mask, sensor), best).T
     spread = Spread.of_grid(index.angle_step, index.resolution.step, index.approach)
     theirs = thesis_refinement(localizer.space, spread)(Seen(mask, make_problem(mask, sensor)), best[0]).T[None]
     return [best, ours, theirs, modes[1][:1], *poses, *modes]
