@@ -73,10 +73,10 @@ def _print(figures: Sequence[Mapping[str, Any]]) -> None:
         "touches",
         "scenes",
         "right",
-        "claimed",
+        "given",
         "log P(right)",
         "sure and wrong",
-        "foreign found",
+        "unknown detected",
         "false alarms",
     ]
     rows = [

@@ -11,8 +11,8 @@ from geomtact.report.canvas import coloured, png
 
 _LINES = {
     "right": "the right object is the most probable",
-    "foreign": "an object that is not among them is called unknown",
-    "alarmed": "one that is among them is called foreign",
+    "foreign": "an unknown object is detected",
+    "alarmed": "false alarm: it is among them",
 }
 
 
