@@ -12,8 +12,9 @@ from geomtact.inference.effort import Effort
 from geomtact.se3 import Array
 
 # Where the likeliest pose leaves more of each of several contacts unexplained (see ``Diagnostics``), the poses that were found
-# are not believed. Chosen on 22 simulated scenes.
-UNEXPLAINED_NATS = 8.0
+# are not believed, and poor agreement is reported. 2 of 26 simulated scenes with two and three sensors exceed it; with eight
+# contacts of a jaw, of which each alone fits its noise best, right poses leave 6 to 15.
+UNEXPLAINED_NATS = 20.0
 
 
 @dataclass(frozen=True)

@@ -45,9 +45,6 @@ _LEAST_CORRELATION = 0.1
 _NEGLIGIBLE_NATS = 25.0  # log density below that of the most probable place from which a place has no weight; hand-set
 _UNLIKELY_DENSITY = 0.1  # density relative to the uniform below which a place is transferred by one pose; hand-set
 _DISAGREES_NATS = -2.0  # support of the other sensors for an image below which a disagreement is reported; hand-set
-# Unexplained nats per contact above which poor agreement is reported of poses that are resolved: 2 of 26 scenes of the pin, the
-# connector plug and the head exceed it. Of others, those by which they are not.
-_UNEXPLAINED_NATS = 20.0
 _POINTS, _ROUGH_POINTS = 60, 20  # of an outline, at most, to register modes, and many poses; hand-set
 
 
@@ -193,8 +190,7 @@ def fused_posterior(
         assert extrinsics_std is not None
         posterior = replace(posterior, refined=_widened(posterior, np.stack(others), extrinsics_std))
     elif others and against is None:
-        most = _UNEXPLAINED_NATS if within else UNEXPLAINED_NATS
-        warnings = poor_agreement(posterior.diagnostics.unexplained_nats, most, prior is not None)
+        warnings = poor_agreement(posterior.diagnostics.unexplained_nats, UNEXPLAINED_NATS, prior is not None)
         posterior = replace(posterior, warnings=posterior.warnings + warnings)
     return posterior
 
