@@ -49,6 +49,7 @@ def test_it_says_more_than_its_cells(localizer, touch, posterior):
 
 def test_runs_that_agree_on_nothing_are_not_believed(localizer, touch, monkeypatch):
     monkeypatch.setattr(two_runs, "_AGREE", -np.inf)
+    monkeypatch.setattr(two_runs, "_AGREE_AT_LAST", -np.inf)
     found = localizer.localize(touch.mask, "mask", effort=EFFORT)
     assert found.explored is None and "not resolved within the grid's cells" in found.warnings[-1]
     cells = localizer.localize(touch.mask, "mask", effort=replace(EFFORT, contacts=0))

@@ -34,8 +34,8 @@ EVIDENCE_POWER = POWERS[3]
 # poses that are kept in the end, at least, which is as many as with several sensors, and at most; and contacts for each
 _POSES, _FOR_EACH = (300, 600), 20
 # nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
-# believed; hand-set
-_AGREE = 1.0
+# believed, while more contacts may be cut and in the last attempt: to leave a contact to the cells costs more; hand-set
+_AGREE, _AGREE_AT_LAST = 1.0, 2.0
 _MORE = 4  # times as many contacts are cut in each attempt after the first
 _LEFT_OUT = 3  # powers that an attempt may leave out, before the last
 _SHARPEST = 100, 40  # poses beside these from which modes may grow, of one sensor and of several
@@ -119,7 +119,7 @@ def _agreed(
             break
         run = replace(pooled(one, other, last, rng), contacts=cut)
         apart = np.abs(np.subtract(one.log_evidence, other.log_evidence))[_kept(one, last)]
-        if run.density.weights @ apart >= _AGREE * run.density.target.sensors:
+        if run.density.weights @ apart >= (_AGREE if least else _AGREE_AT_LAST) * run.density.target.sensors:
             continue
         found = _explored_from(run, _POSES[0] if several else int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
         further = _sharpest(one, other)
