@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from statistics import geometric_mean
 
+from tools.studies.choices.plot import means
 from tools.studies.common.study_file import inside
 from tools.studies.registration.shapes import SHAPES
 from tools.studies.track.plot import LABELS
@@ -70,16 +71,6 @@ def balls(content):
             yield cells(row + "{off_mm_largest:.2f} mm", camera * (k == 0), *told, **f)
 
 
-def of_variant(content, scene, name):
-    """Gain [nats], error of mode 1 [mm] and time [ms] of a variant in the mean over all objects, geometric but for the gain."""
-    each = [part["scenes"][scene]["figures"].get(name) for part in content["parts"].values()]
-    if None in each:
-        return None
-    gain = sum(f["gain_mean"] for f in each) / len(each)
-    mm, ms = (geometric_mean(f) for f in zip(*((f["mssd_mm_median"], f["ms_quantiles"][1]) for f in each), strict=True))
-    return gain, mm, ms
-
-
 VARIANTS = (
     "fast",
     "a quarter of the contacts",
@@ -93,11 +84,16 @@ VARIANTS = (
 
 
 def variants(content):
+    figures = [
+        (means(content, scene, "gain_mean"), means(content, scene, "mssd_mm_median"))
+        for scene in ("one touch", "three sensors")
+    ]
     for name in VARIANTS:
         row = [KEPT]
-        for scene in ("one touch", "three sensors"):
-            f = of_variant(content, scene, name)
-            row += ["", "", ""] if f is None else [f"{f[0]:.1f}", cut(f[1]), f"{f[2]:.0f}"]
+        for gains, errors in figures:
+            row += (
+                [f"{gains[name][1]:.1f}", cut(errors[name][1]), f"{gains[name][0]:.0f}"] if name in gains else [""] * 3
+            )
         yield row
 
 

@@ -182,8 +182,7 @@ def fused_posterior(
     if effort.several:
         search = refiner.searching(posterior.index, joint_problem(shown, T_first_sensor, _ROUGH_POINTS))
     posterior = resolve_touches(posterior, touches, prior, log_prior, effort, extrinsics_std, search)
-    within = posterior.explored is not None
-    if within and effort.modes:
+    if posterior.explored is not None and effort.modes:
         with timed(timing, "refine"):
             posterior = refiner.refine(posterior, joint_problem(shown, T_first_sensor), effort.modes, effort.thorough)
     if uncertain:

@@ -121,6 +121,7 @@ class ContactFilter:
     def meet(self, T: Array, sinks: Array, sigma: float) -> Meeting:
         """Filter the surface at poses ``T`` (k, 4, 4) with width ``sigma`` [m], the gel sunk by ``sinks`` (k, c) [m]."""
         problem, surface, k = self.problem, self.surface.at_scale(sigma), len(T)
+        voxels, far = surface.voxels, self.surface.far  # made once, not by each thread
         size, to_planes = 6 + problem.contacts, self.objective == "plane"
         fit = Fit(np.zeros((k, size, size)), np.zeros((k, size)), np.zeros(k), np.zeros(k), np.zeros(k, np.int64))
 
@@ -128,8 +129,8 @@ class ContactFilter:
             about = problem.centre, problem.length, T[part], sinks[part], sigma, self.neighbours
             found = fit.part(part)
             meet(
-                surface.voxels,
-                self.surface.far,
+                voxels,
+                far,
                 surface.turn,
                 self._outline,
                 *about,
@@ -146,13 +147,13 @@ class ContactFilter:
 
     def pull(self, T: Array, sigma: float, meeting: Meeting) -> None:
         """Add the membrane that is on the wrong side of the surface to the normal equations of ``meeting``."""
-        problem, surface = self.problem, self.surface.at_scale(sigma)
+        problem, voxels, far = self.problem, self.surface.at_scale(sigma).voxels, self.surface.far
         # all together weigh as much as the points
         each = problem.weight.sum() / max(len(problem.around), 1) / problem.middle_noise**2
 
         def some(part: slice) -> None:
             about = problem.centre, problem.length, T[part], sigma, meeting.information[part], meeting.slope[part]
-            pull(surface.voxels, self.surface.far, problem.around, problem.side, each, *about)
+            pull(voxels, far, problem.around, problem.side, each, *about)
 
         by_parts(some, len(T), _PART)
 

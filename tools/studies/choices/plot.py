@@ -42,12 +42,12 @@ def draw_costs(content: Mapping[str, Any]) -> bytes:
         shown = set()
         for column, scene in zip(grid.T, scenes, strict=True):
             for axes, (key, label, best) in zip(column, _PANELS, strict=True):
-                points = _means(content, scene, key)
+                points = means(content, scene, key)
                 shown |= {choices[name] for name in points}
                 named.append((axes, _draw(axes, points, {n: looks[choices[n]] for n in points}, best)))
                 axes.set_xlabel("time [ms]")
                 axes.set_ylabel(label)
-            column[0].set_title(_finding(scene, _means(content, scene, "gain_mean")), loc="left", fontsize=_FONT + 1)
+            column[0].set_title(_finding(scene, means(content, scene, "gain_mean")), loc="left", fontsize=_FONT + 1)
         handles = [
             figure.axes[0].plot([], [], shape, color=colour, label=choice)[0]
             for choice, (colour, shape) in looks.items()
@@ -98,7 +98,7 @@ def draw_ablations(content: Mapping[str, Any]) -> bytes:
         return png(figure)
 
 
-def _means(content: Mapping[str, Any], scene: str, key: str) -> dict[str, tuple[float, float]]:
+def means(content: Mapping[str, Any], scene: str, key: str) -> dict[str, tuple[float, float]]:
     """Time [ms] and a figure of each variant that all objects have, in the mean over them; errors and times are multiplied."""
     each = [part["scenes"][scene]["figures"] for part in content["parts"].values()]
     out = {}
