@@ -33,7 +33,6 @@ from geomtact.sensing.sensor import Sensor
 TOUCHES = 60  # that each score is fitted on; the laws are coarse enough for it
 POOR = ("l1", "hu", "fpfh")  # the thesis's pixel distance, and those that are blind to where a contact lies
 ONLY_BY_WEIGHTS = {"CosineScorer"}  # of a user's own trained network
-INNER = {"Product"}  # where "best" weighs several
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +88,7 @@ def test_every_score_is_reached_by_a_name(fit):
         inside = [getattr(each, name, None) for name in ("scorer", "scorers")]
         waiting += [one for some in inside for one in (some if isinstance(some, list | tuple) else [some]) if one]
     defined = {each.__name__ for each in implementations(geomtact.scoring, "score")}
-    assert defined - reached <= ONLY_BY_WEIGHTS | INNER
+    assert defined - reached <= ONLY_BY_WEIGHTS
 
 
 def test_a_score_has_the_grids_shape_is_finite_and_repeats(score, fit, index, touches):

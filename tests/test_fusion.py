@@ -17,7 +17,7 @@ from geomtact.contact_space.touches import random_touches
 from geomtact.errors import InputError, NoPoseAgreesError, UsageError
 from geomtact.evaluation import simultaneous_touches
 from geomtact.inference.distribution import cell_densities, cell_log_density
-from geomtact.inference.effort import Effort
+from geomtact.inference.effort import GRID_ALONE, Effort
 from geomtact.inference.extrinsics import extrinsics_covariance
 from geomtact.inference.fusion import _shares, disagreement, fuse, poor_agreement
 from geomtact.sensing.image_file import write_image
@@ -32,7 +32,7 @@ def world(touches, rng):
 
 
 def single(localizer, touch, T):
-    return localizer.localize(touch.mask, "mask", T_world_sensor=T, effort="fast")
+    return localizer.localize(touch.mask, "mask", T_world_sensor=T, effort=GRID_ALONE)
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_each_further_sensor_adds_information_about_the_true_pose(plug, scenes):
         some = touches[3 * i : 3 * i + 3]
         T, sensors = world(some, rng)
         for n in (1, 2, 3):
-            posterior = plug.localize([t.mask for t in some[:n]], "mask", None, sensors[:n], effort="fast", seed=i)
+            posterior = plug.localize([t.mask for t in some[:n]], "mask", None, sensors[:n], effort=GRID_ALONE, seed=i)
             assert posterior.frame == "world" and len(posterior.observations) == n
             assert np.exp(posterior.log_prob).sum() == pytest.approx(1, abs=1e-4)
             gains.append(posterior.log_density(T))
@@ -190,7 +190,7 @@ def test_a_sensor_without_contact_lowers_poses_that_would_touch_it(plug, rng):
     empty = np.zeros_like(touch.mask)
     alone = single(plug, touch, sensors[0])
     beside, away = (
-        plug.localize([touch.mask, empty], "mask", None, np.stack([sensors[0], other]), effort="fast")
+        plug.localize([touch.mask, empty], "mask", None, np.stack([sensors[0], other]), effort=GRID_ALONE)
         for other in (near, far)
     )
     before = cell_densities(alone)
@@ -226,7 +226,7 @@ def test_a_sensor_that_faces_away_does_not_constrain_poses_behind_it(plug, rng, 
     _, sensors = world([touch], rng)
     away = sensors[0] @ se3.transform(np.eye(3), [0, 0, -apart]) @ np.diag([1.0, -1.0, -1.0, 1.0])
     empty = np.zeros_like(touch.mask)
-    posterior = plug.localize([touch.mask, empty], "mask", None, np.stack([sensors[0], away]), effort="fast")
+    posterior = plug.localize([touch.mask, empty], "mask", None, np.stack([sensors[0], away]), effort=GRID_ALONE)
     alone = single(plug, touch, sensors[0])
     assert abs(cell_densities(posterior) - cell_densities(alone)).sum() < 1e-3 * cell_densities(alone).sum()
 
@@ -252,8 +252,8 @@ def test_sensors_without_contact_never_exclude_the_truth_for_a_later_one(plug, o
             sensors[i] = sensors[i] @ se3.transform(np.eye(3), [0, 0, -touches[i].penetration - 0.5e-3])
         before = plug.localize([empty, empty], "mask", None, sensors[order])
         assert not before.contact and np.isfinite(before.log_density(T))
-        posterior = plug.localize(touches[2].mask, "mask", None, sensors[2], prior=before, effort="fast")
-        alone = plug.localize(touches[2].mask, "mask", None, sensors[2], effort="fast")
+        posterior = plug.localize(touches[2].mask, "mask", None, sensors[2], prior=before, effort=GRID_ALONE)
+        alone = plug.localize(touches[2].mask, "mask", None, sensors[2], effort=GRID_ALONE)
         assert posterior.log_density(T) > alone.log_density(T) - 3
 
 
@@ -287,14 +287,14 @@ def test_a_prior_counts_once(plug, rng):
     touches = random_touches(plug.space, 2, 11)
     T, sensors = world(touches, rng)
     images = [t.mask for t in touches]
-    near = plug.localize(images, "mask", None, sensors, prior=(T[None], np.zeros(1)), effort="fast")
+    near = plug.localize(images, "mask", None, sensors, prior=(T[None], np.zeros(1)), effort=GRID_ALONE)
     assert (cell_densities(near) > 0).sum() == 1 and near.log_density(T) > 5
 
     def nearer(T):  # in the world, where the first sensor stands
         return -0.5 * (np.linalg.norm(T[:, :3, 3], axis=1) / 0.01) ** 2
 
-    plain = plug.localize(images, "mask", None, sensors, effort="fast")
-    graded = plug.localize(images, "mask", None, sensors, prior=nearer, effort="fast")
+    plain = plug.localize(images, "mask", None, sensors, effort=GRID_ALONE)
+    graded = plug.localize(images, "mask", None, sensors, prior=nearer, effort=GRID_ALONE)
     before = nearer(sensors[0] @ plug.index.poses(graded.cells))
     likely = np.flatnonzero(graded.log_prob > graded.log_prob.max() - 12)
     some = graded.cells[likely]
@@ -309,7 +309,7 @@ def test_the_posterior_of_one_sensor_is_a_prior_for_another(plug, rng):
         touches = random_touches(plug.space, 2, seed)
         T, sensors = world(touches, rng)
         before, alone = (single(plug, touch, at) for touch, at in zip(touches, sensors, strict=True))
-        after = plug.localize(touches[1].mask, "mask", None, sensors[1], prior=before, effort="fast")
+        after = plug.localize(touches[1].mask, "mask", None, sensors[1], prior=before, effort=GRID_ALONE)
         assert np.exp(after.log_prob).sum() == pytest.approx(1, abs=1e-4)
         gains.append([posterior.log_density(T) for posterior in (before, alone, after)])
     assert np.isfinite(gains).all()
@@ -321,14 +321,14 @@ def test_an_image_that_counts_twice_is_a_warning(plug, rng):
     touches = random_touches(plug.space, 2, 12)
     _, sensors = world(touches, rng)
     images = [touch.mask for touch in touches]
-    both = plug.localize(images, "mask", None, sensors, effort="fast")
+    both = plug.localize(images, "mask", None, sensors, effort=GRID_ALONE)
     assert not any("same" in warning for warning in both.warnings)
-    again = plug.localize([images[0], images[0]], "mask", None, sensors, effort="fast")
+    again = plug.localize([images[0], images[0]], "mask", None, sensors, effort=GRID_ALONE)
     assert any(warning.startswith("images 1 and 2 are the same") for warning in again.warnings)
-    once = plug.localize(images[0], "mask", None, sensors[0], effort="fast")
-    then = plug.localize(images[1], "mask", None, sensors[1], prior=once, effort="fast")
+    once = plug.localize(images[0], "mask", None, sensors[0], effort=GRID_ALONE)
+    then = plug.localize(images[1], "mask", None, sensors[1], prior=once, effort=GRID_ALONE)
     for prior in (once, then):  # what the prior's own prior was made from counts too
-        twice = plug.localize(images[0], "mask", None, sensors[0], prior=prior, effort="fast")
+        twice = plug.localize(images[0], "mask", None, sensors[0], prior=prior, effort=GRID_ALONE)
         assert any("counts twice" in warning for warning in twice.warnings)
     assert not any("counts twice" in warning for warning in then.warnings)
 
@@ -337,8 +337,8 @@ def test_a_repeated_touch_adds_hardly_any_evidence(plug):
     """Two sensors at one place show the same, so that together they are about as informative as one."""
     touch = random_touches(plug.space, 1, 13)[0]
     sensors = np.stack([np.eye(4), se3.transform(np.eye(3), [0, 0, 2e-6])])
-    once = plug.localize(touch.mask, "mask", effort="fast").log_evidence
-    twice = plug.localize([touch.mask] * 2, "mask", None, sensors, effort="fast").log_evidence
+    once = plug.localize(touch.mask, "mask", effort=GRID_ALONE).log_evidence
+    twice = plug.localize([touch.mask] * 2, "mask", None, sensors, effort=GRID_ALONE).log_evidence
     assert abs(twice - once) < 0.3 * abs(once)  # what is left is the share of a cell that touches the second sensor
 
 
@@ -381,7 +381,7 @@ def test_sensors_may_differ(make_localizer, plug, rng, scenes, max_poses, more):
     for i in range(scenes):
         touches = [random_touches(plug.space, 1, 20 + i)[0], random_touches(other.space, 1, 40 + i)[0]]
         T, sensors = world(touches, rng)
-        together = both.localize([t.mask for t in touches], "mask", None, sensors, effort="fast")
+        together = both.localize([t.mask for t in touches], "mask", None, sensors, effort=GRID_ALONE)
         assert together.sensor.name == "gelslim"
         gains.append(together.log_density(T) - single(plug, touches[0], sensors[0]).log_density(T))
     assert np.mean(gains) > more

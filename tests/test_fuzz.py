@@ -17,6 +17,7 @@ from geomtact import GeomtactError, Sensor, load_mesh
 from geomtact.cli.next_touch import read_actions
 from geomtact.cli.sensor_poses import read_sensor_poses
 from geomtact.inference import files
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.report.exchange import from_bop, from_tum
 from geomtact.scoring.encoder import load_weights
 from geomtact.sensing.image_file import ImageFile, read_image
@@ -146,7 +147,7 @@ def test_lists_within_lists_are_refused_however_deep(kind, tmp_path):
 def test_a_broken_posterior_is_refused_in_one_line(ball, a_touch, tmp_path, monkeypatch):
     """Where its poses would have to be simulated anew, that is not done here."""
     path = tmp_path / "posterior.npz"
-    ball.localize(a_touch(ball)[1], effort="fast").save(path)
+    ball.localize(a_touch(ball)[1], effort=GRID_ALONE).save(path)
     whole, rng = path.read_bytes(), np.random.default_rng(7)
     monkeypatch.setattr(files, "open_index", lambda *args, **options: ball.index)
     for number in range(150 * TIMES):

@@ -16,6 +16,7 @@ from geomtact.cli.several import objects_of
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import simultaneous_touches
 from geomtact.identification import _MISFIT_NATS, _MISSED, identify
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.inference.facts import Diagnostics
 from geomtact.sensing.image_file import write_image
 from geomtact.sensing.noise import MODERATE
@@ -53,7 +54,7 @@ def test_touches_are_identified_among_those_of_other_objects(drawer, n, errors):
     unlike = []
     for own in drawer:
         found = [
-            {c.name: c for c in identify(drawer, mask, kind="mask", effort="fast").candidates}
+            {c.name: c for c in identify(drawer, mask, kind="mask", effort=GRID_ALONE).candidates}
             for mask in touches(own, n)
         ]
         unlike += [each[own.mesh.name].is_outlier for each in found]
@@ -67,7 +68,7 @@ def test_touches_are_identified_among_those_of_other_objects(drawer, n, errors):
 
 def test_the_most_probable_comes_first_with_its_posterior(drawer):
     for own in drawer:
-        found = identify(drawer, touches(own)[0], kind="mask", effort="fast")
+        found = identify(drawer, touches(own)[0], kind="mask", effort=GRID_ALONE)
         probabilities = [c.probability for c in found.candidates]
         assert sum(probabilities) == pytest.approx(1) and probabilities == sorted(probabilities)[::-1]
         assert found.posterior.mesh is found.localizer.mesh and found.localizer.mesh.name == found.candidates[0].name
@@ -76,15 +77,15 @@ def test_the_most_probable_comes_first_with_its_posterior(drawer):
 def test_probabilities_are_evidence_times_weights(drawer):
     """The evidence of one contact's moments counts by a quarter, before the weights do."""
     mask = touches(drawer[1])[0]
-    alike = {c.name: c for c in identify(drawer, mask, kind="mask", effort="fast").candidates}
+    alike = {c.name: c for c in identify(drawer, mask, kind="mask", effort=GRID_ALONE).candidates}
     for name, candidate in alike.items():
         own = next(each for each in drawer if each.mesh.name == name)
-        assert candidate.log_evidence == own.localize(mask, "mask", effort="fast").log_evidence
+        assert candidate.log_evidence == own.localize(mask, "mask", effort=GRID_ALONE).log_evidence
     beyond = alike["ball"].log_evidence - alike["rod"].log_evidence
     assert alike["ball"].probability / alike["rod"].probability == pytest.approx(np.exp(beyond / 4))
     weights = (1.0, 2.0, 0.0)
     found = {
-        c.name: c.probability for c in identify(iter(drawer), mask, weights, kind="mask", effort="fast").candidates
+        c.name: c.probability for c in identify(iter(drawer), mask, weights, kind="mask", effort=GRID_ALONE).candidates
     }
     assert found["block"] == 0
     expected = 2 * alike["ball"].probability / alike["rod"].probability
@@ -120,16 +121,17 @@ def test_unlike_all_are_outliers_or_unexplained_touches_of_each_object(drawer, s
 def test_contacts_tell_objects_apart_that_moments_do_not(drawer):
     """By contacts the right one of three objects is the most probable in more of the same touches, and given more: the log of its
     probability is larger in the mean. None that explains them is ruled out."""
-    right, logs = {"fast": 0, "balanced": 0}, {"fast": [], "balanced": []}
+    efforts = {"moments": GRID_ALONE, "contacts": "balanced"}
+    right, logs = dict.fromkeys(efforts, 0), {name: [] for name in efforts}
     for own in drawer:
         for mask in touches(own, 6, seed=3):
-            for effort in right:
+            for by, effort in efforts.items():
                 found = identify(drawer, mask, kind="mask", effort=effort)
                 given = {each.name: each.probability for each in found.candidates}
-                right[effort] += found.candidates[0].name == own.mesh.name
-                logs[effort].append(np.log(given[own.mesh.name]))
+                right[by] += found.candidates[0].name == own.mesh.name
+                logs[by].append(np.log(given[own.mesh.name]))
             assert min(given.values()) >= _MISSED / 3 - 1e-12 and sum(given.values()) == pytest.approx(1)
-    assert right["balanced"] > right["fast"] and np.mean(logs["balanced"]) > np.mean(logs["fast"])
+    assert right["contacts"] > right["moments"] and np.mean(logs["contacts"]) > np.mean(logs["moments"])
 
 
 def test_the_evidence_of_contacts_does_not_depend_on_the_cells(drawer, make_localizer):
@@ -195,7 +197,7 @@ def test_three_noisy_touches_of_an_object_are_not_unlike_it(drawer, flat, scenes
 
 
 def test_no_contact_does_not_change_the_probabilities(drawer):
-    found = identify(drawer, np.zeros((320, 427), bool), kind="mask", effort="fast")
+    found = identify(drawer, np.zeros((320, 427), bool), kind="mask", effort=GRID_ALONE)
     assert not found.posterior.contact and not found.is_unknown
     assert [c.probability for c in found.candidates] == pytest.approx([1 / 3] * 3)
 
@@ -211,7 +213,7 @@ def test_an_object_without_a_possible_pose_has_no_probability(drawer, monkeypatc
         sensors = drawer[0].sensors
         localize = refuses
 
-    found = identify([Refusing(), drawer[1]], mask, kind="mask", effort="fast")
+    found = identify([Refusing(), drawer[1]], mask, kind="mask", effort=GRID_ALONE)
     assert found.localizer is drawer[1] and found.candidates[1].probability == 0 and found.candidates[1].is_outlier
     with pytest.raises(NoPoseAgreesError):
         identify([Refusing()], mask)
@@ -220,7 +222,7 @@ def test_an_object_without_a_possible_pose_has_no_probability(drawer, monkeypatc
 @pytest.mark.parametrize("weights", [(1.0,), (1.0, 1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (0.0, 0.0, 0.0), (np.nan, 1, 1)])
 def test_weights_that_do_not_fit_are_refused(drawer, weights):
     with pytest.raises(UsageError, match="identify: expected"):
-        identify(drawer, touches(drawer[0])[0], weights, kind="mask", effort="fast")
+        identify(drawer, touches(drawer[0])[0], weights, kind="mask", effort=GRID_ALONE)
     with pytest.raises(UsageError, match="identify: expected a localizer for each object, got int"):
         identify(3, None)
     with pytest.raises(UsageError, match="expected objects"):

@@ -17,7 +17,7 @@ from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.densities import GaussianPrior
-from geomtact.inference.effort import Effort
+from geomtact.inference.effort import GRID_ALONE, Effort
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_mass
 from geomtact.registration.contact_problem import SINK
@@ -92,11 +92,12 @@ def test_the_same_seed_gives_the_same_result(localizer, a_touch):
 
 def test_efforts_differ_in_resolution_and_in_refinement(curved, a_touch):
     T, mask = a_touch(curved)
-    fast, balanced, exact = (curved.localize(mask, effort=e) for e in ("fast", "balanced", "exact"))
-    assert len(fast.cells) == len(balanced.cells) == len(exact.cells) and fast.explored is None
-    for each in (balanced, exact):
-        assert each.explored is not None and each.information_gain_nats > fast.information_gain_nats + 1
-    assert balanced.explored.contacts < exact.explored.contacts
+    alone, fast, balanced, exact = (curved.localize(mask, effort=e) for e in (GRID_ALONE, "fast", "balanced", "exact"))
+    assert alone.explored is None
+    for each in (fast, balanced, exact):
+        assert len(each.cells) == len(alone.cells)
+        assert each.explored is not None and each.information_gain_nats > alone.information_gain_nats + 1
+    assert fast.explored.contacts < balanced.explored.contacts < exact.explored.contacts
     assert len(fast.refined) == 0 < len(balanced.refined) <= 5 <= len(exact.refined) <= 25
     refined = np.stack([found.T for found in balanced.refined.values()])
     before, after = (
@@ -175,7 +176,7 @@ def test_a_prior_multiplies_the_likelihood(plug, a_touch, rng):
     f = 4 * rng.normal(size=len(plug.index))
     f[rng.random(len(f)) < 0.2] = -np.inf
     chunks = iter(np.split(f, range(1 << 16, len(f), 1 << 16)))
-    posterior = plug.localize(mask, effort="fast", prior=lambda T: next(chunks))
+    posterior = plug.localize(mask, effort=GRID_ALONE, prior=lambda T: next(chunks))
     log_likelihood = plug.scorer.scorer.score(plug.index, mask) / plug.scorer.calibration.temperature
     prior = np.exp(plug.index.log_weight.astype(float) + f)
     prior /= prior.sum()
@@ -206,9 +207,11 @@ def test_a_posterior_as_prior_is_used_as_it_is(localizer, a_touch):
 def test_a_saved_posterior_is_as_good_a_prior(ball, a_touch, tmp_path, monkeypatch, cache_dir):
     monkeypatch.setenv("GEOMTACT_CACHE", str(cache_dir))
     mask = a_touch(ball)[1]
-    once = ball.localize(mask, effort="fast")
+    once = ball.localize(mask, effort=GRID_ALONE)
     once.save(tmp_path / "once.npz")
-    from_memory, from_disk = (ball.localize(mask, effort="fast", prior=p) for p in (once, str(tmp_path / "once.npz")))
+    from_memory, from_disk = (
+        ball.localize(mask, effort=GRID_ALONE, prior=p) for p in (once, str(tmp_path / "once.npz"))
+    )
     assert from_disk.log_prob == pytest.approx(from_memory.log_prob, abs=1e-3)
 
 
@@ -217,15 +220,15 @@ def test_weighted_poses_as_prior_gather_the_mass(localizer, a_touch, uniform_pos
     others = uniform_poses(localizer)[0][:9]
     poses = np.concatenate([T_true[None], others])
     log_weights_ = np.log(np.r_[0.5, np.full(9, 0.5 / 9)])
-    posterior = localizer.localize(mask, prior=(poses, log_weights_), effort="fast")
+    posterior = localizer.localize(mask, prior=(poses, log_weights_), effort=GRID_ALONE)
     assert len(posterior.cells) <= 10
-    assert posterior.log_density(T_true) > localizer.localize(mask, effort="fast").log_density(T_true)
+    assert posterior.log_density(T_true) > localizer.localize(mask, effort=GRID_ALONE).log_density(T_true)
     radius = mode_radius(localizer.mesh)
     distance = PoseDistance(localizer.mesh, 128)
     own = localizer.index.poses(posterior.cells)
     assert len(own) == len(posterior.poses)
     # the weights are masses: doubling all of them changes nothing
-    again = localizer.localize(mask, prior=(poses, log_weights_ + 1), effort="fast")
+    again = localizer.localize(mask, prior=(poses, log_weights_ + 1), effort=GRID_ALONE)
     assert again.log_prob == pytest.approx(posterior.log_prob, abs=1e-5)
     best = posterior.modes(1)[0]
     assert distance.mean(best.T, own).min() <= radius
@@ -298,7 +301,7 @@ def test_an_impossible_prior_is_refused_and_a_contradicted_one_is_mostly_a_warni
     warned = np.zeros((len(ranks), len(ranks)), bool)
     for i, j in np.ndindex(warned.shape):
         prior = GaussianPrior(T[some[i]], covariance)
-        warnings = plug.localize(masks[some[j]], "mask", prior=prior, effort="fast").warnings
+        warnings = plug.localize(masks[some[j]], "mask", prior=prior, effort=GRID_ALONE).warnings
         warned[i, j] = any("contradict each other" in warning for warning in warnings)
     assert not warned.diagonal().any() and warned.sum() >= len(ranks) * (len(ranks) - 1) / 3
     # at a metre, and that many standard deviations of 10 mm away from the sensor, beside which a cell is narrow
@@ -309,7 +312,7 @@ def test_an_impossible_prior_is_refused_and_a_contradicted_one_is_mostly_a_warni
             InputError, match="no pose that touches the sensor lies within about 8 of its standard deviations"
         ):
             plug.localize(masks[0], "mask", prior=away)
-    assert plug.localize(masks[0], "mask", prior=near, effort="fast").contact
+    assert plug.localize(masks[0], "mask", prior=near, effort=GRID_ALONE).contact
 
 
 @pytest.mark.parametrize("width", [0.3, 0.8, 2.0, 6.0])
@@ -334,7 +337,7 @@ def test_a_matrix_that_is_no_covariance_is_refused(covariance):
 def test_poses_that_do_not_touch_carry_no_prior(ball, a_touch):
     T, mask = a_touch(ball)
     away = T + np.array([[0] * 4, [0] * 4, [0, 0, 0, 1.0], [0] * 4])
-    posterior = ball.localize(mask, prior=(np.stack([T, away]), [0.0, 50.0]), effort="fast")
+    posterior = ball.localize(mask, prior=(np.stack([T, away]), [0.0, 50.0]), effort=GRID_ALONE)
     assert len(posterior.cells) == 1 and np.isfinite(posterior.log_density(T))
     with pytest.raises(InputError, match="none of its poses touches the sensor"):
         ball.localize(mask, prior=(away[None], [0.0]))
@@ -342,16 +345,16 @@ def test_poses_that_do_not_touch_carry_no_prior(ball, a_touch):
 
 def test_a_prior_in_the_world_frame_is_the_same_prior(plug, a_touch):
     T_true, mask = a_touch(plug)
-    here = plug.localize(mask, prior=lambda T: -1e4 * ((T - T_true)[:, :3, 3] ** 2).sum(1), effort="fast")
+    here = plug.localize(mask, prior=lambda T: -1e4 * ((T - T_true)[:, :3, 3] ** 2).sum(1), effort=GRID_ALONE)
     there = plug.localize(
         mask,
         T_world_sensor=T_WORLD,
         prior=lambda T: -1e4 * ((np.linalg.inv(T_WORLD) @ T - T_true)[:, :3, 3] ** 2).sum(1),
-        effort="fast",
+        effort=GRID_ALONE,
     )
     assert there.log_prob == pytest.approx(here.log_prob, abs=1e-3)
     pair = (np.stack([T_WORLD @ T_true]), [0.0])
-    only = plug.localize(mask, T_world_sensor=T_WORLD, prior=pair, effort="fast")
+    only = plug.localize(mask, T_world_sensor=T_WORLD, prior=pair, effort=GRID_ALONE)
     assert np.isfinite(only.log_density(T_WORLD @ T_true)) and len(only.cells) == 1
 
 
@@ -361,9 +364,9 @@ def test_a_posterior_of_another_touch_in_the_world_is_a_prior(ball):
     first = ball_in_world @ np.linalg.inv(transform(np.eye(3), [2 * MM, 1 * MM, 5 * MM]))
     second = ball_in_world @ np.linalg.inv(transform(np.eye(3), [-3 * MM, 2 * MM, 5.3 * MM]))
     mask_1, mask_2 = (pressed(ball, np.linalg.inv(T) @ ball_in_world) for T in (first, second))
-    prior = ball.localize(mask_1, T_world_sensor=first, effort="fast")
-    alone = ball.localize(mask_2, T_world_sensor=second, effort="fast")
-    both = ball.localize(mask_2, T_world_sensor=second, prior=prior, effort="fast")
+    prior = ball.localize(mask_1, T_world_sensor=first, effort=GRID_ALONE)
+    alone = ball.localize(mask_2, T_world_sensor=second, effort=GRID_ALONE)
+    both = ball.localize(mask_2, T_world_sensor=second, prior=prior, effort=GRID_ALONE)
     assert both.frame == "world"
     assert both.log_density(ball_in_world) > alone.log_density(ball_in_world)
     assert both.entropy_nats < alone.entropy_nats - 0.2
@@ -393,18 +396,18 @@ def test_a_mode_is_a_prior(localizer, a_touch):
     """Of a ball as well, whose turns are unobservable."""
     mode = localizer.localize(a_touch(localizer)[1]).modes(1)[0]
     prior = GaussianPrior(mode.T, mode.covariance)
-    assert localizer.localize(a_touch(localizer)[1], prior=prior, effort="fast").log_density(mode.T) > 0
+    assert localizer.localize(a_touch(localizer)[1], prior=prior, effort=GRID_ALONE).log_density(mode.T) > 0
 
 
 def test_a_prior_of_another_object_or_frame_is_refused(ball, flat_nut, a_touch):
     mask = a_touch(ball)[1]
-    other = flat_nut.localize(a_touch(flat_nut)[1], effort="fast")
+    other = flat_nut.localize(a_touch(flat_nut)[1], effort=GRID_ALONE)
     with pytest.raises(InputError, match="it is for the object 'hex_nut', not for 'ball'"):
         ball.localize(mask, prior=other)
-    world = ball.localize(mask, T_world_sensor=T_WORLD, effort="fast")
+    world = ball.localize(mask, T_world_sensor=T_WORLD, effort=GRID_ALONE)
     with pytest.raises(InputError, match="its frame is 'world' but this posterior's is 'sensor'"):
         ball.localize(mask, prior=world)
-    held = ball.localize(mask, effort="fast")
+    held = ball.localize(mask, effort=GRID_ALONE)
     elsewhere = replace(
         held, index=replace(held.index, sensor=replace(ball.sensor, camera_distance=0.03, name="other"))
     )
@@ -429,7 +432,7 @@ def test_a_prior_of_another_object_or_frame_is_refused(ball, flat_nut, a_touch):
 
 def test_off_the_approach_the_density_is_minus_infinity(cone, flat_nut, uniform_poses, a_touch):
     for localizer in (cone, flat_nut):
-        posterior = localizer.localize(a_touch(localizer)[1], effort="fast")
+        posterior = localizer.localize(a_touch(localizer)[1], effort=GRID_ALONE)
         T, depth = uniform_poses(localizer)
         T, depth = T[:40], depth[:40]
         tilted = T @ exp([0.9, 0.4, 0, 0, 0, 0])
@@ -445,7 +448,7 @@ def test_off_the_approach_the_density_is_minus_infinity(cone, flat_nut, uniform_
 
 
 def test_an_exact_face_holds_to_a_millionth_of_a_radian(flat_nut, uniform_poses, a_touch):
-    posterior = flat_nut.localize(a_touch(flat_nut)[1], effort="fast")
+    posterior = flat_nut.localize(a_touch(flat_nut)[1], effort=GRID_ALONE)
     T, depth = uniform_poses(flat_nut)
     middle = (depth > 0.2 * MM) & (depth < 1.8 * MM)
     for tilt, inside in ((5e-7, True), (5e-6, False)):
@@ -492,7 +495,7 @@ def test_the_order_of_vertices_and_faces_does_not_matter(make_localizer, rng):
     assert a.index.key != b.index.key
     T = a.space.sample(3, np.random.default_rng(0), (0.5 * MM, 1 * MM))[0]
     for pose in T:
-        pa, pb = (localizer.localize(a.simulate(pose).mask, effort="fast") for localizer in (a, b))
+        pa, pb = (localizer.localize(a.simulate(pose).mask, effort=GRID_ALONE) for localizer in (a, b))
         assert pb.log_density(pose) == pytest.approx(pa.log_density(pose), abs=0.05)
 
 
@@ -505,7 +508,7 @@ def test_probabilities_come_true(plug, n):
     touches = random_touches(plug.space, n, seed=77)
     gain, level = [], []
     for touch in touches:
-        posterior = plug.localize(touch.mask, effort="fast")
+        posterior = plug.localize(touch.mask, effort=GRID_ALONE)
         gain.append(posterior.log_density(touch.T_sensor_object))
         level.append(posterior.credible_level(touch.T_sensor_object))
     assert np.isfinite(gain).all() and np.mean(gain) > 0
@@ -548,7 +551,7 @@ def test_a_prior_about_any_symmetric_image_is_the_same_prior(name, request, a_to
             angle = Rotation.from_matrix(np.swapaxes(T[:, :3, :3], 1, 2) @ about[:3, :3]).magnitude()
             return -0.5 * (angle / 0.4) ** 2 - 0.5 * (((T - about)[:, :3, 3] / (4 * MM)) ** 2).sum(1)
 
-        posterior = localizer.localize(mask, prior=near, effort="fast")
+        posterior = localizer.localize(mask, prior=near, effort=GRID_ALONE)
         seen.append((posterior.log_density(T_true), posterior.log_evidence, posterior.entropy_nats))
     assert len(seen) >= 6
     assert np.ptp(np.array(seen), axis=0).max() < 1e-3
@@ -560,7 +563,7 @@ def test_a_constant_in_the_prior_means_nothing_and_a_small_density_is_not_none(p
     def sharp(T):
         return -0.5 * (((T - T_true)[:, :3, 3] / (0.3 * MM)) ** 2).sum(1)
 
-    posteriors = [plug.localize(mask, prior=lambda T, c=c: sharp(T) + c, effort="fast") for c in (0.0, 1e8)]
+    posteriors = [plug.localize(mask, prior=lambda T, c=c: sharp(T) + c, effort=GRID_ALONE) for c in (0.0, 1e8)]
     assert posteriors[1].log_prob == pytest.approx(posteriors[0].log_prob, rel=1e-5, abs=1e-3)
     T = uniform_poses(plug)[0]
     assert sharp(plug.index.poses()).min() < -1000

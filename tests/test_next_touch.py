@@ -15,6 +15,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.errors import GeomtactError, InputError, PoseError, UsageError
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.planning.actions import Probe, Touch
 from geomtact.planning.draws import draw_places
 from geomtact.planning.grid import grid_of_touches
@@ -71,7 +72,7 @@ def block():
 
 @pytest.fixture(scope="module")
 def posterior(a_touch, plug):
-    return plug.localize(a_touch(plug)[1], effort="fast")
+    return plug.localize(a_touch(plug)[1], effort=GRID_ALONE)
 
 
 def above(x_mm, y_mm=0.0, z_mm=50.0, travel=0.1):
@@ -284,7 +285,7 @@ def test_ties_keep_the_order_given(posterior):
 
 def test_the_choice_does_not_depend_on_the_frame(plug, a_touch, posterior):
     """The world moved together with all actions changes nothing."""
-    world = plug.localize(a_touch(plug)[1], T_world_sensor=T_MOVED, effort="fast")
+    world = plug.localize(a_touch(plug)[1], T_world_sensor=T_MOVED, effort=GRID_ALONE)
     touches = grid_of_touches(posterior)[:4]
     moved = [Touch(T_MOVED @ t.T_world_sensor, t.travel) for t in touches]
     here, there = next_touch(posterior, touches, n=32), next_touch(world, moved, n=32)
@@ -319,7 +320,7 @@ def test_touches_start_clear_of_the_object_and_meet_it(plug, posterior):
 
 
 def test_touches_keep_to_the_approach(flat_nut, a_touch):
-    posterior = flat_nut.localize(a_touch(flat_nut)[1], T_world_sensor=T_MOVED, effort="fast")
+    posterior = flat_nut.localize(a_touch(flat_nut)[1], T_world_sensor=T_MOVED, effort=GRID_ALONE)
     touches = grid_of_touches(posterior)
     assert touches
     for touch in touches:

@@ -13,6 +13,7 @@ from speed import slow_but
 from geomtact import GaussianPrior
 from geomtact.contact_space import store
 from geomtact.errors import CacheError, InputError
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.scoring.probability import Calibration
 from geomtact.se3 import transform
 
@@ -62,7 +63,7 @@ def test_a_pickle_refers_to_the_cache_which_a_process_reads_once(flat_nut, a_tou
     stored = flat_nut.index.bits.nbytes + flat_nut.index.moments.nbytes
     assert len(text) < 0.5 * stored
     assert pickle.loads(text) is pickle.loads(text)
-    posterior = flat_nut.localize(a_touch(flat_nut)[1], effort="fast")
+    posterior = flat_nut.localize(a_touch(flat_nut)[1], effort=GRID_ALONE)
     _ = posterior.poses, posterior.entropy_nats
     assert len(pickle.dumps(posterior)) < 0.5 * stored
     assert pickle.loads(pickle.dumps(posterior)).index is pickle.loads(text).index
@@ -107,7 +108,7 @@ def test_a_missing_or_different_cache_is_one_line(make_localizer, flat_nut, cach
     elsewhere = make_localizer("hex_nut", "gelsight-mini", approach=[((0, 0, 1), 0.0)], cache_dir=tmp_path)
     text = pickle.dumps(elsewhere)
     other = replace(elsewhere, scorer=replace(elsewhere.scorer, calibration=Calibration(1.0, 0.5, 0.0)))
-    with pytest.raises(CacheError, match="its score 'best' is not the one that was pickled; prepare") as caught:
+    with pytest.raises(CacheError, match="its score 'encoder' is not the one that was pickled; prepare") as caught:
         pickle.loads(pickle.dumps(other))
     assert "\n" not in str(caught.value)
     shutil.rmtree(tmp_path / flat_nut.index.key)
@@ -132,5 +133,5 @@ def test_a_prior_is_pickled_where_possible_and_else_the_error_is_one_line(flat_n
         pickle.dumps(unnamed)
     assert "\n" not in str(caught.value)
     assert copy.deepcopy(unnamed).log_density(away) == unnamed.log_density(away)
-    touched = flat_nut.localize(mask, prior=lambda T: -T[:, 2, 3], effort="fast")
+    touched = flat_nut.localize(mask, prior=lambda T: -T[:, 2, 3], effort=GRID_ALONE)
     check_same(touched, pickle.loads(pickle.dumps(touched)))

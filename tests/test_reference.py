@@ -15,6 +15,7 @@ from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.mesh_file import load_mesh
 from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.distribution import Refined
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.inference.modes import carried, grown
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.reference import Reference
@@ -104,7 +105,7 @@ def test_modes_are_the_images_nearest_to_a_prior(name, request, a_touch, rng):
     forms = forms_of_prior(T)
     del forms["Gaussian"]  # which takes seconds; it is tried before the disk
     for prior in forms.values():
-        posterior = localizer.localize(mask, T_world_sensor=T_WORLD, prior=prior, effort="fast")
+        posterior = localizer.localize(mask, T_world_sensor=T_WORLD, prior=prior, effort=GRID_ALONE)
         plain = replace(posterior, reference=None)
         allowed = None if localizer.space.cones is None else lambda T: localizer.space.approaches(inverse(T_WORLD) @ T)
         for mode, own in zip(posterior.modes(2), plain.modes(2), strict=True):
@@ -131,7 +132,7 @@ def test_a_posterior_as_prior_hands_its_image_on_by_disk_too(name, request, a_to
         assert np.array_equal(a.T, b.T) and np.array_equal(a.covariance, b.covariance)
         assert np.array_equal(a.observable, b.observable)
     for prior in (first, tmp_path / "first.npz"):
-        second = localizer.localize(mask, prior=prior, effort="fast")
+        second = localizer.localize(mask, prior=prior, effort=GRID_ALONE)
         for mode in second.modes(3):
             check_nearest(localizer.mesh, mode.T, first.modes(1)[0].T, localizer.space.approaches)
 
@@ -199,7 +200,7 @@ def test_the_poses_with_more_mass_choose_the_image(flat_nut, a_touch):
         (np.tile(many, (100, 1, 1)), np.zeros(2000), second),
         (many, np.r_[np.full(9, -5.0), np.full(11, -np.inf)], first),
     ):
-        mode = flat_nut.localize(mask, prior=(poses, log_mass), effort="fast").modes(1)[0]
+        mode = flat_nut.localize(mask, prior=(poses, log_mass), effort=GRID_ALONE).modes(1)[0]
         check_nearest(flat_nut.mesh, mode.T, expected, flat_nut.space.approaches)
 
 
@@ -220,7 +221,7 @@ def test_a_track_does_not_jump_between_images(name, request):
     localizer: Localizer = request.getfixturevalue(name)
     masks = random_trajectory(localizer.space, 4, 3).masks
     before = None
-    for posterior in localizer.track([*masks[:3], np.zeros_like(masks[0]), masks[3]], T_WORLD, effort="fast"):
+    for posterior in localizer.track([*masks[:3], np.zeros_like(masks[0]), masks[3]], T_WORLD, effort=GRID_ALONE):
         modes = posterior.modes(2)
         assert bool(modes) == posterior.contact
         for mode in modes:
@@ -236,10 +237,10 @@ def test_a_track_begins_at_the_image_of_its_prior(flat_nut, form, rng):
     T = an_image(flat_nut, trajectory.T_sensor_object[0], rng)
     prior = forms_of_prior(T).get(form)
     if form == "posterior":
-        prior = flat_nut.localize(trajectory.masks[0], prior=GaussianPrior(T, np.diag(STD**2)), effort="fast")
+        prior = flat_nut.localize(trajectory.masks[0], prior=GaussianPrior(T, np.diag(STD**2)), effort=GRID_ALONE)
         T = prior.modes(1)[0].T
     masks = [np.zeros_like(trajectory.masks[0]), *trajectory.masks]
-    _, first, *rest = flat_nut.track(masks, prior=prior, effort="fast")
+    _, first, *rest = flat_nut.track(masks, prior=prior, effort=GRID_ALONE)
     check_nearest(flat_nut.mesh, first.modes(1)[0].T, T, flat_nut.space.approaches)
     for posterior in rest:  # less than the sixth of a turn after which the nut looks the same
         turned = Rotation.from_matrix(posterior.modes(1)[0].T[:3, :3].T @ T[:3, :3]).magnitude()
@@ -255,15 +256,15 @@ def test_several_sensors_report_the_image_of_the_prior(pin, rng):
     prior = GaussianPrior(image, np.diag(STD**2))
     away = transform(np.eye(3), [0, 0, -0.3])
     posterior = pin.localize(
-        [mask, np.zeros_like(mask)], T_world_sensor=[T_WORLD, T_WORLD @ away], prior=prior, effort="fast"
+        [mask, np.zeros_like(mask)], T_world_sensor=[T_WORLD, T_WORLD @ away], prior=prior, effort=GRID_ALONE
     )
     check_nearest(pin.mesh, posterior.modes(1)[0].T, image)
 
 
 def test_without_symmetry_or_prior_nothing_is_turned(plug, flat_nut, a_touch):
     T, mask = a_touch(plug)
-    assert plug.localize(mask, prior=GaussianPrior(T, np.diag(STD**2)), effort="fast").reference is None
-    posterior = flat_nut.localize(a_touch(flat_nut)[1], effort="fast")
+    assert plug.localize(mask, prior=GaussianPrior(T, np.diag(STD**2)), effort=GRID_ALONE).reference is None
+    posterior = flat_nut.localize(a_touch(flat_nut)[1], effort=GRID_ALONE)
     assert posterior.reference is None
     heart = posterior.index.poses(np.array([cell for cell, _ in grown(posterior, 1)]))
     assert np.array_equal(posterior.modes(1)[0].T, heart[0])

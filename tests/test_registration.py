@@ -10,6 +10,7 @@ from refining import SENSOR, SHIFT, TURN, facing_down, is_sound, off, scene, ste
 import geomtact.registration
 from geomtact import se3
 from geomtact.errors import MeshError, PoseError
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.inference.modes import grown
 from geomtact.registration.contact_problem import make_problem
 from geomtact.registration.filterreg import FilterReg
@@ -206,9 +207,9 @@ def test_specks_have_no_rim_and_a_curved_membrane_lifts_it():
 @pytest.mark.slow
 def test_open3d_repeats_itself_to_the_last_digit(pin, a_touch):
     """Its sums run over threads, and a weakly constrained rim turns another order of adding into another pose."""
-    mask = pin.localize(a_touch(pin)[1], effort="fast").observation.contact.mask
+    mask = pin.localize(a_touch(pin)[1], effort=GRID_ALONE).observation.contact.mask
     problem = make_problem(mask, pin.sensor)
-    starts = pin.index.poses(np.array([cell for cell, _ in grown(pin.localize(a_touch(pin)[1], effort="fast"), 3)]))
+    starts = pin.index.poses(np.array([cell for cell, _ in grown(pin.localize(a_touch(pin)[1], effort=GRID_ALONE), 3)]))
     icp = next(r for r in pin.mode_refiner.refiners(pin.index, True) if r.name == "icp")
     first = icp.refine(problem, starts).T
     assert all((first == icp.refine(problem, starts).T).all() for _ in range(15))

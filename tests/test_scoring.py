@@ -345,7 +345,7 @@ def test_a_damaged_fit_is_made_anew(ball, tmp_path, monkeypatch, damage):
     monkeypatch.setattr("geomtact.scoring.fitted.TOUCHES", 50)
     (tmp_path / "iou.json").write_text(damage)
     assert fitted_scorer("iou", ball.index, tmp_path).scorer.name == "iou"
-    assert json.loads((tmp_path / "iou.json").read_text())["weights"] == {"iou": 1.0}
+    assert set(json.loads((tmp_path / "iou.json").read_text())["calibration"]) == {"temperature", "floor", "gain"}
 
 
 def test_an_unknown_score_names_the_nearest(ball):
@@ -364,7 +364,7 @@ def test_an_object_whose_touches_are_all_equal_is_refused(make_localizer, monkey
     ) as error:
         make_localizer(slab, "gelsight-mini", approach=[((0, 0, 1), 0.0)], max_poses=5_000, cache_dir=tmp_path)
     assert "a larger window" in str(error.value) and "\n" not in str(error.value)
-    assert not list(tmp_path.glob("*/best*.json"))
+    assert not list(tmp_path.glob("*/encoder*.json"))
 
 
 # --- probabilities in a mask's stead

@@ -21,6 +21,7 @@ from geomtact.errors import ImageError, InputError, UsageError
 from geomtact.geometry.distance import PoseDistance
 from geomtact.inference.densities import GaussianPrior
 from geomtact.inference.distribution import cell_log_density
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.inference.motion import GaussianTwist, UniformBall
 from geomtact.inference.motion_kernel import Mixture, MotionKernel
 from geomtact.sensing.image_file import ImageFile, write_image
@@ -33,11 +34,11 @@ KINDS = ("pin", "ball", "cone", "flat_nut")  # an axis, a sphere, cones of appro
 
 
 def track(localizer, frames, *args, **options):
-    return localizer.track(frames, *args, **({"effort": "fast"} | options))
+    return localizer.track(frames, *args, **({"effort": GRID_ALONE} | options))
 
 
 def alone(localizer, mask):
-    return localizer.localize(mask, effort="fast")
+    return localizer.localize(mask, effort=GRID_ALONE)
 
 
 def weights(index):

@@ -16,6 +16,7 @@ from geomtact.contact_space.space import ContactSpace
 from geomtact.contact_space.touches import penetrations
 from geomtact.errors import NoPoseAgreesError
 from geomtact.evaluation import simultaneous_touches
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.json_values import plain
 from geomtact.se3 import inverse
 from geomtact.sensing.noise import CLEAN, MODERATE
@@ -56,7 +57,7 @@ def test_the_first_level_of_each_perturbation_is_the_localizers_own_world(here):
 
 def test_outside_the_contact_pose_space_the_error_is_that_of_the_pose_itself(plug, a_touch):
     T, mask = a_touch(plug)
-    posterior = plug.localize(mask, "mask", effort="fast")
+    posterior = plug.localize(mask, "mask", effort=GRID_ALONE)
     deeper = T.copy()
     deeper[2, 3] -= 3 * MM
     answer, at_home = judged(plug.mesh, deeper, posterior, T), judged(plug.mesh, T, posterior)
@@ -76,7 +77,7 @@ def test_a_sequence_is_evaluated_at_its_last_frame(flat_nut, monkeypatch):
     answers = list(stability.swept(flat_nut, SWEEPS["slips"], 1, 2, 3, "fast"))
     for number, answer in enumerate(answers):
         made = random_trajectory(flat_nut.space, 8, 3000 + number, 2 * MM, slips=(4,), elastic=number % 2 == 1)
-        frames = list(flat_nut.track(made.masks, effort="fast", kind="mask", seed=3))
+        frames = list(flat_nut.track(made.masks, effort=GRID_ALONE, kind="mask", seed=3))
         slipped = any("possible slip" in warning for frame in frames for warning in frame.warnings)
         assert answer == replace(judged(flat_nut.mesh, made.T_sensor_object[-1], frames[-1]), warned=slipped)
     assert any(answer.warned for answer in answers)
@@ -206,7 +207,7 @@ def test_the_outline_cut_off_is_counted_in_pixel_edges():
 def test_an_unperturbed_world_gives_the_localizers_own_posteriors(plug, here):
     answers = list(stability.swept(plug, SWEEPS["size"], 0, 2, 5, "fast"))
     for answer, (T, mask) in zip(answers, worlds.touches(here, 2, 5), strict=True):
-        assert answer == judged(plug.mesh, T, plug.localize(mask, "mask", effort="fast", seed=5))
+        assert answer == judged(plug.mesh, T, plug.localize(mask, "mask", effort=GRID_ALONE, seed=5))
         assert np.isfinite(answer.gain)
 
 
@@ -331,7 +332,7 @@ def test_a_stopped_study_goes_on_and_its_picture_comes_from_the_file_alone(comma
 def test_the_records_of_all_objects_are_pooled():
     one, other = Answer(1.23456, 1.0, 0.3, 1.0, 0.9, False), REFUSED
 
-    def part(*answers, effort="fast"):
+    def part(*answers, effort=GRID_ALONE):
         settings = dict.fromkeys(evaluate_stability._ALIKE) | {"effort": effort}
         level = {"level": 2, "figures": stability.summarise(answers), "answers": evaluate_stability._columns(answers)}
         sweeps = {"specks": {"title": "specks", "inside": [2], "levels": [plain(level)]}}

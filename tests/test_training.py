@@ -12,6 +12,7 @@ from safetensors.numpy import load_file, save_file
 from geomtact.contact_space.touch import LEAST_CONTACT
 from geomtact.errors import GeomtactError, InputError
 from geomtact.geometry.mesh_file import load_mesh
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.scoring import precision
 from geomtact.scoring.catalogue import descriptor_of
 from geomtact.scoring.contact_features import BASIS, SHAPE, moment_features
@@ -297,7 +298,7 @@ def test_a_localizer_takes_the_path_of_weights(make_localizer, weights, tmp_path
     assert localizer.scorer.scorer.stored.shape == (len(localizer.index), 8)
     mask = np.zeros((240, 320), bool)
     mask[100:140, 150:190] = True
-    posterior = localizer.localize(mask, kind="mask", effort="fast")
+    posterior = localizer.localize(mask, kind="mask", effort=GRID_ALONE)
     assert np.exp(posterior.log_prob).sum() == pytest.approx(1, abs=1e-5)
     assert posterior.provenance.scorer == path
 

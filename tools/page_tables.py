@@ -72,13 +72,14 @@ def balls(content):
 
 
 VARIANTS = (
+    "the grid alone",
     "fast",
-    "a quarter of the contacts",
     "balanced",
     "exact",
     "no mode refined",
     "75k poses",
-    "cosine, fast",
+    "1.2M poses",
+    "the grid alone, cosine",
     "depth map",
 )
 

@@ -38,7 +38,7 @@ MaxPoses = Annotated[
     typer.Option(
         "--max-poses",
         min=1000,
-        help="Number of poses in the contact index, 1.2 million by default. Fewer is faster but coarser. "
+        help="Number of poses in the contact index, 300,000 by default. Fewer is faster but coarser. "
         "Flat faces raise the count by up to 75 %.",
         show_default=False,
     ),

@@ -8,7 +8,7 @@ place at one penetration. Every array is laid out penetration by penetration, so
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -308,22 +308,6 @@ class Index:
         """A few rotations (k, M, 3, 3) drawn within the cell of every rotation of the grid; always the same ones."""
         rng, every = np.random.default_rng(0), np.arange(len(self.rotations))
         return np.stack([self.directions.draw(every, rng) for _ in range(_TURNED)])
-
-    def at_places(self, places: NDArray[np.int64]) -> Index:
-        """What is stored of some places (m,) alone, for scores; without a grid to look poses up in."""
-        moments = self.moments.reshape(-1, *self.height.shape)[:, :, places]
-        return replace(
-            self,
-            rotation=self.rotation[places],
-            shift=self.shift[places],
-            height=self.height[:, places],
-            weight=self.weight[:, places],
-            deflated=deflate(self.bits[:, :, places]),
-            area=self.area[:, places],
-            moments=moments.reshape(len(moments), -1),
-            table=np.zeros((0, 0, 0), np.int32),
-            folder=None,
-        )
 
     @cached_property
     def drawn_moments(self) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ from geomtact.geometry.symmetry import Symmetry
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
 
-MAX_POSES = 1_200_000  # by default
+MAX_POSES = 300_000  # by default
 LEVELS = (1, 2, 3, 4)
 PIXELS_PER_MASK_PIXEL = 3  # of the height maps, along each side
 _BYTES_FOR_FINE_MASKS = 120e6

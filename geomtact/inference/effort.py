@@ -35,8 +35,9 @@ class Effort:
                 raise UsageError(f"Effort: expected 0 contacts or more, got {contacts}; give 0 for none")
 
 
+GRID_ALONE = Effort(0)  # for studies, and for what lives on the cells of the grid
 EFFORTS = {
-    "fast": Effort(0),
+    "fast": Effort(0, 10_000, several=10_000),
     "balanced": Effort(5, 160_000, thorough=False, several=40_000),
     "exact": Effort(25, 640_000, several=160_000),
 }

@@ -15,9 +15,8 @@ from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import Descriptor, VectorScorer
 
 PIXELWISE: dict[str, Scorer] = {**OVERLAPS, "likelihood": PixelLikelihood()}
-ENCODER = "encoder"
-DEFAULT_SCORER = "best"  # of the encoder, the moments and the overlap, those that gain most information on an index
-SCORERS = (*PIXELWISE, *CLASSICAL, "moments", ENCODER, DEFAULT_SCORER)
+DEFAULT_SCORER = "encoder"
+SCORERS = (*PIXELWISE, *CLASSICAL, "moments", DEFAULT_SCORER)
 _WEIGHTS_FILE = ".safetensors"
 
 
@@ -33,11 +32,6 @@ def check_name(name: str) -> None:
         raise UsageError(f"no score named {name!r}{nearest_name(name, SCORERS)}")
 
 
-def vectors_name(name: str) -> str:
-    """The score among those of ``name`` that compares vectors, where one does."""
-    return ENCODER if name == DEFAULT_SCORER else name
-
-
 def descriptor_of(name: str, index: Index) -> tuple[Descriptor, type[VectorScorer]] | None:
     """What makes the vectors of the score ``name`` on ``index``, and what compares them; None if it compares none.
 
@@ -48,7 +42,7 @@ def descriptor_of(name: str, index: Index) -> tuple[Descriptor, type[VectorScore
     """
     if name in CLASSICAL:
         return CLASSICAL[name], VectorScorer
-    if not name.endswith(_WEIGHTS_FILE) and vectors_name(name) != ENCODER:
+    if not name.endswith(_WEIGHTS_FILE) and name != DEFAULT_SCORER:
         return None
     path = Path(name) if name.endswith(_WEIGHTS_FILE) else WEIGHTS
     metadata = about(path)
@@ -71,7 +65,7 @@ def _check_whose(path: Path, metadata: dict[str, str], index: Index) -> None:
         if metadata.get(f"{what}_sha256", given.sha256) != given.sha256:
             raise InputError(
                 f"{path}: trained for the {what} {metadata[what]!r}, not for {given.name!r}; train weights for it, or use the "
-                f"score {ENCODER!r}, which serves all"
+                f"score {DEFAULT_SCORER!r}, which serves all"
             )
 
 

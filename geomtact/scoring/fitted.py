@@ -20,31 +20,27 @@ from geomtact.progress import Progress
 from geomtact.scoring.calibration import CalibrationTouches, fit_calibration, simulate_touches
 from geomtact.scoring.catalogue import (
     DEFAULT_SCORER,
-    ENCODER,
     PIXELWISE,
     check_name,
     descriptor_of,
     fingerprint,
     vectors_file,
-    vectors_name,
 )
 from geomtact.scoring.encoder import EncoderScorer
 from geomtact.scoring.evidence_model import EvidenceModel
 from geomtact.scoring.mixture import contact_hypotheses, mix_hypotheses
 from geomtact.scoring.moments import Moments
 from geomtact.scoring.probability import Calibration, posterior_log_prob
-from geomtact.scoring.product import Comparison, Product, choose
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import describe_index
 from geomtact.sensing.contact import SoftMask
 
-FORMAT = 14
+FORMAT = 15
 # All constants are hand-set.
-_COSTLY = 300_000  # number of poses above which a second score slows a touch down
 _USUAL = 0.9  # share of the touches whose distance to the nearest stored contact counts as usual
 _OUTLIERS = 0.01  # share of the touches whose evidence, or best pose, counts as an outlier
 _LEAST_GAIN = 0.05  # least mean information gain of a touch, below which preparing fails [nats]
-TOUCHES, SEED = 500, 20_200_531  # number and seed of the simulated touches that scores are calibrated on
+TOUCHES, SEED = 250, 20_200_531  # number and seed of the simulated touches that scores are calibrated on
 _LEARN = 0.6  # share of these touches that the moments are fitted to; the rest are held out
 
 
@@ -139,7 +135,7 @@ def fitted_scorer(
         descriptor, compared = found
         label = f"{Path(name).name}-{fingerprint(descriptor)}"
         path = None if folder is None else vectors_file(folder, descriptor)
-        scorers[vectors_name(name)] = compared(descriptor, describe_index(index, descriptor, path, progress))
+        scorers[name] = compared(descriptor, describe_index(index, descriptor, path, progress))
     path = None if folder is None else folder / f"{label}.json"
     fitted = _fitted_before(name, path, scorers)
     if fitted is not None:
@@ -216,16 +212,9 @@ def _fit(name: str, scorers: dict[str, Scorer], index: Index, touches: Calibrati
         },
         "usual": np.quantile(evidence, _OUTLIERS, axis=0).tolist(),
         "nearest": nearest,
-        "weights": {name: 1.0},
     }
-    if name == DEFAULT_SCORER:
-        comparison = Comparison(index, held_out)
-        candidates = {each: scorers[each] for each in (ENCODER, "moments", "iou")}
-        # on a large grid a further score must gain more, for its time
-        data["weights"] = choose(comparison, candidates, least=0.15 if len(index) > _COSTLY else 0.01)
     # only the moments have learned from some of the touches
-    touches = held_out if "moments" in data["weights"] else touches
-    calibration = fit_calibration(_weighed(data["weights"], scorers), index, touches)
+    calibration = fit_calibration(scorers[name], index, held_out if name == "moments" else touches)
     data["calibration"] = asdict(calibration)
     return data
 
@@ -238,7 +227,7 @@ def _from_json(name: str, data: dict[str, Any], scorers: dict[str, Scorer]) -> F
     scorers = {**_limited(scorers, data["nearest"]), "moments": moments}
     return FittedScorer(
         name,
-        _weighed(data["weights"], scorers),
+        scorers[name],
         Calibration(**data["calibration"]),
         EvidenceModel(moments, tuple(data["usual"])),
     )
@@ -250,12 +239,6 @@ def _limited(scorers: dict[str, Scorer], nearest: dict[str, float]) -> dict[str,
         name: replace(scorer, usual=nearest[name]) if isinstance(scorer, EncoderScorer) else scorer
         for name, scorer in scorers.items()
     }
-
-
-def _weighed(weights: dict[str, float], scorers: dict[str, Scorer]) -> Scorer:
-    if len(weights) == 1:
-        return scorers[next(iter(weights))]
-    return Product([scorers[name] for name in weights], list(weights.values()))
 
 
 def _all_alike(index: Index, touches: CalibrationTouches, gain: float) -> str:

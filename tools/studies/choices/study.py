@@ -22,7 +22,7 @@ from geomtact.errors import NoPoseAgreesError, UsageError, nearest_name
 from geomtact.evaluation import simultaneous_touches
 from geomtact.geometry.mesh import Mesh
 from geomtact.geometry.symmetry import Symmetry
-from geomtact.inference.effort import EFFORTS, Effort
+from geomtact.inference.effort import EFFORTS, GRID_ALONE, Effort
 from geomtact.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.catalogue import DEFAULT_SCORER
@@ -38,7 +38,7 @@ from tools.studies.scores import study as scores
 SCENES = ("one touch", "three sensors", "known contact face")
 DEFAULT = "balanced"
 _SENSORS = 3
-_BALANCED, _FAST = EFFORTS["balanced"], EFFORTS["fast"]
+_BALANCED = EFFORTS["balanced"]
 _ONE, _ALL = SCENES[:1], SCENES[:2]
 
 
@@ -73,20 +73,20 @@ class Variant:
 _FACE = Variant("contact face", SCENES[2:], cone=0.0, max_poses=50_000)
 VARIANTS = {
     DEFAULT: Variant("effort", SCENES),
-    "fast": Variant("effort", effort=_FAST),
-    "a quarter of the contacts": Variant("effort", effort=replace(_BALANCED, contacts=40_000, several=10_000)),
+    "the grid alone": Variant("effort", effort=GRID_ALONE),
+    "fast": Variant("effort", effort=EFFORTS["fast"]),
     "exact": Variant("effort", effort=EFFORTS["exact"]),
     "no mode refined": Variant("modes", effort=replace(_BALANCED, modes=0)),
     "ICP too": Variant("modes", effort=replace(_BALANCED, thorough=True)),
     "75k poses": Variant("grid", max_poses=75_000),
-    "300k poses": Variant("grid", max_poses=300_000),
-    "cosine, fast": Variant("score", _ONE, _FAST, "cosine"),
-    "moments, fast": Variant("score", _ONE, _FAST, "moments"),
+    "1.2M poses": Variant("grid", max_poses=1_200_000),
+    "the grid alone, cosine": Variant("score", _ONE, GRID_ALONE, "cosine"),
+    "the grid alone, moments": Variant("score", _ONE, GRID_ALONE, "moments"),
     "symmetry ignored": Variant("symmetry", _ONE, quotient=False),
     "depth map": Variant("image", _ONE, kind="height"),
     "face to 30 degrees": Variant("contact face", SCENES[2:], cone=np.radians(30)),
     "known face": _FACE,
-    "known face, fast": replace(_FACE, effort=_FAST),
+    "known face, the grid alone": replace(_FACE, effort=GRID_ALONE),
     "known face, exact": replace(_FACE, effort=EFFORTS["exact"]),
 }
 
@@ -94,17 +94,17 @@ _THESIS_POSES = 150_000  # of its discretisation (6.1.2)
 
 # what is left out, or added: (the variant without it, the variant with it), which count nats from the same uniform
 ABLATIONS = {
-    "contacts within the cells": ("fast", DEFAULT),
-    "four times the contacts": ("a quarter of the contacts", DEFAULT),
-    "16 times the contacts and 25 modes": ("a quarter of the contacts", "exact"),
+    "contacts within the cells": ("the grid alone", DEFAULT),
+    "up to 16 times the contacts": ("fast", DEFAULT),
+    "4 times more, and 25 modes": (DEFAULT, "exact"),
     "modes refined": ("no mode refined", DEFAULT),
     "ICP beside FilterReg": (DEFAULT, "ICP too"),
-    "300k poses, not 75k": ("75k poses", "300k poses"),
-    "1.2M poses, not 300k": ("300k poses", DEFAULT),
-    "the network, not moments (fast)": ("moments, fast", "fast"),
+    "300k poses, not 75k": ("75k poses", DEFAULT),
+    "1.2M poses, not 300k": (DEFAULT, "1.2M poses"),
+    "the network, not moments (grid alone)": ("the grid alone, moments", "the grid alone"),
     "symmetry": ("symmetry ignored", DEFAULT),
     "a depth map, not a mask": (DEFAULT, "depth map"),
-    "known face: contacts within the cells": ("known face, fast", "known face"),
+    "known face: contacts within the cells": ("known face, the grid alone", "known face"),
     "known face: exact": ("known face", "known face, exact"),
 }
 
@@ -125,9 +125,11 @@ def variants_of(weights: Sequence[Path], only: Sequence[str] = ()) -> dict[str, 
     for path in weights:
         of_thesis = about(path).get("architecture") == THESIS
         name, poses = (
-            ("the thesis's network", _THESIS_POSES) if of_thesis else (f"encoder {path.stem}, fast", MAX_POSES)
+            ("the thesis's network", _THESIS_POSES)
+            if of_thesis
+            else (f"the grid alone, encoder {path.stem}", MAX_POSES)
         )
-        out[name] = Variant("score", _ONE, _FAST, str(path), poses)
+        out[name] = Variant("score", _ONE, GRID_ALONE, str(path), poses)
     return out
 
 

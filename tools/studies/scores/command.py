@@ -61,7 +61,7 @@ def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], 
     from geomtact.errors import UsageError, nearest_name
     from geomtact.geometry.catalogue import catalogue
     from geomtact.inference.effort import EFFORTS
-    from geomtact.scoring.catalogue import DEFAULT_SCORER, SCORERS
+    from geomtact.scoring.catalogue import SCORERS
     from tools.studies.common.study import THESIS_PARTS
 
     known = (*SCORERS, *EFFORTS)
@@ -73,7 +73,7 @@ def sort_words(words: Sequence[str], scores: Sequence[str]) -> tuple[list[str], 
     for word in parts:
         if scores and word not in catalogue() and not Path(word).suffix:
             raise UsageError(f"no score or part named {word!r}{nearest_name(word, [*known, *catalogue()])}")
-    every = [*(name for name in SCORERS if name != DEFAULT_SCORER), *EFFORTS]
+    every = [*SCORERS, *EFFORTS]
     return parts or list(THESIS_PARTS), list(dict.fromkeys([*scores, *more])) or every
 
 

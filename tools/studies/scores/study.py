@@ -19,7 +19,6 @@ from geomtact.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.catalogue import PIXELWISE, descriptor_of, vectors_file
 from geomtact.scoring.moments import Moments
-from geomtact.scoring.product import Product
 from geomtact.scoring.protocol import Scorer
 from geomtact.scoring.vectors import VectorScorer, describe_index
 from geomtact.sensing.sensor import Sensor
@@ -88,8 +87,6 @@ def prepare(
 
 def bytes_per_pose(scorer: Scorer, index: Index) -> float:
     """Bytes that ``scorer`` reads of every pose to compare a touch with it; all that is stored, for one unknown here."""
-    if isinstance(scorer, Product):
-        return sum(bytes_per_pose(part, index) for part in scorer.scorers)
     if isinstance(scorer, VectorScorer):
         return scorer.stored.nbytes / len(index)
     if isinstance(scorer, Moments):

@@ -11,7 +11,7 @@ import numpy as np
 from geomtact.contact_space.contact_class import contact_class
 from geomtact.errors import MeshError
 from geomtact.inference import filter as filtering
-from geomtact.inference.effort import effort_of
+from geomtact.inference.effort import GRID_ALONE, effort_of
 from geomtact.inference.resolve import resolve_touch
 from geomtact.inference.sequence import make_filter
 from geomtact.localizer import Localizer
@@ -76,7 +76,7 @@ def follow(
         judged: dict[str, list[tuple[float, ...]]] = {method: [] for method in METHODS}
         poses = trajectory.T_sensor_object
         for T, mask in zip(poses, trajectory.masks, strict=True):
-            of_cells = localizer.localize(mask, kind="mask", effort="fast", seed=seed)
+            of_cells = localizer.localize(mask, kind="mask", effort=GRID_ALONE, seed=seed)
             found = {"frames": resolve_touch(of_cells, None, None, localizer.scorer, resolved)}
             found |= {method: each.step(of_cells) for method, each in filters.items()}
             for method, posterior in found.items():
@@ -91,7 +91,7 @@ def time_steps(localizer: Localizer, seed: int, frames: int, noise: Noise, effor
     """Milliseconds of each frame, with ``LIVE`` cells kept, from the third one of a trajectory on."""
     state = make_filter(localizer, most=LIVE, seed=seed, effort=effort_of(effort))
     masks = make_trajectory(localizer, 0, seed, frames, noise).masks
-    posteriors = [state.step(localizer.localize(mask, kind="mask", effort="fast", seed=seed)) for mask in masks]
+    posteriors = [state.step(localizer.localize(mask, kind="mask", effort=GRID_ALONE, seed=seed)) for mask in masks]
     return [sum(p.timing_ms.values()) for p in posteriors[2:]]
 
 
