@@ -28,7 +28,7 @@ _MISFIT_NATS = 10.0
 _POWER = {"moments": 0.25, "contacts": 0.5}
 # Probability that the evidence says nothing, because the right pose was not found: fitted with the power of contacts.
 _MISSED = 0.02
-_ROUGHLY = 4  # by so much fewer contacts it is decided which objects to look at closely
+_ROUGHLY = 10_000  # contacts by which it is decided which objects to look at closely
 _HARDLY = 0.01  # probability below which they are not; hand-set
 
 
@@ -138,10 +138,8 @@ def identify(
 def _efforts(effort: str | Effort) -> list[Effort]:
     """The efforts by which an object is looked at, the last one only where the object may be the right one."""
     asked = effort_of(effort)
-    if not asked.contacts:
-        return [asked]
-    contacts, several = (-(-each // _ROUGHLY) for each in (asked.contacts, asked.several))
-    return [replace(asked, modes=0, contacts=contacts, several=several), asked]
+    roughly = replace(asked, modes=0, contacts=min(asked.contacts, _ROUGHLY))
+    return [asked] if roughly.contacts == asked.contacts else [roughly, asked]
 
 
 def _probability(log_odds: Array, log_weights: Array | None, missed: float) -> Array:

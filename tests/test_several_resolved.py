@@ -18,7 +18,7 @@ from geomtact.inference.systematic_errors import ERRORS, stand_of
 from geomtact.localizer import Localizer
 from geomtact.scoring.contact_likelihood import mixture_weights
 
-EFFORT = Effort(3, thorough=False, several=80_000)
+EFFORT = Effort(3, 80_000, thorough=False)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_they_say_more_than_the_cells(localizer, scenes, n):
     """In the mean of 12 scenes by 6 nats or more."""
     gains = [
         [found(localizer, scene, effort=effort).log_density(scene.T_world_object) for scene in scenes[:n]]
-        for effort in (EFFORT, replace(EFFORT, several=0))
+        for effort in (EFFORT, replace(EFFORT, contacts=0))
     ]
     assert np.isfinite(gains).all() and np.subtract(*gains).mean() > 1
 

@@ -14,32 +14,28 @@ class Effort:
     Attributes
     ----------
     modes : that are refined, where the pose is resolved within the cells
-    contacts : of the last attempt to resolve the pose within the cells of the grid (see ``inference.two_runs``), of one mask. The
-        first attempt has a sixteenth, and settles most touches; the second has a quarter. Half as many more weigh the modes. 0
-        leaves the cells as they are
+    contacts : that are cut at most to resolve the pose within the cells of the grid, on all sensors together. 10,000 on each
+        settle most touches (see ``inference.two_runs``), which is also the least. Of one sensor, half as many more weigh the
+        modes. 0 leaves the cells as they are
     thorough : whether each mode is refined by all registrations or by one
-    several : contacts on each sensor where several are resolved together, of the last of two attempts; the first has a quarter.
-        0 leaves the cells as they are
     """
 
     modes: int
     contacts: int = 0
     thorough: bool = True
-    several: int = 0
 
     def __post_init__(self) -> None:
         if self.modes < 0:
             raise UsageError(f"Effort: expected 0 refined modes or more, got {self.modes}; give 0 for none")
-        for contacts in (self.contacts, self.several):
-            if contacts < 0:
-                raise UsageError(f"Effort: expected 0 contacts or more, got {contacts}; give 0 for none")
+        if self.contacts < 0:
+            raise UsageError(f"Effort: expected 0 contacts or more, got {self.contacts}; give 0 for none")
 
 
 GRID_ALONE = Effort(0)  # for studies, and for what lives on the cells of the grid
 EFFORTS = {
-    "fast": Effort(0, 10_000, several=10_000),
-    "balanced": Effort(5, 160_000, thorough=False, several=40_000),
-    "exact": Effort(25, 640_000, several=160_000),
+    "fast": Effort(0, 10_000),
+    "balanced": Effort(5, 200_000, thorough=False),
+    "exact": Effort(25, 800_000),
 }
 
 

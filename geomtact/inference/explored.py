@@ -40,12 +40,14 @@ class Density:
     log_evidence : of each posterior, the log of the mean of the power of the likelihood over the coarse posterior
     powers : of the likelihood; all but the last are of ``POWERS``
     log_inside : log of the share of the poses with errors that are in the contact pose space
+    trust : probability that the sampler found where the likelihood is high; else the pose has the coarse posterior
     """
 
     target: Target
     log_evidence: tuple[float, ...]
     powers: tuple[float, ...] = POWERS
     log_inside: float = 0.0
+    trust: float = 1.0
 
     @property
     def index(self) -> Index:
@@ -56,7 +58,9 @@ class Density:
     def weights(self) -> Array:
         """Weight of each posterior; the last one has those of the powers that are left out too."""
         weights, last = self.target.weights, len(self.powers) - 1
-        return np.append(weights[:last], weights[last:].sum())
+        weights = self.trust * np.append(weights[:last], weights[last:].sum())
+        weights[0] += 1 - self.trust
+        return weights
 
     def by_power(self, log_likelihood: Array, log_coarse: Array) -> Array:
         """Log density (..., K) of each posterior over the prior, without errors, from the log likelihood and the log density of
@@ -193,6 +197,7 @@ class Explored:
             "log_evidence": np.array(self.density.log_evidence),
             "powers": np.array(self.density.powers),
             "log_inside": np.array(self.density.log_inside),
+            "trust": np.array(self.density.trust),
             "log_coarse": target.log_coarse.astype(np.float32),
             **({} if target.prior is None else target.prior.arrays()),
             "contacts": np.array(self.contacts),
@@ -239,6 +244,7 @@ class Explored:
                 tuple(arrays["log_evidence"].tolist()),
                 tuple(arrays["powers"].tolist()),
                 float(arrays["log_inside"]),
+                float(arrays["trust"]),
             ),
             T,
             arrays["depth"],

@@ -28,7 +28,7 @@ from geomtact.se3 import Array, inverse
 from geomtact.sensing.moments import moments_of
 from geomtact.sensing.reading import Observation
 
-# The next four were chosen on 91 trajectories of four objects, apart from those of the study (docs/tracking.md).
+# The next four were chosen on 91 trajectories of four objects, apart from those of the study (docs/evaluation-tracking.md).
 FRAME_POWER = 0.85  # power of a frame's likelihood in its own posterior
 MEMORY_POWER = 0.6  # summed power of the likelihoods of all earlier frames
 NEWEST_SHARE = 0.15  # largest share of ``MEMORY_POWER`` that the newest earlier frame has

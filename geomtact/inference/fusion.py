@@ -40,7 +40,7 @@ from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
 
 # Least correlation between the log densities of two sensors, because a cell's width hides the same part of the pose from both.
-# Hand-set; its effect was measured on simulated scenes apart from those of the study (docs/several-sensors.md).
+# Hand-set; its effect was measured on simulated scenes apart from those of the study (docs/evaluation-several-sensors.md).
 _LEAST_CORRELATION = 0.1
 _NEGLIGIBLE_NATS = 25.0  # log density below that of the most probable place from which a place has no weight; hand-set
 _UNLIKELY_DENSITY = 0.1  # density relative to the uniform below which a place is transferred by one pose; hand-set
@@ -179,7 +179,7 @@ def fused_posterior(
     T_first_sensor = inverse(first.T_frame_sensor) @ np.stack([touch.T_frame_sensor for touch, _ in touching])
     refiner = mode_refiners[posterior.provenance.base]
     search = None
-    if effort.several:
+    if effort.contacts:
         search = refiner.searching(posterior.index, joint_problem(shown, T_first_sensor, _ROUGH_POINTS))
     posterior = resolve_touches(posterior, touches, prior, log_prior, effort, extrinsics_std, search)
     if posterior.explored is not None and effort.modes:

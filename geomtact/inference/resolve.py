@@ -23,6 +23,10 @@ from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, indentatio
 from geomtact.scoring.fitted import FittedScorer
 from geomtact.se3 import Array, inverse
 
+_UNCONFIRMED = (
+    "two runs of the sampler do not agree: half of the probability is left on the grid's cells; "
+    "cut more contacts: --effort exact"
+)
 LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
 
 
@@ -67,8 +71,7 @@ def resolve_touches(
 
 
 def _can_resolve(touches: Sequence[Posterior], effort: Effort) -> bool:
-    contacts = effort.contacts if len(touches) == 1 else effort.several
-    return bool(contacts) and any(touch.contact and touch.observation for touch in touches)
+    return bool(effort.contacts) and any(touch.contact and touch.observation for touch in touches)
 
 
 def _resolved(
@@ -103,8 +106,7 @@ def _resolved(
             if touch is not first
         ]
         rng = np.random.default_rng(posterior.seed)
-        contacts = effort.several if others else effort.contacts
-        found = explore_twice(index, _query(first), coarse, contacts, rng, at_poses, others, search)
+        found = explore_twice(index, _query(first), coarse, effort.contacts, rng, at_poses, others, search)
     diagnostics = replace(
         posterior.diagnostics,
         evidence_of="contacts",
@@ -117,7 +119,13 @@ def _resolved(
         warning = f"the pose is not resolved within the grid's cells: {found.why_not}"
         return replace(posterior, diagnostics=diagnostics, warnings=[*posterior.warnings, warning])
     power = explored.density.powers[-1] / POWERS[-1]
-    return replace(posterior, explored=explored, diagnostics=replace(diagnostics, settled_power=power))
+    warnings = [] if explored.density.trust == 1 else [_UNCONFIRMED]
+    return replace(
+        posterior,
+        explored=explored,
+        diagnostics=replace(diagnostics, settled_power=power),
+        warnings=posterior.warnings + warnings,
+    )
 
 
 def _mass_of_places(index: Index, density: NDArray[np.floating]) -> Array:

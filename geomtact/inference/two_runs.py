@@ -36,6 +36,10 @@ _POSES, _FOR_EACH = (300, 600), 20
 # nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
 # believed, while more contacts may be cut and in the last attempt: to leave a contact to the cells costs more; hand-set
 _AGREE, _AGREE_AT_LAST = 1.0, 2.0
+# Of two runs that do not agree, one at least has missed something. So what they found rests on one run, which nothing confirms:
+# by the rule of succession another one would find the same with this probability.
+_TRUST = 0.5
+_LEAST = 10_000  # contacts of the first attempt; with fewer, the evidence is mostly found too small, by more than a nat
 _MORE = 4  # times as many contacts are cut in each attempt after the first
 # powers that an attempt may leave out, before the last: of several sensors, of a mask, and of depths, whose likelihood is
 # sharper; where the gain of 20 touches each of pin and head levels off (seed 91), and of 10 scenes of four objects (seed 810)
@@ -74,15 +78,18 @@ def explore_twice(
     others: Sequence[OtherSensor] = (),
     search: Search | None = None,
 ) -> Finding:
-    """The distribution of the pose with its modes, by two runs that share a sixteenth of the ``contacts`` of each sensor, or a
-    quarter where there are several, and have to agree on the evidence; arguments as of :func:`explore`.
+    """The distribution of the pose with its modes, by two runs that share 10,000 contacts on each sensor, and have to agree on
+    the evidence; arguments as of :func:`explore`.
 
     Where they do not, the largest powers of the likelihood are left out until they do, one to three of them at most. If that
-    does not help, both are repeated with four times the contacts, until these are all; then as many powers are left out as need
-    be. So are runs of several sensors that found no pose which explains all contacts.
+    does not help, both are repeated with four times the contacts, while that is no more than ``contacts`` on all sensors
+    together. So are runs of several sensors that found no pose which explains all contacts. If the runs do not agree in the
+    end, what they found has half of the probability, and the coarse posterior the rest.
     """
     cut, found = 0, Finding(None, unexplained_nats=np.inf if others else None)
-    attempts = (contacts // _MORE, contacts) if others else (contacts // _MORE**2, contacts // _MORE, contacts)
+    attempts = [_LEAST]
+    while _MORE * attempts[-1] * (1 + len(others)) <= contacts:
+        attempts.append(_MORE * attempts[-1])
     left_out = _LEFT_OUT if query.indentation is None else _LEFT_OUT_OF_DEPTHS
     if others:
         left_out = _LEFT_OUT_OF_SEVERAL
@@ -94,8 +101,10 @@ def explore_twice(
             found = Finding(None, _log_evidence(one, other), _misfit(one, other), unexplained)
             if unexplained is not None and unexplained > UNEXPLAINED_NATS:
                 continue
-            least = 0 if asked == attempts[-1] else POWERS[-1 - left_out]
-            explored, cut = _agreed(one, other, least, asked, cut, rng)
+            is_last = asked == attempts[-1]
+            explored, cut = _agreed(one, other, left_out, _AGREE_AT_LAST if is_last else _AGREE, asked, cut, rng)
+            if explored is None and is_last:
+                explored = _by_one_run(one, other, asked, cut, rng)
         except InputError as error:
             found = replace(found, why_not=str(error))
             continue
@@ -103,15 +112,15 @@ def explore_twice(
             if others:
                 unexplained = _unexplained_in_place(one, other, explored)
             return replace(found, explored=explored, unexplained_nats=unexplained)
-    settle = f"{cut:,} contacts do not settle how likely the observed one is; allow more by Effort(contacts=)"
-    return replace(found, why_not=found.why_not or f"{index.mesh.name}: {settle}")
+    return replace(found, why_not=found.why_not or f"{index.mesh.name}: no pose explains all contacts")
 
 
 def _agreed(
-    one: Run, other: Run, least: float, asked: int, cut: int, rng: np.random.Generator
+    one: Run, other: Run, left_out: int, most: float, asked: int, cut: int, rng: np.random.Generator
 ) -> tuple[Explored | None, int]:
-    """The distribution of the pose by the largest power of the likelihood at which two runs agree, of ``least`` or more, if there
-    is one; and how many contacts were cut until then, ``cut`` of them before.
+    """The distribution of the pose by the largest power of the likelihood at which two runs differ by ``most`` nats a sensor,
+    where ``left_out`` powers at most are larger, if there is one; and how many contacts were cut until then, ``cut`` of them
+    before.
 
     Raises
     ------
@@ -120,22 +129,51 @@ def _agreed(
     """
     several = bool(one.density.target.others)
     for last in range(len(one.log_evidence) - 1, 0, -1):
-        if one.density.powers[last] < least:
+        if one.density.powers[last] < POWERS[-1 - left_out]:
             break
         run = replace(pooled(one, other, last, rng), contacts=cut)
         apart = np.abs(np.subtract(one.log_evidence, other.log_evidence))[_kept(one, last)]
-        if run.density.weights @ apart >= (_AGREE if least else _AGREE_AT_LAST) * run.density.target.sensors:
+        if run.density.weights @ apart >= most * run.density.target.sensors:
             continue
-        found = _explored_from(run, _POSES[0] if several else int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
-        further = _sharpest(one, other)
-        if several:
-            led_to = (one.about.led_to, one.about.origin) if one.about else None
-            return counted(found, further, _draws_left(one, last) + _draws_left(other, last), led_to), cut
-        found, log_sum = weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
-        if log_sum < 0:
+        found, log_sum = _with_modes(one, other, run, last, asked, rng)
+        if several or log_sum < 0:
             return found, cut
         cut = found.contacts
     return None, cut
+
+
+def _with_modes(
+    one: Run, other: Run, run: Run, last: int, asked: int, rng: np.random.Generator
+) -> tuple[Explored, float]:
+    """The distribution of the pose by both runs as one ``run`` up to the ``last`` stop, with its modes; and the log of the sum of
+    their masses as it was found, 0 of several sensors."""
+    further = _sharpest(one, other)
+    if run.density.target.others:
+        led_to = (one.about.led_to, one.about.origin) if one.about else None
+        draws = _draws_left(one, last) + _draws_left(other, last)
+        return counted(_explored_from(run, _POSES[0], rng), further, draws, led_to), 0.0
+    found = _explored_from(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
+    return weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
+
+
+def _by_one_run(one: Run, other: Run, asked: int, cut: int, rng: np.random.Generator) -> Explored:
+    """What two runs that do not agree found, with the probability ``_TRUST``, else the coarse posterior.
+
+    Where the modes of one sensor have a larger mass than that, the evidence is too small by as much.
+    """
+    last = len(one.log_evidence) - 1
+    run = replace(pooled(one, other, last, rng), contacts=cut)
+    run = replace(run, density=replace(run.density, trust=_TRUST))
+    found, log_sum = _with_modes(one, other, run, last, asked, rng)
+    if run.density.target.others:
+        return replace(found, masses=_TRUST * found.masses)
+    excess = log_sum - float(np.log(_TRUST))
+    if excess <= 0:
+        return found
+    evidence = np.array(run.density.log_evidence) + np.where(np.array(run.density.powers) > 0, excess, 0)
+    density = replace(found.density, log_evidence=tuple(evidence.tolist()))
+    masses = found.masses * (_TRUST / max(found.masses.sum(), 1e-300))
+    return replace(found, density=density, masses=masses, log_density=density.log_density(found.poses))
 
 
 def _log_evidence(one: Run, other: Run) -> float:

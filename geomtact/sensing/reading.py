@@ -23,7 +23,7 @@ from geomtact.sensing.local_shape import find_contact, on_grid
 from geomtact.sensing.sensor import Sensor
 
 KINDS = ("auto", "mask", "height", "reading")
-_DUST = 0.1e-6  # m^2 of contact, under which a touch constrains nothing (docs/stability.md)
+_DUST = 0.1e-6  # m^2 of contact, under which a touch constrains nothing (docs/robustness.md)
 _SPECKS = 100  # pieces and holes no larger than dust, that a mask of one touch has at most
 # share in contact of a mask that may be a negative, if all of its border is, or most of it
 _NEGATIVE, _NEGATIVE_MOST, _BORDER = 0.5, 0.85, 0.8
