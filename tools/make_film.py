@@ -204,7 +204,7 @@ def film(localizer: Localizer, triple: Triple, background: Array) -> tuple[list[
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--max-poses", type=int, default=1_200_000, help="of the grid")
+    parser.add_argument("--max-poses", type=int, default=300_000, help="of the grid")
     parser.add_argument("--out", type=Path, default=FILM)
     options = parser.parse_args()
     localizer = Localizer.prepare(OBJECT, sensor=SENSOR, max_poses=options.max_poses)

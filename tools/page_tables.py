@@ -5,6 +5,7 @@
 A cell that no file holds, as a name in words, stays what it is, and what is bold stays bold.
 """
 
+import csv
 import json
 import math
 import re
@@ -283,16 +284,6 @@ def sweeps(content):
         yield [f"`{name}`", KEPT, told, promised]
 
 
-def within_cells(content):
-    for sweep in content["together"].values():
-        for at in sweep["levels"]:
-            f, promised = at["figures"], "yes" if at["level"] in sweep["inside"] else "no"
-            yield [
-                sweep["title"], f"{at['level']:g}", promised, *cells("{n} | {claimed_mean:.1f}", **f), *inside(f),
-                *cells("{silent:.0%}", **f),
-            ]  # fmt: skip
-
-
 def expected(touches, triplets):
     def over(sensors, key, form="{:.1f}", scale=1.0):
         values = [
@@ -313,29 +304,27 @@ def expected(touches, triplets):
 
 TABLES = [
     ("README", "| images |", expected, "touches", "triplets"),
-    ("readings", "| set |", contacts, "readings"),
-    ("readings", "| camera |", balls, "readings"),
+    ("evaluation-real-images", "| set |", contacts, "readings"),
+    ("evaluation-real-images", "| camera |", balls, "readings"),
     ("no-more-than-needed", "| choice |", ablations, "choices"),
     ("speed-accuracy", "| variant |", variants, "choices"),
     ("speed-accuracy", "| gain [nats] /", known_face, "choices"),
-    ("several-sensors", "| object |", touches, "touches"),
-    ("several-sensors", "| shown |", elsewhere_simulated, "triplets"),
-    ("tracking", "| method |", followed, "track"),
-    ("next-touch", "| object |", until_sure, "next_touch"),
-    ("kitting", "| object |", placed, "kitting"),
-    ("which-part", "| touches |", identified, "identification"),
-    ("registration", "| method | success", from_everywhere, "registration"),
-    ("registration", "| method | error", from_grid, "registration"),
-    ("registration", "| contact |", by_contact, "registration"),
+    ("evaluation-several-sensors", "| object |", touches, "touches"),
+    ("evaluation-several-sensors", "| shown |", elsewhere_simulated, "triplets"),
+    ("evaluation-tracking", "| method |", followed, "track"),
+    ("evaluation-next-touch", "| object |", until_sure, "next_touch"),
+    ("evaluation-kitting", "| object |", placed, "kitting"),
+    ("evaluation-identification", "| touches |", identified, "identification"),
+    ("evaluation-registration", "| method | success", from_everywhere, "registration"),
+    ("evaluation-registration", "| method | error", from_grid, "registration"),
+    ("evaluation-registration", "| contact |", by_contact, "registration"),
     ("benchmark", "| what |", cost, "benchmark"),
     ("benchmark", "| score | threads", retrieval, "peers"),
     ("benchmark", "| pixels |", simulation, "peers"),
     ("benchmark", "| score | pin", scores, "scores"),
     ("benchmark", "| contact |", kinds, "classes", "flat"),
     ("benchmark", "| object |", answers, "localize"),
-    ("stability", "| sweep |", sweeps, "stability"),
-    ("stability", "| what gets worse | level |", within_cells, "stability-within-cells"),
-    ("stability", "| object |", answers, "housing"),
+    ("robustness", "| sweep |", sweeps, "stability"),
 ]
 
 
@@ -380,7 +369,24 @@ def page_path(page):
     return (DOCS.parent if page == "README" else DOCS) / f"{page}.md"
 
 
+def write_meshes_csv():
+    """``results/meshes.csv``: what tools/prep_mesh.py made of each file of meshes.json, a row each."""
+    symmetries = {"none": "none", "axis": "any turn", "sphere": "any rotation"}
+    with (DOCS / "results" / "meshes.csv").open("w", newline="", encoding="utf-8") as file:
+        write = csv.writer(file, lineterminator="\n").writerow
+        write(["file", "unit", "outcome", "deviation_mm", "seconds", "symmetry", "changes", "warnings", "reason"])
+        for mesh in study("meshes")["meshes"]:
+            found = mesh.get("symmetry", {"kind": ""})
+            symmetry = symmetries.get(found["kind"], f"{found.get('order', '')}-fold" * bool(found["kind"]))
+            symmetry += " and flip" * (found["kind"] == "axis" and found["order"] == 2)
+            changes = "; ".join(f"{step}: {words}" for step, words in mesh.get("changes", {}).items())
+            off = f"{mesh['deviation_mm']:.4f}" if "deviation_mm" in mesh else ""
+            row = [mesh["file"], mesh.get("unit"), mesh["outcome"], off, mesh["seconds"], symmetry, changes]
+            write([*row, "; ".join(mesh.get("warnings", [])), mesh["reason"]])
+
+
 def main():
+    write_meshes_csv()
     for page in dict.fromkeys(name for name, *_ in TABLES):
         path = page_path(page)
         before = path.read_text("utf-8")

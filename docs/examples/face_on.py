@@ -55,7 +55,7 @@ def touches(mesh, face, tilt, n, rng):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--face", type=float, nargs=3, default=FACE)
-    parser.add_argument("--max-poses", type=int, default=1_200_000)
+    parser.add_argument("--max-poses", type=int, default=300_000)
     parser.add_argument("--touches", type=int, default=24)
     parser.add_argument("--tilt", type=float, nargs="*", default=[0.0, 1.0, 3.0])
     asked = parser.parse_args()

@@ -39,7 +39,8 @@ _AGREE, _AGREE_AT_LAST = 1.0, 2.0
 # Of two runs that do not agree, one at least has missed something. So what they found rests on one run, which nothing confirms:
 # by the rule of succession another one would find the same with this probability.
 _TRUST = 0.5
-_LEAST = 10_000  # contacts of the first attempt; with fewer, the evidence is mostly found too small, by more than a nat
+_LEAST = 10_000  # contacts of an attempt; with fewer, the evidence is mostly found too small, by more than a nat
+_SHARE = 20  # the first attempt cuts one of so many of all contacts on each sensor
 _MORE = 4  # times as many contacts are cut in each attempt after the first
 # powers that an attempt may leave out, before the last: of several sensors, of a mask, and of depths, whose likelihood is
 # sharper; where the gain of 20 touches each of pin and head levels off (seed 91), and of 10 scenes of four objects (seed 810)
@@ -78,8 +79,8 @@ def explore_twice(
     others: Sequence[OtherSensor] = (),
     search: Search | None = None,
 ) -> Finding:
-    """The distribution of the pose with its modes, by two runs that share 10,000 contacts on each sensor, and have to agree on
-    the evidence; arguments as of :func:`explore`.
+    """The distribution of the pose with its modes, by two runs that share a twentieth of the ``contacts`` on each sensor, 10,000
+    at least, and have to agree on the evidence; arguments as of :func:`explore`.
 
     Where they do not, the largest powers of the likelihood are left out until they do, one to three of them at most. If that
     does not help, both are repeated with four times the contacts, while that is no more than ``contacts`` on all sensors
@@ -87,7 +88,7 @@ def explore_twice(
     end, what they found has half of the probability, and the coarse posterior the rest.
     """
     cut, found = 0, Finding(None, unexplained_nats=np.inf if others else None)
-    attempts = [_LEAST]
+    attempts = [max(_LEAST, contacts // _SHARE)]
     while _MORE * attempts[-1] * (1 + len(others)) <= contacts:
         attempts.append(_MORE * attempts[-1])
     left_out = _LEFT_OUT if query.indentation is None else _LEFT_OUT_OF_DEPTHS

@@ -97,7 +97,7 @@ def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
     for touch, badly_found in _touches(localizer, touches, rng):
         query = ContactQuery.of(touch.mask, sensor)
         coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
-        run = pooled(*explore(localizer.index, query, coarse, CONTACTS // 2, rng, runs=2), len(POWERS), rng)
+        run = pooled(*explore(localizer.index, query, coarse, CONTACTS // 2, rng, runs=2), len(POWERS) - 1, rng)
         (reference,) = explore(localizer.index, query, coarse, REFERENCE, rng)
         yield _example(run, reference, touch, badly_found, rng)
 

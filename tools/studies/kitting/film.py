@@ -28,7 +28,7 @@ parser.add_argument("--part", default="pin", help="a bundled object, or a mesh f
 parser.add_argument("--unit", help="of a mesh file: mm, cm, m or inch")
 parser.add_argument("--clearance-mm", type=float, default=1.0)
 parser.add_argument("--touches", type=int, default=4)
-parser.add_argument("--max-poses", type=int, default=1_200_000, help="of the grid")
+parser.add_argument("--max-poses", type=int, default=300_000, help="of the grid")
 parser.add_argument("--seed", type=int, default=0)
 options = parser.parse_args()
 if options.touches < 1 or options.clearance_mm < 0:

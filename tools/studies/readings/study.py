@@ -105,7 +105,7 @@ def imprints(folder: Path) -> dict[str, list[Imprint]]:
     fots, pack = folder / "fots_balls", folder / "objectfolder_gelsight_calib" / "dataPack_subset.npz"
     wanted = "fots_balls and objectfolder_gelsight_calib"
     if not (fots.is_dir() and pack.is_file()):
-        raise InputError(f"{folder}: expected {wanted} in it; give the folder of the readings (docs/readings.md)")
+        raise InputError(f"{folder}: expected {wanted} in it; give that of the images (docs/evaluation-real-images.md)")
     try:
         rows = circles_of(fots / "gelsight_contact_circles.csv")
         columns = ("image", "center_x_px", "center_y_px", "radius_px")

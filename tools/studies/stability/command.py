@@ -27,7 +27,7 @@ def judge_stability(
         list[str] | None,
         typer.Option(
             "--sweep",
-            help=f"What to make worse (see docs/stability.md); may be repeated; all by default: {_NAMES}.",
+            help=f"What to make worse (see docs/robustness.md); may be repeated; all by default: {_NAMES}.",
         ),
     ] = None,
     sensor: study_options.SensorName = "gelslim",

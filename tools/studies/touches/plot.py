@@ -22,7 +22,7 @@ def draw_touches(content: Mapping[str, Any]) -> bytes:
             sensors, [f["mssd_mm_median"] for f in figures], "o-", color=colour, label=f"{name}, first mode (MSSD)"
         )
         right.plot(sensors, [f["add10_mm_median"] for f in figures], "s:", color=colour, mfc="white")
-    left.set_ylabel("information at the true pose [nats]")
+    left.set_ylabel("information gain [nats]")
     left.set_ylim(bottom=0)
     right.set_yscale("log")
     right.yaxis.set_major_formatter("{x:g}")
@@ -33,8 +33,20 @@ def draw_touches(content: Mapping[str, Any]) -> bytes:
         axes.set_xticks(sensors)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3)
-    left.set_title("How much is known")
-    right.set_title("How far off the first mode and the best of ten are")
+    left.set_title(_gain_found(content))
+    right.set_title(_error_found(content))
     left.legend(frameon=False)
-    right.legend(frameon=False, fontsize=8)
+    right.legend(frameon=False, fontsize=9)
     return png(figure)
+
+
+def _gain_found(content: Mapping[str, Any]) -> str:
+    gains = [[f["gain_mean"] for f in part["figures"]] for part in content["parts"].values()]
+    ratios = [each[1] / each[0] for each in gains]
+    return f"Two sensors gain {min(ratios):.1f} to {max(ratios):.1f} times as much as one"
+
+
+def _error_found(content: Mapping[str, Any]) -> str:
+    most = [part["figures"][-1] for part in content["parts"].values()]
+    off = [f["mssd_mm_median"] for f in most]
+    return f"{most[0]['sensors']} sensors: the first mode is {min(off):.1f} to {max(off):.1f} mm off"
