@@ -32,7 +32,7 @@ _OFF = 1e-3  # largest deviation of the sum of probabilities from 1; hand-set
 WITHOUT_PRIOR = (
     "this file lacks the prior and other sensors: it holds only that one sensor without contact rules poses out"
 )
-_FORMAT = "geomtact/posterior/12"
+_FORMAT = "geomtact/posterior/13"
 _BROKEN = (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError)
 
 
