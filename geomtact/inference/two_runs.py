@@ -1,8 +1,8 @@
-"""The distribution of a pose from two runs of the sampler that have to agree.
+"""The distribution of a pose from two runs of the sampler, which are compared.
 
 One run does not show what it has missed. So two are compared: where they disagree on the evidence, one has missed what the other
 found; where the masses of the modes add up to more than 1, both have. Then more contacts are cut, or the sharpest powers are left
-out.
+out. Where that does not help, the coarse posterior has half of the probability.
 
 How likely the contacts are at all is known even where the runs do not agree, only less exactly.
 """
@@ -55,7 +55,7 @@ class Finding:
 
     Attributes
     ----------
-    explored : the distribution of the pose; None where they do not agree, or found no pose
+    explored : the distribution of the pose; None where they found no pose that explains all contacts
     log_evidence : log of the mean under the prior of the likelihood of all contacts, to the power ``EVIDENCE_POWER``; -inf where
         no pose was found that touches all sensors which show contact
     misfit_nats, unexplained_nats : as of ``facts.Diagnostics``
