@@ -2,93 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import cycle
-from textwrap import fill
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from geomtact.report.canvas import COLOURS, png
 
-_ACROSS = 4
-_TOGETHER = "all objects"
-_LINE = 50  # letters under an axis
-_SEVENTH = "#8C564B"  # colour, of as many objects
-_IN_A_ROW = 6  # of the legend
+_HELD, _BEYOND = COLOURS[0], COLOURS[1]
+_PROMISED = 85, 95  # %, of the truths in the 90 % region
+_SLANT = 0.6  # rows that the levels of a sweep take
 
 
 def draw_stability(content: Mapping[str, Any]) -> bytes:
-    """A PNG: for each sweep the gain and the expected gain; and below how many truths the 90 % region holds, with the 99 %
-    intervals of all objects together, and the share of undetected failures.
+    """A PNG with a row for each sweep: how many truths the 90 % region holds, and how many failures are undetected, at each
+    level of all objects together, from the mildest level (above) to the worst (below).
 
-    What is promised lies on a light ground. Objects differ by colour; all together are black.
+    Levels in the promised range are filled.
     """
+    import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    sweeps = {part: told["sweeps"] for part, told in content["parts"].items()}
-    colours = dict(zip(sweeps, cycle((*COLOURS, _SEVENTH)), strict=False))
-    names = list(dict.fromkeys(name for some in sweeps.values() for name in some))
-    if len(sweeps) > 1:
-        sweeps[_TOGETHER], colours[_TOGETHER] = content["together"], "black"
-    across = min(_ACROSS, max(1, len(names)))
-    down = -(-len(names) // across)
-    figure = Figure(figsize=(4.2 * across, 4.4 * down + 0.4), dpi=100, layout="constrained", facecolor="white")
-    grid = figure.subplots(2 * down, across, squeeze=False, height_ratios=[3, 2] * down)
-    for axes in grid.ravel():
-        axes.set_visible(False)
-    for number, name in enumerate(names):
-        row, column = divmod(number, across)
-        pair = grid[2 * row, column], grid[2 * row + 1, column]
-        _draw(pair, [(colours[p], some[name]) for p, some in sweeps.items() if name in some])
-    handles: list[Any] = [figure.axes[0].plot([], [], "o-", color=c, label=p)[0] for p, c in colours.items()]
-    styles = (
-        ("o-", "above: gain, below: truths in the 90 % region"),
-        ("--", "above: expected gain"),
-        (":", "below: undetected failures"),
-    )
-    handles += [figure.axes[0].plot([], [], style, color="0.4", label=label)[0] for style, label in styles]
-    handles.append(figure.axes[0].fill_between([], [], color="0.94", label="promised to hold"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=_IN_A_ROW, frameon=False)
-    return png(figure)
+    rows = _rows(content)
+    with mpl.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(10, 0.34 * len(rows) + 1.6), dpi=110, layout="constrained", facecolor="white")
+        left, right = figure.subplots(1, 2, sharey=True)
+        left.axvspan(*_PROMISED, color="0.92", lw=0)
+        for row, (_, sweep) in enumerate(rows):
+            points = list(_points(row, sweep))
+            for axes, k in ((left, 1), (right, 2)):
+                axes.plot([p[k] for p in points], [p[0] for p in points], "-", color="0.7", lw=0.8)
+                for y, held, silent, promised in points:
+                    axes.plot(
+                        held if k == 1 else silent,
+                        y,
+                        "o",
+                        color=_HELD if promised else _BEYOND,
+                        mfc=_HELD if promised else "white",
+                        ms=4.5,
+                    )
+        left.set_yticks(range(len(rows)), [name for name, _ in rows])
+        left.invert_yaxis()
+        left.set_xlim(-2, 102)
+        left.set_xlabel("true poses in the 90 % region [%]")
+        right.set_xlabel("undetected failures [% of the touches]")
+        right.set_xlim(left=-1)
+        for axes in (left, right):
+            axes.grid(axis="y", alpha=0.3)
+            axes.spines[["top", "right"]].set_visible(False)
+        left.plot([], [], "o", color=_HELD, label="promised to hold")
+        left.plot([], [], "o", color=_BEYOND, mfc="white", label="beyond")
+        figure.legend(loc="outside lower center", ncols=2, frameon=False)
+        left.set_title(_regions_found(rows))
+        right.set_title(_failures_found(rows))
+        return png(figure)
 
 
-def _draw(pair: Sequence[Any], parts: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
-    """One sweep of each object, with its colour, into the two axes of ``pair``, the last with intervals.
+def _rows(content: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """Each sweep of all objects together, or of the one object that there is, with its name."""
+    together = content.get("together") or next(iter(content["parts"].values()))["sweeps"]
+    return list(together.items())
 
-    An object may lack levels that others have.
-    """
-    nats, shares = pair
-    sweep = max((each for _, each in parts), key=lambda each: len(each["levels"]))
-    levels = list(dict.fromkeys(at["level"] for each in (sweep, *(e for _, e in parts)) for at in each["levels"]))
-    for colour, each in parts:
-        figures = [at["figures"] for at in each["levels"]]
-        here = [levels.index(at["level"]) for at in each["levels"]]
-        nats.plot(here, [f["gain_mean"] for f in figures], "o-", color=colour, ms=4)
-        nats.plot(here, [f["claimed_mean"] for f in figures], "--", color=colour)
-        held = [f["coverage"][1] for f in figures]
-        beyond = [[100 * (c["share"] - c["low"]) for c in held], [100 * (c["high"] - c["share"]) for c in held]]
-        last = each is parts[-1][1]
-        shares.errorbar(
-            here,
-            [100 * c["share"] for c in held],
-            beyond if last else None,
-            fmt="o-",
-            color=colour,
-            ms=4,
-            elinewidth=0.8,
-        )
-        shares.plot(here, [100 * f["silent"] for f in figures], ":", color=colour)
-    for axes in pair:
-        axes.set_visible(True)
-        for i, level in enumerate(levels):
-            if level in sweep["inside"]:
-                axes.axvspan(i - 0.5, i + 0.5, color="0.94", zorder=0, lw=0)
-        axes.set_xlim(-0.5, len(levels) - 0.5)
-        axes.set_xticks(range(len(levels)), [f"{level:g}" for level in levels])
-        axes.spines[["top", "right"]].set_visible(False)
-    shares.axhline(90, color="0.7", lw=0.8)
-    nats.tick_params(labelbottom=False)
-    nats.axhline(0, color="0.7", lw=0.8)
-    nats.set_ylabel("information [nats]")
-    shares.set_ylabel("of all touches [%]")
-    shares.set_ylim(-3, 103)
-    shares.set_xlabel(fill(sweep["title"], _LINE))
+
+def _points(row: int, sweep: Mapping[str, Any]) -> Iterator[tuple[float, float, float, bool]]:
+    """Where each level stands, the share [%] of truths in the 90 % region, that of undetected failures, and whether the level is
+    in the promised range."""
+    levels = sweep["levels"]
+    for k, at in enumerate(levels):
+        y = row + _SLANT * (k / max(len(levels) - 1, 1) - 0.5)
+        f = at["figures"]
+        yield y, 100 * f["coverage"][1]["share"], 100 * f["silent"], at["level"] in sweep["inside"]
+
+
+def _regions_found(rows: list[tuple[str, Mapping[str, Any]]]) -> str:
+    held = [p[1] for row, (_, sweep) in enumerate(rows) for p in _points(row, sweep) if p[3]]
+    return f"In the promised range the 90 % region\nholds {min(held):.0f} to {max(held):.0f} % of the true poses"
+
+
+def _failures_found(rows: list[tuple[str, Mapping[str, Any]]]) -> str:
+    silent = [(p[2], p[3]) for row, (_, sweep) in enumerate(rows) for p in _points(row, sweep)]
+    within, beyond = (max((s for s, promised in silent if promised == which), default=0.0) for which in (True, False))
+    return f"Undetected failures: at most {within:.0f} % in the\npromised range, {beyond:.0f} % beyond it"
