@@ -55,7 +55,7 @@ def test_runs_that_agree_on_nothing_have_half_of_the_probability(localizer, touc
     assert "two runs of the sampler do not agree" in found.warnings[-1]
     density = found.explored.density
     assert density.trust == 0.5 and density.weights[0] >= 0.5 and density.weights.sum() == pytest.approx(1)
-    assert found.explored.masses.sum() <= 0.5 + 1e-9
+    assert found.explored.masses.sum() <= 1 + 1e-9 and found.diagnostics.settled_power == 0
     T = localizer.space.sample(200, np.random.default_rng(2))[0]
     coarse = density.of_powers(T)[:, 0] - density.log_inside
     assert (found.log_density(T) >= coarse + np.log(0.5) - 1e-9).all()
@@ -142,20 +142,23 @@ def test_registration_moves_a_mode_within_its_radius(posterior):
     assert (np.linalg.eigvalsh(first.covariance) > 0).all()
 
 
-def test_modes_that_hold_more_than_everything_are_not_believed(localizer, touch, monkeypatch):
-    monkeypatch.setattr(two_runs, "weighed", lambda found, further, log_measure, contacts, rng: (found, 5.0))
+@pytest.mark.parametrize("excess, trust", [(0.5, 1.0), (5.0, 0.5)])
+def test_modes_that_hold_more_than_everything_raise_the_evidence(localizer, touch, monkeypatch, excess, trust):
+    """By as much; where that is more than runs may differ by, what they found has half of the probability alone."""
+    drawn = []
+
+    def weighed(found, *_):
+        drawn.append(found)
+        return found, excess
+
+    monkeypatch.setattr(two_runs, "weighed", weighed)
     found = localizer.localize(touch.mask, "mask", effort=EFFORT)
-    assert "do not agree" in found.warnings[-1]
-    T = found.poses[:50]
-    own = found.explored.density
-    flatter = replace(
-        own, log_evidence=(own.log_evidence[0], *(each - 5.0 + np.log(0.5) for each in own.log_evidence[1:]))
-    )
+    own, before = found.explored.density, drawn[-1].density
+    assert own.trust == trust and ("do not agree" in " ".join(found.warnings)) == (trust < 1)
     np.testing.assert_allclose(
-        own.of_powers(T)[:, 1:] - flatter.of_powers(T)[:, 1:],
-        -5.0 + np.log(0.5),
-        err_msg="evidence is raised by as much",
+        np.subtract(own.log_evidence, before.log_evidence), [0.0] + [excess] * (len(own.powers) - 1)
     )
+    np.testing.assert_allclose(found.explored.log_density, own.log_density(found.explored.poses), atol=1e-6)
 
 
 def test_modes_share_the_mass_out(posterior):

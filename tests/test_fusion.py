@@ -17,12 +17,11 @@ from geomtact.contact_space.touches import random_touches
 from geomtact.errors import InputError, NoPoseAgreesError, UsageError
 from geomtact.evaluation import simultaneous_touches
 from geomtact.inference.distribution import cell_densities, cell_log_density
-from geomtact.inference.effort import GRID_ALONE, Effort
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.inference.extrinsics import extrinsics_covariance
 from geomtact.inference.fusion import _shares, disagreement, fuse, poor_agreement
 from geomtact.sensing.image_file import write_image
-
-CELLS = Effort(0)
+from geomtact.sensing.reading import read_observation
 
 
 def world(touches, rng):
@@ -204,6 +203,21 @@ def test_a_sensor_without_contact_lowers_poses_that_would_touch_it(plug, rng):
     assert np.corrcoef(share, ratio)[0, 1] < -0.9 and ratio[share.argmin()] > 0 > ratio[share.argmax()]
 
 
+def test_a_contact_that_is_not_found_in_an_image_is_warned_of(plug, rng):
+    """An empty mask says that nothing touches; an image may hide a contact."""
+    touch = random_touches(plug.space, 1, 7)[0]
+    _, sensors = world([touch], rng)
+    both = np.stack([sensors[0], se3.transform(np.eye(3), [0, 0, 1.0]) @ sensors[0]])
+    grey, empty = np.full((*touch.mask.shape, 3), 128, np.uint8), np.zeros_like(touch.mask)
+    shown = read_observation(touch.mask, plug.sensor, "mask")
+    for other, warned in (
+        (read_observation(grey, plug.sensor, "reading", grey), True),
+        (read_observation(empty, plug.sensor, "mask"), False),
+    ):
+        warnings = plug.localize([shown, other], "auto", None, both, effort=GRID_ALONE).warnings
+        assert any(w.startswith("sensor 2: no contact was found") for w in warnings) == warned
+
+
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (3, 4, 0, 1, 2), (0, 3, 1, 4, 2)])
 @pytest.mark.slow
 def test_sensors_out_of_reach_do_not_change_the_posterior(plug, order):
@@ -212,8 +226,8 @@ def test_sensors_out_of_reach_do_not_change_the_posterior(plug, order):
     far = [se3.transform(np.eye(3), [0, 0, z]) @ sensors[0] for z in (2.0, 3.0)]
     masks, T = [t.mask for t in touches], [*sensors, *far]
     masks += [np.zeros_like(masks[0])] * 2
-    alone = plug.localize(masks[:3], "mask", None, T[:3], effort=CELLS)
-    posterior = plug.localize([masks[i] for i in order], "mask", None, [T[i] for i in order], effort=CELLS)
+    alone = plug.localize(masks[:3], "mask", None, T[:3], effort=GRID_ALONE)
+    posterior = plug.localize([masks[i] for i in order], "mask", None, [T[i] for i in order], effort=GRID_ALONE)
     assert abs(np.exp(posterior.log_prob) - np.exp(alone.log_prob)).sum() < 1e-3
     assert posterior.entropy_nats == pytest.approx(alone.entropy_nats, abs=1e-3)
     for one, other in zip(alone.modes(3), posterior.modes(3), strict=True):

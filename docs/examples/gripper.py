@@ -13,7 +13,8 @@ from geomtact.planning.jaw import close_jaw, first_grasp
 from geomtact.report.exchange import to_ros
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--part", default="head")
+parser.add_argument("--part", default="head", help="name of a bundled object, or a mesh file")
+parser.add_argument("--unit", help="of a mesh file that states none: mm, cm, m or inch")
 parser.add_argument("--sensor", default="gelslim")
 parser.add_argument("--max-poses", type=int, default=300_000)
 parser.add_argument("--seed", type=int, default=4)
@@ -50,7 +51,7 @@ def grasped(localizer, rng):
     return width, masks, T_gripper_part
 
 
-localizer = Localizer.prepare(options.part, sensor=options.sensor, max_poses=options.max_poses)
+localizer = Localizer.prepare(options.part, options.unit, options.sensor, max_poses=options.max_poses)
 width, masks, truth = grasped(localizer, np.random.default_rng(options.seed))
 
 # --- from here on as on the robot: `width` comes from its joint, `masks` from its cameras

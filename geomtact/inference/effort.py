@@ -14,9 +14,9 @@ class Effort:
     Attributes
     ----------
     modes : that are refined, where the pose is resolved within the cells
-    contacts : that are cut at most to resolve the pose within the cells of the grid, on all sensors together. A twentieth of
-        them on each settles most touches, but 10,000 are cut at least (see ``inference.two_runs``). Of one sensor, half as many
-        more weigh the modes. 0 leaves the cells as they are
+    contacts : that the largest attempt to resolve the pose within the cells of the grid may cut, on all sensors together. The
+        first one has a twentieth of them on each, 10,000 at least, and settles most touches (see ``inference.two_runs``). Of one
+        sensor, half as many more weigh the modes, and the density at poses takes more. 0 leaves the cells as they are
     thorough : whether each mode is refined by all registrations or by one
     """
 

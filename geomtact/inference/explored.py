@@ -103,6 +103,7 @@ class Density:
         asked = Placements(place, poses.direction[rows], poses.rotation[rows], flat[:, :2], reach)
         cut, log_likelihood = query.compare(index, asked, flat[:, 2])
         each = self.by_power(log_likelihood, self.target.log_coarse[place])
+        each[~np.isfinite(log_likelihood)] = -np.inf  # what touches nothing is no pose, by whatever power
         if isinstance(self.target.prior, CellPrior):
             each += self.target.prior.log_density(asked, cut.reach - flat[:, 2])[:, None]
         # volumes with errors are larger

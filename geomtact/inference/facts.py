@@ -30,8 +30,8 @@ class Diagnostics:
     misfit_nats : by how much the contacts that are cut at the likeliest pose miss the masks, and their depths those that were
         measured, for every 15 mm of outline; inf where no pose suits all, None where no contacts were cut
     evidence_of : what ``log_evidence`` compares: the "moments" of a contact, or "contacts" that are cut at poses
-    settled_power : largest power of the likelihood that the contacts settle within the cells, 1 the sharpest; None where the
-        posterior is that of the cells
+    settled_power : largest power of the likelihood that the contacts settle within the cells, 1 the sharpest, 0 none; None
+        where the posterior is that of the cells
     frame : number of the frame in a sequence, from 1; None outside of one
     surprise_nats : log of how likely the posterior of the frame before made this frame, relative to chance; None where
         nothing was compared

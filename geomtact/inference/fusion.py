@@ -45,6 +45,10 @@ _LEAST_CORRELATION = 0.1
 _NEGLIGIBLE_NATS = 25.0  # log density below that of the most probable place from which a place has no weight; hand-set
 _UNLIKELY_DENSITY = 0.1  # density relative to the uniform below which a place is transferred by one pose; hand-set
 _DISAGREES_NATS = -2.0  # support of the other sensors for an image below which a disagreement is reported; hand-set
+_NOT_FOUND = (
+    "no contact was found in its image, which counts against poses that touch there; if it does touch the object, leave it out, "
+    "or give its contact mask"
+)
 _POINTS, _ROUGH_POINTS = 60, 20  # of an outline, at most, to register modes, and many poses; hand-set
 
 
@@ -239,7 +243,14 @@ def _without_contact(touches: Sequence[Posterior], prior: Any) -> Posterior:
 def _of_all(touches: Sequence[Posterior], disagreements: Sequence[str] | None = None) -> dict[str, Any]:
     """Fields of the joint posterior that collect those of all ``touches``, in their order; warnings with the sensor's number."""
     first = next((touch for touch in touches if touch.contact), touches[0])
-    warnings = [f"sensor {i}: {warning}" for i, touch in enumerate(touches, 1) for warning in touch.warnings]
+    of_object = [w for w in first.warnings if all(w in touch.warnings for touch in touches if touch.contact)]
+    warnings = of_object + [
+        f"sensor {i}: {warning}"
+        for i, touch in enumerate(touches, 1)
+        for warning in touch.warnings
+        if warning not in of_object
+    ]
+    warnings += [f"sensor {i}: {_NOT_FOUND}" for i, touch in enumerate(touches, 1) if _finds_nothing(touch)]
     return {
         "observations": [o for touch in touches for o in touch.observations],
         "provenance": replace(first.provenance, views=tuple(v for t in touches for v in t.provenance.views)),
@@ -248,6 +259,11 @@ def _of_all(touches: Sequence[Posterior], disagreements: Sequence[str] | None = 
         ),
         "warnings": warnings + list(disagreements or []),
     }
+
+
+def _finds_nothing(touch: Posterior) -> bool:
+    """Whether no contact was found in its camera image."""
+    return not touch.contact and touch.observation is not None and touch.observation.method is not None
 
 
 def disagreement(fused: Fused, with_prior: bool = False) -> str | None:

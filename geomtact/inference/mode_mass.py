@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.contact_maps import sample_pitch
 from geomtact.geometry.distance import PoseDistance, mode_radius
+from geomtact.geometry.mesh import Mesh
 from geomtact.inference.explored import Explored
 from geomtact.inference.student import Student, log_volume
 from geomtact.inference.systematic_errors import errors_of
@@ -95,6 +96,17 @@ def counted(
     mass = _shared_out(explored, members, np.array([explored.weight[rows].sum() for rows in members]))
     order = np.argsort(-mass, kind="stable")
     return replace(explored, hearts=hearts[order], masses=mass[order] * draws / (draws + 1))
+
+
+def shares_near(mesh: Mesh, hearts: Array, T: Array) -> Array:
+    """Share (m,) of the poses ``T`` (n, 4, 4) near each of ``hearts`` (m, 4, 4); a pose counts for the first that it is near."""
+    distance, radius, free = PoseDistance(mesh, _POINTS), mode_radius(mesh), np.ones(len(T), bool)
+    out = np.zeros(len(hearts))
+    for i, heart in enumerate(hearts):
+        near = free & distance.within(heart, T, radius)
+        out[i] = near.mean()
+        free &= ~near
+    return out
 
 
 def _modes(explored: Explored, hearts: Array, members: list[NDArray[np.int64]], distance: PoseDistance) -> list[_Mode]:

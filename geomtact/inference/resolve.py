@@ -118,8 +118,9 @@ def _resolved(
     if explored is None:
         warning = f"the pose is not resolved within the grid's cells: {found.why_not}"
         return replace(posterior, diagnostics=diagnostics, warnings=[*posterior.warnings, warning])
-    power = explored.density.powers[-1] / POWERS[-1]
-    warnings = [] if explored.density.trust == 1 else [_UNCONFIRMED]
+    settled = explored.density.trust == 1
+    power = explored.density.powers[-1] / POWERS[-1] if settled else 0.0
+    warnings = [] if settled else [_UNCONFIRMED]
     return replace(
         posterior,
         explored=explored,

@@ -1,8 +1,8 @@
 """The distribution of a pose from two runs of the sampler, which are compared.
 
 One run does not show what it has missed. So two are compared: where they disagree on the evidence, one has missed what the other
-found; where the masses of the modes add up to more than 1, both have. Then more contacts are cut, or the sharpest powers are left
-out. Where that does not help, the coarse posterior has half of the probability.
+found; where the masses of the modes add up to much more than 1, both have. Then more contacts are cut, or the sharpest powers are
+left out. Where that does not help, the coarse posterior has half of the probability.
 
 How likely the contacts are at all is known even where the runs do not agree, only less exactly.
 """
@@ -17,9 +17,9 @@ import numpy as np
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
-from geomtact.inference.explored import Explored
+from geomtact.inference.explored import Density, Explored
 from geomtact.inference.facts import UNEXPLAINED_NATS
-from geomtact.inference.mode_mass import counted, weighed
+from geomtact.inference.mode_mass import counted, shares_near, weighed
 from geomtact.inference.particles import OtherSensor, Particles
 from geomtact.inference.population import systematic
 from geomtact.inference.pose_prior import NormalPrior, PosePrior
@@ -121,14 +121,13 @@ def _agreed(
 ) -> tuple[Explored | None, int]:
     """The distribution of the pose by the largest power of the likelihood at which two runs differ by ``most`` nats a sensor,
     where ``left_out`` powers at most are larger, if there is one; and how many contacts were cut until then, ``cut`` of them
-    before.
+    before. The masses of the modes may add up to more than 1 by as many nats; then the evidence is raised.
 
     Raises
     ------
     InputError
         No pose that was found touches the sensor.
     """
-    several = bool(one.density.target.others)
     for last in range(len(one.log_evidence) - 1, 0, -1):
         if one.density.powers[last] < POWERS[-1 - left_out]:
             break
@@ -137,8 +136,11 @@ def _agreed(
         if run.density.weights @ apart >= most * run.density.target.sensors:
             continue
         found, log_sum = _with_modes(one, other, run, last, asked, rng)
-        if several or log_sum < 0:
+        if log_sum <= 0:
             return found, cut
+        if log_sum < most:
+            density = _raised(found.density, log_sum)
+            return replace(found, density=density, log_density=density.log_density(found.poses)), cut
         cut = found.contacts
     return None, cut
 
@@ -158,23 +160,23 @@ def _with_modes(
 
 
 def _by_one_run(one: Run, other: Run, asked: int, cut: int, rng: np.random.Generator) -> Explored:
-    """What two runs that do not agree found, with the probability ``_TRUST``, else the coarse posterior.
-
-    Where the modes of one sensor have a larger mass than that, the evidence is too small by as much.
-    """
+    """What two runs that do not agree found, with the probability ``_TRUST``, else the coarse posterior."""
     last = len(one.log_evidence) - 1
-    run = replace(pooled(one, other, last, rng), contacts=cut)
-    run = replace(run, density=replace(run.density, trust=_TRUST))
+    run = replace(pooled(one, other, last, rng, alike=False), contacts=cut)
     found, log_sum = _with_modes(one, other, run, last, asked, rng)
-    if run.density.target.others:
-        return replace(found, masses=_TRUST * found.masses)
-    excess = log_sum - float(np.log(_TRUST))
-    if excess <= 0:
-        return found
-    evidence = np.array(run.density.log_evidence) + np.where(np.array(run.density.powers) > 0, excess, 0)
-    density = replace(found.density, log_evidence=tuple(evidence.tolist()))
-    masses = found.masses * (_TRUST / max(found.masses.sum(), 1e-300))
-    return replace(found, density=density, masses=masses, log_density=density.log_density(found.poses))
+    density = replace(_raised(run.density, log_sum), trust=_TRUST)
+    drawn = _explored_from(replace(run, density=density, contacts=found.contacts), len(found.poses), rng)
+    coarse = density.target.poses(run.particles[0])
+    masses = _TRUST * found.masses + (1 - _TRUST) * shares_near(run.density.index.mesh, found.hearts, coarse)
+    return replace(drawn, hearts=found.hearts, masses=masses)
+
+
+def _raised(density: Density, log_sum: float) -> Density:
+    """``density`` with an evidence larger by ``log_sum``, the log of the sum of the modes' masses, if that is positive."""
+    if log_sum <= 0:
+        return density
+    evidence = np.array(density.log_evidence) + np.where(np.array(density.powers) > 0, log_sum, 0)
+    return replace(density, log_evidence=tuple(evidence.tolist()))
 
 
 def _log_evidence(one: Run, other: Run) -> float:
@@ -214,16 +216,16 @@ def _kept(run: Run, last: int) -> list[int]:
     return [stop for stop in range(last) if run.density.powers[stop] in POWERS] + [last]
 
 
-def pooled(one: Run, other: Run, last: int, rng: np.random.Generator) -> Run:
-    """Two runs as one, up to the ``last`` stop: of each posterior the particles of both, of one sensor by how likely each run
-    makes the contact. With several sensors that is mostly chance, where runs agree, and both count alike."""
+def pooled(one: Run, other: Run, last: int, rng: np.random.Generator, alike: bool = True) -> Run:
+    """Two runs as one, up to the ``last`` stop: of each posterior the particles of both, by how likely each run makes the
+    contact. With several sensors that is mostly chance, where runs agree, and both count ``alike``."""
     particles, evidence, kept = [], [], _kept(one, last)
     for stop in kept:
         first, second = one.particles[stop], other.particles[stop]
         a, b = one.log_evidence[stop], other.log_evidence[stop]
         evidence.append(float(np.logaddexp(a, b) - np.log(2)))
         share, n = float(np.exp(a - np.logaddexp(a, b))), len(first) + len(second)
-        if one.density.target.others:
+        if one.density.target.others and alike:
             share = 0.5
         of_first = systematic(np.ones(len(first)), round(share * n), rng)
         of_second = systematic(np.ones(len(second)), n - round(share * n), rng)
