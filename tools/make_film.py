@@ -1,6 +1,6 @@
 """Draw the moving picture of README.md, docs/images/three_touches.gif:
 
-    python tools/make_film.py [--max-poses N] [--out FILE]
+    python -m tools.make_film [--max-poses N] [--out FILE]
 
 An elbow pipe is touched three times by a GelSlim, in simulation. Of 20 such triples, touched anywhere, it shows the one
 whose information gain at the true pose is the tenth largest after three touches. About three minutes on two cores.
@@ -61,7 +61,7 @@ class Step:
 def simulate(folder: Path) -> tuple[list[Triple], Array]:
     """The triples and the image of the untouched gel, by the command line."""
     n = str(TRIPLES * TOUCHES)
-    words = ["simulate", OBJECT, "--sensor", SENSOR, "--n", n, "--seed", str(SEED), "--reading", "--noise", "moderate"]
+    words = ["simulate", OBJECT, "--sensor", SENSOR, "--n", n, "--seed", str(SEED), "--tactile-image", "--noise", "moderate"]
     subprocess.run([sys.executable, "-m", "geomtact", *words, "--out", str(folder)], check=True, stdout=sys.stderr)
     stems = [folder / f"{OBJECT}_{i + 1}" for i in range(TRIPLES * TOUCHES)]
     images = [np.asarray(Image.open(f"{stem}.png")) for stem in stems]
@@ -172,13 +172,13 @@ class Stage:
         values = [(0.0, 0.0)] + [(step.gain, 100 * step.probability) for step in steps]
         values[-1] = tuple(np.array(values[-2]) + grown * (np.array(values[-1]) - values[-2]))
         number = [*range(len(steps)), len(steps) - 1 + grown]
-        names, tops = ("information gain [nats]", "probability of mode 1 [%]"), (14, 110)
+        names, tops = ("information gain [nats]", "probability of mode 1 [%]"), (30, 110)
         for axes, heights, name, top in zip(panels, zip(*values, strict=True), names, tops, strict=True):
             axes.plot(number, heights, color=ORANGE, lw=2, marker="o", ms=5, clip_on=False)
             axes.set(xlim=(0, TOUCHES + 0.15), ylim=(0, top), xticks=range(TOUCHES + 1), title=name)
             axes.grid(axis="y", color="0.9")
         left = float(f"{np.exp(values[-1][0]):.2g}")  # as many nats are worth, to two digits
-        panels[0].text(0.1, 12, f"1 pose in {left:,.0f} left", color=INK)
+        panels[0].text(0.1, 26, f"1 pose in {left:,.0f} left", color=INK)
         panels[1].set_xlabel("touches")
 
 
