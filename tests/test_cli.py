@@ -305,8 +305,10 @@ def test_localize_takes_all_from_the_image_and_writes_everything(geomtact, touch
     assert written == ["posterior.npz", "report.html", "report.png", "result.json"]
     content = json.loads((tmp_path / "out" / "result.json").read_text())
     truth = json.loads((touched / "ball_1.json").read_text())
-    centre = np.array(content["modes"][0]["T"]) @ [0, 0, 0, 1] - np.array(truth["T_sensor_object"]) @ [0, 0, 0, 1]
-    assert np.linalg.norm(centre[:2]) < 1e-3  # the ball's own origin is its centre
+    # the ball's own origin is its centre; its contact is cut off by the border, so that neighbouring modes share the mass
+    centres = np.array([mode["T"] for mode in content["modes"]])[:, :2, 3]
+    off = np.linalg.norm(centres - np.array(truth["T_sensor_object"])[:2, 3], axis=1)
+    assert off.min() < 1e-3 and off[0] < 2.5e-3
     assert content["settings"]["seed"] == 0
 
     # only JSON on standard output, and the index comes from the cache now

@@ -13,7 +13,6 @@ from geomtact import Localizer
 from geomtact.cli import app
 from geomtact.evaluation import LEVELS, Outcome, accuracy, assess, changed, coverage, simultaneous_touches
 from geomtact.geometry.distance import PoseDistance
-from geomtact.inference.effort import GRID_ALONE
 
 TOUCHES = 2
 
@@ -53,7 +52,7 @@ def timeless(content):
 
 def test_an_exact_posterior_covers_its_own_draws_and_gains_what_it_expects(plug, a_touch):
     """A pose drawn from the posterior is a true pose for which that posterior is exact."""
-    posterior = plug.localize(a_touch(plug)[1], "mask", effort=GRID_ALONE)
+    posterior = plug.localize(a_touch(plug)[1], "mask", effort="fast")
     distance = PoseDistance(plug.mesh)
     found = [assess(posterior, T, 1, distance) for T in posterior.sample(120, np.random.default_rng(0))]
     for each in coverage([each.level for each in found], LEVELS, 0.999):
@@ -97,7 +96,7 @@ def test_an_outcome_is_what_the_posterior_says_of_the_true_pose(whole, plug):
     _, content, _ = whole
     scene = next(iter(simultaneous_touches(plug.space, TOUCHES, 3, 1)))
     images = [touch.mask for touch in scene.touches[:2]]
-    posterior = plug.localize(images, "mask", None, scene.T_world_sensor[:2], effort=GRID_ALONE, seed=1)
+    posterior = plug.localize(images, "mask", None, scene.T_world_sensor[:2], effort="fast", seed=1)
     outcome = content["outcomes"][0][1]
     assert outcome["information_gain_nats"] == posterior.log_density(scene.T_world_object)
     assert outcome["credible_level"] == posterior.credible_level(scene.T_world_object)

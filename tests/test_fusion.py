@@ -208,7 +208,7 @@ def test_a_contact_that_is_not_found_in_an_image_is_warned_of(plug, rng):
     touch = random_touches(plug.space, 1, 7)[0]
     _, sensors = world([touch], rng)
     both = np.stack([sensors[0], se3.transform(np.eye(3), [0, 0, 1.0]) @ sensors[0]])
-    grey, empty = np.full((*touch.mask.shape, 3), 128, np.uint8), np.zeros_like(touch.mask)
+    grey, empty = rng.integers(100, 140, (*touch.mask.shape, 3), np.uint8), np.zeros_like(touch.mask)
     shown = read_observation(touch.mask, plug.sensor, "mask")
     for other, warned in (
         (read_observation(grey, plug.sensor, "reading", grey), True),

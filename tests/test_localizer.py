@@ -97,7 +97,7 @@ def test_efforts_differ_in_resolution_and_in_refinement(curved, a_touch):
     for each in (fast, balanced, exact):
         assert len(each.cells) == len(alone.cells)
         assert each.explored is not None and each.information_gain_nats > alone.information_gain_nats + 1
-    assert fast.explored.contacts < balanced.explored.contacts < exact.explored.contacts
+    assert fast.explored.contacts <= balanced.explored.contacts < exact.explored.contacts
     assert len(fast.refined) == 0 < len(balanced.refined) <= 5 <= len(exact.refined) <= 25
     refined = np.stack([found.T for found in balanced.refined.values()])
     before, after = (

@@ -393,7 +393,7 @@ def test_trajectories_creep_and_stay_in_contact(flat_nut):
 def test_the_study_reports_the_figures_of_the_posteriors(flat_nut):
     (followed,) = track_study.follow(flat_nut, 3, 0, 3, MODERATE, "fast", first=2)
     t = track_study.make_trajectory(flat_nut, 2, 0, 3, MODERATE)
-    for k, (p, T) in enumerate(zip(track(flat_nut, t.masks), t.T_sensor_object, strict=True)):
+    for k, (p, T) in enumerate(zip(track(flat_nut, t.masks, effort="fast"), t.T_sensor_object, strict=True)):
         assert followed.gain["filter"][k] == pytest.approx(p.log_density(T), abs=1e-4)
         assert followed.claimed["filter"][k] == pytest.approx(-p.entropy_nats, abs=1e-3)
         assert followed.level["filter"][k] == pytest.approx(p.credible_level(T), abs=0.05)
@@ -431,7 +431,7 @@ def folder(tmp_path, creeping):
 
 def test_track_prints_a_line_a_frame(command, folder, flat_nut, creeping):
     lines = [json.loads(s) for s in command(folder, "--tum", "out.txt").stdout.splitlines()]
-    expected = list(track(flat_nut, creeping[0][0].masks[:3]))
+    expected = list(track(flat_nut, creeping[0][0].masks[:3], effort="fast"))
     assert [line["frame"] for line in lines] == [1, 2, 3]
     for line, posterior in zip(lines, expected, strict=True):
         mode = posterior.modes(1)[0]

@@ -77,7 +77,7 @@ def test_a_sequence_is_evaluated_at_its_last_frame(flat_nut, monkeypatch):
     answers = list(stability.swept(flat_nut, SWEEPS["slips"], 1, 2, 3, "fast"))
     for number, answer in enumerate(answers):
         made = random_trajectory(flat_nut.space, 8, 3000 + number, 2 * MM, slips=(4,), elastic=number % 2 == 1)
-        frames = list(flat_nut.track(made.masks, effort=GRID_ALONE, kind="mask", seed=3))
+        frames = list(flat_nut.track(made.masks, effort="fast", kind="mask", seed=3))
         slipped = any("possible slip" in warning for frame in frames for warning in frame.warnings)
         assert answer == replace(judged(flat_nut.mesh, made.T_sensor_object[-1], frames[-1]), warned=slipped)
     assert any(answer.warned for answer in answers)
@@ -207,7 +207,7 @@ def test_the_outline_cut_off_is_counted_in_pixel_edges():
 def test_an_unperturbed_world_gives_the_localizers_own_posteriors(plug, here):
     answers = list(stability.swept(plug, SWEEPS["size"], 0, 2, 5, "fast"))
     for answer, (T, mask) in zip(answers, worlds.touches(here, 2, 5), strict=True):
-        assert answer == judged(plug.mesh, T, plug.localize(mask, "mask", effort=GRID_ALONE, seed=5))
+        assert answer == judged(plug.mesh, T, plug.localize(mask, "mask", effort="fast", seed=5))
         assert np.isfinite(answer.gain)
 
 
@@ -332,7 +332,7 @@ def test_a_stopped_study_goes_on_and_its_picture_comes_from_the_file_alone(comma
 def test_the_records_of_all_objects_are_pooled():
     one, other = Answer(1.23456, 1.0, 0.3, 1.0, 0.9, False), REFUSED
 
-    def part(*answers, effort=GRID_ALONE):
+    def part(*answers, effort="fast"):
         settings = dict.fromkeys(evaluate_stability._ALIKE) | {"effort": effort}
         level = {"level": 2, "figures": stability.summarise(answers), "answers": evaluate_stability._columns(answers)}
         sweeps = {"specks": {"title": "specks", "inside": [2], "levels": [plain(level)]}}

@@ -61,7 +61,19 @@ class Step:
 def simulate(folder: Path) -> tuple[list[Triple], Array]:
     """The triples and the image of the untouched gel, by the command line."""
     n = str(TRIPLES * TOUCHES)
-    words = ["simulate", OBJECT, "--sensor", SENSOR, "--n", n, "--seed", str(SEED), "--tactile-image", "--noise", "moderate"]
+    words = [
+        "simulate",
+        OBJECT,
+        "--sensor",
+        SENSOR,
+        "--n",
+        n,
+        "--seed",
+        str(SEED),
+        "--tactile-image",
+        "--noise",
+        "moderate",
+    ]
     subprocess.run([sys.executable, "-m", "geomtact", *words, "--out", str(folder)], check=True, stdout=sys.stderr)
     stems = [folder / f"{OBJECT}_{i + 1}" for i in range(TRIPLES * TOUCHES)]
     images = [np.asarray(Image.open(f"{stem}.png")) for stem in stems]
