@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from geomtact.errors import NoPoseAgreesError, UsageError
-from geomtact.inference.effort import Effort, effort_of
+from geomtact.inference.effort import LEAST_CONTACTS, Effort, effort_of
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.views import read_views
 from geomtact.localizer import Localizer
@@ -28,8 +28,7 @@ _MISFIT_NATS = 10.0
 _POWER = {"moments": 0.25, "contacts": 0.5}
 # Probability that the evidence says nothing, because the right pose was not found: fitted with the power of contacts.
 _MISSED = 0.02
-_ROUGHLY = 10_000  # contacts by which it is decided which objects to look at closely
-_HARDLY = 0.01  # probability below which they are not; hand-set
+_HARDLY = 0.01  # probability, by the least contacts, below which an object is not looked at closely; hand-set
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def identify(
 def _efforts(effort: str | Effort) -> list[Effort]:
     """The efforts by which an object is looked at, the last one only where the object may be the right one."""
     asked = effort_of(effort)
-    roughly = replace(asked, modes=0, contacts=min(asked.contacts, _ROUGHLY))
+    roughly = replace(asked, modes=0, contacts=min(asked.contacts, LEAST_CONTACTS))
     return [asked] if roughly.contacts == asked.contacts else [roughly, asked]
 
 

@@ -14,11 +14,11 @@ from geomtact.contact_space.touches import random_touches
 from geomtact.evaluation import simultaneous_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import sampler, two_runs
-from geomtact.inference.effort import GRID_ALONE, Effort
+from geomtact.inference.effort import GRID_ALONE, LEAST_CONTACTS, Effort
 from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
 from geomtact.sensing.reading import read_observation
 
-EFFORT = Effort(3, contacts=96_000)  # 6,000 at first
+EFFORT = Effort(3, contacts=96_000)  # 10,000 at first
 SCENES = {"anywhere": (None, 20_000), "on a known face": ([((0, 0, 1), 0.0)], 8_000)}  # approach and poses
 
 
@@ -96,7 +96,7 @@ def test_powers_on_which_runs_disagree_are_left_out(localizer, touch, monkeypatc
     assert found.explored.contacts > sum(each.contacts for each in seen)  # of modes too
     assert found.diagnostics.settled_power == POWERS[1] / POWERS[-1] and not found.warnings
     monkeypatch.setattr(two_runs, "_LEFT_OUT", 2)
-    found = localizer.localize(touch.mask, "mask", effort=replace(EFFORT, contacts=4 * two_runs._LEAST))
+    found = localizer.localize(touch.mask, "mask", effort=replace(EFFORT, contacts=4 * LEAST_CONTACTS))
     assert len(seen) == 6 and found.explored.density.trust == 0.5
 
 
@@ -106,7 +106,7 @@ def test_its_particles_and_its_cells_have_all_mass(posterior):
 
 
 def test_the_density_is_1_in_the_mean_of_uniform_poses(localizer, posterior):
-    """Within four standard errors and a fifth, of which a budget of 6,000 contacts may err."""
+    """Within four standard errors and a fifth, of which a budget of 10,000 contacts may err."""
     poses = localizer.space.sample(2_000, np.random.default_rng(0))[0]
     density = np.exp(posterior.log_density(poses))
     assert abs(density.mean() - 1) < 4 * density.std() / np.sqrt(len(density)) + 0.2
@@ -186,7 +186,7 @@ def test_a_prior_counts_once(localizer, touch, posterior):
 
 
 def test_a_narrow_prior_is_resolved_alike_by_any_seed(localizer, touch):
-    """A first attempt with a sixteenth of the contacts may miss what is left of it, in both of its runs."""
+    """A first attempt with the least contacts may miss what is left of it, in both of its runs."""
     near = GaussianPrior(touch.T_sensor_object, np.diag([0.02] * 3 + [1e-3] * 3) ** 2)
     effort = replace(EFFORT, contacts=4 * EFFORT.contacts)
     found = [localizer.localize(touch.mask, "mask", effort=effort, prior=near, seed=seed) for seed in (0, 1)]

@@ -13,13 +13,12 @@ from geomtact.contact_space.draw import draw_within
 from geomtact.errors import InputError, PoseError, UsageError
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference.distribution import cell_log_density, row_poses
-from geomtact.inference.effort import Effort
+from geomtact.inference.effort import GRID_ALONE
 from geomtact.inference.posterior import Posterior
 from geomtact.se3 import exp, transform
 
 T_WORLD = exp([0.3, -1.2, 0.5, 0.4, -0.1, 0.7])
 MM = 1e-3
-CELLS = Effort(0)  # what is within the cells: test_explored.py
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +29,7 @@ def posteriors(a_touch):
     def of(localizer) -> Posterior:
         key = localizer.index.key
         if key not in found:
-            found[key] = localizer.localize(a_touch(localizer)[1], effort=CELLS)
+            found[key] = localizer.localize(a_touch(localizer)[1], effort=GRID_ALONE)
         return found[key]
 
     return of
@@ -247,7 +246,7 @@ def test_modes_are_allowed_poses(localizer, posteriors):
 
 
 def test_the_likeliest_poses_are_those_of_the_cells_with_most_mass(localizer, a_touch):
-    posterior = localizer.localize(a_touch(localizer)[1], T_world_sensor=T_WORLD, effort=CELLS)
+    posterior = localizer.localize(a_touch(localizer)[1], T_world_sensor=T_WORLD, effort=GRID_ALONE)
     mass = posterior.log_prob
     poses = posterior.likeliest(10)
     row = [int(np.abs(posterior.poses - T).max((1, 2)).argmin()) for T in poses]

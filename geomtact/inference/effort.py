@@ -31,9 +31,11 @@ class Effort:
             raise UsageError(f"Effort: expected 0 contacts or more, got {self.contacts}; give 0 for none")
 
 
+# Of an attempt on each sensor: with fewer, the evidence is mostly found too small, by more than a nat (docs/adaptive.md).
+LEAST_CONTACTS = 10_000
 GRID_ALONE = Effort(0)  # for studies, and for what lives on the cells of the grid
 EFFORTS = {
-    "fast": Effort(0, 10_000),
+    "fast": Effort(0, LEAST_CONTACTS),
     "balanced": Effort(5, 200_000, thorough=False),
     "exact": Effort(25, 800_000),
 }

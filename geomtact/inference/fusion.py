@@ -30,6 +30,7 @@ from geomtact.inference.mode_refiner import ModeRefiner
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.prior import prior_log_density, prior_log_mass
 from geomtact.inference.resolve import resolve_touches
+from geomtact.inference.single_touch import hollow_warnings
 from geomtact.inference.timing import timed
 from geomtact.log_mass import normalised
 from geomtact.registration.contact_problem import make_problem
@@ -45,10 +46,6 @@ _LEAST_CORRELATION = 0.1
 _NEGLIGIBLE_NATS = 25.0  # log density below that of the most probable place from which a place has no weight; hand-set
 _UNLIKELY_DENSITY = 0.1  # density relative to the uniform below which a place is transferred by one pose; hand-set
 _DISAGREES_NATS = -2.0  # support of the other sensors for an image below which a disagreement is reported; hand-set
-_NOT_FOUND = (
-    "no contact was found in its image, which counts against poses that touch there; if it does touch the object, leave it out, "
-    "or give its contact mask"
-)
 _POINTS, _ROUGH_POINTS = 60, 20  # of an outline, at most, to register modes, and many poses; hand-set
 
 
@@ -243,14 +240,11 @@ def _without_contact(touches: Sequence[Posterior], prior: Any) -> Posterior:
 def _of_all(touches: Sequence[Posterior], disagreements: Sequence[str] | None = None) -> dict[str, Any]:
     """Fields of the joint posterior that collect those of all ``touches``, in their order; warnings with the sensor's number."""
     first = next((touch for touch in touches if touch.contact), touches[0])
-    of_object = [w for w in first.warnings if all(w in touch.warnings for touch in touches if touch.contact)]
-    warnings = of_object + [
-        f"sensor {i}: {warning}"
-        for i, touch in enumerate(touches, 1)
-        for warning in touch.warnings
-        if warning not in of_object
-    ]
-    warnings += [f"sensor {i}: {_NOT_FOUND}" for i, touch in enumerate(touches, 1) if _finds_nothing(touch)]
+    of_object = [*first.index.mesh.warnings, *(hollow_warnings(first.index.space.hollow) if first.contact else [])]
+    warnings = list(of_object)
+    for i, touch in enumerate(touches, 1):
+        own = [warning for warning in touch.warnings if warning not in of_object]
+        warnings += [f"sensor {i}: {warning}" for warning in (*own, *_not_found(touch))]
     return {
         "observations": [o for touch in touches for o in touch.observations],
         "provenance": replace(first.provenance, views=tuple(v for t in touches for v in t.provenance.views)),
@@ -261,9 +255,14 @@ def _of_all(touches: Sequence[Posterior], disagreements: Sequence[str] | None = 
     }
 
 
-def _finds_nothing(touch: Posterior) -> bool:
-    """Whether no contact was found in its camera image."""
-    return not touch.contact and touch.observation is not None and touch.observation.method is not None
+def _not_found(touch: Posterior) -> list[str]:
+    """The warning, if any, that no contact was found in a camera image."""
+    if touch.contact or touch.observation is None or touch.observation.method is None:
+        return []
+    return [
+        "no contact was found in its image, which counts against poses that touch there; if it does touch the object, leave it "
+        "out, or give its contact mask"
+    ]
 
 
 def disagreement(fused: Fused, with_prior: bool = False) -> str | None:

@@ -134,9 +134,10 @@ class Posterior(CellDistribution):
     def log_density(self, T: ArrayLike) -> Any:
         """Natural log of the density at ``T`` (4, 4) or (n, 4, 4), in ``frame``, relative to the uniform distribution.
 
-        -inf outside the contact pose space; inside it finite, unless the prior ruled T out, or T misses another sensor that shows
-        contact. Where the pose is resolved within the cells, at most that of the densest pose in ``poses``. Without contact, -inf
-        where T would touch, however deep, and elsewhere the prior's, 0 without one.
+        -inf outside the contact pose space; inside it finite, unless the prior ruled T out, or the grid alone decides and the
+        cell of T misses another sensor that shows contact. Where the pose is resolved within the cells, at most that of the
+        densest pose in ``poses``. Without contact, -inf where T would touch, however deep, and elsewhere the prior's, 0 without
+        one.
 
         Raises
         ------

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from geomtact.errors import InputError, PoseError, UsageError, nearest_name
-from geomtact.inference.effort import Effort, effort_of
+from geomtact.inference.effort import GRID_ALONE, Effort, effort_of
 from geomtact.inference.facts import Diagnostics, TrackRecord
 from geomtact.inference.filter import FRAME_POWER, UNIFORM_SHARE, Counts, Filter, Resolve
 from geomtact.inference.motion import Motion, UniformBall
@@ -123,15 +123,13 @@ def _tracked(
     skip: bool,
 ) -> Iterator[Posterior]:
     index, motion, made_from, expected = prepared.index, state.motion_kernel.motion, None, None
-    effort = effort_of(options["effort"])
     record = TrackRecord({"kind": type(motion).__name__, **vars(motion)}, state.counts, state.fresh, state.most)
     for n, image, T in pairs:
         frame, at = ("sensor", np.eye(4)) if T is None else ("world", T)
         try:
             (view,) = read_views(image, T, prepared.sensors, options["kind"], options["background"])
             # frames are resolved after the filter's step, by the modes of its posterior
-            over_cells = replace(effort, contacts=0, modes=0 if effort.contacts else effort.modes)
-            seen = localize(view.observation, T_world_sensor=T, **options | {"effort": over_cells})
+            seen = localize(view.observation, T_world_sensor=T, **options | {"effort": GRID_ALONE})
             seen = replace(
                 seen,
                 provenance=replace(seen.provenance, effort=options["effort"]),

@@ -76,7 +76,7 @@ def touch_posterior(
             "out-of-distribution contact: no simulated touch of this object resembles it; "
             "check the object, the sensor and the mask"
         )
-    warnings.extend(_hollows(index.space.hollow))
+    warnings.extend(hollow_warnings(index.space.hollow))
     calibration = rows.calibration
     posterior = replace(
         posterior,
@@ -145,7 +145,7 @@ def _contradiction(nats: float) -> list[str]:
     ]
 
 
-def _hollows(share: float) -> list[str]:
+def hollow_warnings(share: float) -> list[str]:
     """The warning, if any, of an object with this share of its surface in hollows that are wider than the window."""
     if not share > _HOLLOW:
         return []

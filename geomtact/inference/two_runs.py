@@ -17,6 +17,7 @@ import numpy as np
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
+from geomtact.inference.effort import LEAST_CONTACTS
 from geomtact.inference.explored import Density, Explored
 from geomtact.inference.facts import UNEXPLAINED_NATS
 from geomtact.inference.mode_mass import counted, shares_near, weighed
@@ -39,7 +40,6 @@ _AGREE, _AGREE_AT_LAST = 1.0, 2.0
 # Of two runs that do not agree, one at least has missed something. So what they found rests on one run, which nothing confirms:
 # by the rule of succession another one would find the same with this probability.
 _TRUST = 0.5
-_LEAST = 10_000  # contacts of an attempt; with fewer, the evidence is mostly found too small, by more than a nat
 _SHARE = 20  # the first attempt cuts one of so many of all contacts on each sensor
 _MORE = 4  # times as many contacts are cut in each attempt after the first
 # powers that an attempt may leave out, before the last: of several sensors, of a mask, and of depths, whose likelihood is
@@ -88,12 +88,11 @@ def explore_twice(
     end, what they found has half of the probability, and the coarse posterior the rest.
     """
     cut, found = 0, Finding(None, unexplained_nats=np.inf if others else None)
-    attempts = [max(_LEAST, contacts // _SHARE)]
+    attempts = [max(LEAST_CONTACTS, contacts // _SHARE)]
     while _MORE * attempts[-1] * (1 + len(others)) <= contacts:
         attempts.append(_MORE * attempts[-1])
-    left_out = _LEFT_OUT if query.indentation is None else _LEFT_OUT_OF_DEPTHS
-    if others:
-        left_out = _LEFT_OUT_OF_SEVERAL
+    of_one = _LEFT_OUT if query.indentation is None else _LEFT_OUT_OF_DEPTHS
+    left_out = _LEFT_OUT_OF_SEVERAL if others else of_one
     for asked in attempts:
         try:
             one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, search)

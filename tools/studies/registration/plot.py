@@ -10,6 +10,7 @@ import numpy as np
 
 from geomtact.report.canvas import COLOURS, png
 from geomtact.se3 import Array
+from tools.studies.registration.study import OWN
 
 _NAMES = {
     "none": "start, not registered",
@@ -78,7 +79,7 @@ def _by(content: Mapping[str, Any], key: str) -> dict[str, tuple[list[float], Ar
 def _found(content: Mapping[str, Any]) -> str:
     """What the picture shows, in words."""
     mean = {name: float(shares.mean()) for name, (_, shares) in _by(content, "turn_deg").items()}
-    peers = {name: each for name, each in mean.items() if " " in name}
+    peers = {name: each for name, each in mean.items() if name not in OWN}
     if _OURS not in mean or not peers:
         return "Share of starts from which each method finds the true pose"
     best = max(peers, key=lambda name: peers[name])

@@ -30,15 +30,8 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
             points = list(_points(row, sweep))
             for axes, k in ((left, 1), (right, 2)):
                 axes.plot([p[k] for p in points], [p[0] for p in points], "-", color="0.7", lw=0.8)
-                for y, held, silent, promised in points:
-                    axes.plot(
-                        held if k == 1 else silent,
-                        y,
-                        "o",
-                        color=_HELD if promised else _BEYOND,
-                        mfc=_HELD if promised else "white",
-                        ms=4.5,
-                    )
+                for point in points:
+                    axes.plot(point[k], point[0], "o", ms=4.5, **_style(point[3]))
         left.set_yticks(range(len(rows)), [name for name, _ in rows])
         left.invert_yaxis()
         left.set_xlim(-2, 102)
@@ -48,12 +41,16 @@ def draw_stability(content: Mapping[str, Any]) -> bytes:
         for axes in (left, right):
             axes.grid(axis="y", alpha=0.3)
             axes.spines[["top", "right"]].set_visible(False)
-        left.plot([], [], "o", color=_HELD, label="promised to hold")
-        left.plot([], [], "o", color=_BEYOND, mfc="white", label="beyond")
+        left.plot([], [], "o", **_style(True), label="promised to hold")
+        left.plot([], [], "o", **_style(False), label="beyond")
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
         left.set_title(_regions_found(rows))
         right.set_title(_failures_found(rows))
         return png(figure)
+
+
+def _style(promised: bool) -> dict[str, str]:
+    return {"color": _HELD} if promised else {"color": _BEYOND, "mfc": "white"}
 
 
 def _rows(content: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
