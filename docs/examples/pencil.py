@@ -43,7 +43,7 @@ images = [localizer.simulate(inverse(finger) @ truth).mask for finger in fingers
 posterior = localizer.localize(images, T_world_sensor=fingers)
 modes = posterior.modes(2)
 print(
-    f"{-posterior.entropy_nats:.1f} nats gained; first modes {', '.join(f'{100 * m.probability:.0f} %' for m in modes)}"
+    f"{posterior.information_gain_nats:.1f} nats gained; first modes {', '.join(f'{100 * m.probability:.0f} %' for m in modes)}"
 )
 
 

@@ -36,7 +36,7 @@ for number in range(1, MOST_TOUCHES + 1):
     posterior = localizer.localize(images, T_world_sensor=stops)
     mode = posterior.modes(1)[0]
     off = 1e3 * PoseDistance(localizer.mesh).mean(truth, mode.T[None])[0]
-    known = f"{-posterior.entropy_nats:.1f} nats gained, mode 1 holds {100 * mode.probability:.0f} %"
+    known = f"{posterior.information_gain_nats:.1f} nats gained, mode 1 holds {100 * mode.probability:.0f} %"
     print(f"{number}: {known} (it is {off:.1f} mm off the truth)")
     if mode.probability >= SURE:
         break

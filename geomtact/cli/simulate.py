@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 _FOUND = 0.25  # share of a contact that is found in its tactile image, below which the image shows something else
-_LARGE = 0.1  # share of the window in contact, from which on the gel sinks in nearly all of it
+_LARGE = 0.1  # share of the window in contact, from which on pressing less deep helps
 
 
 class NoiseName(StrEnum):
@@ -161,13 +161,12 @@ def _warn(space: ContactSpace, touch: Touch, image: Path, background: Path | Non
     share = float((found & touch.mask).sum() / touch.mask.sum())
     if touch.mask.all():
         why = "the contact fills the window, so no slope changes the colours; touch an edge"
-    elif found.all() or (share < _FOUND and touch.mask.mean() > _LARGE):
+    elif found.all() or share < _FOUND:
+        press = "press less deep" if touch.mask.mean() > _LARGE else "press deeper"
         why = (
-            "the gel sinks in nearly all of the window, so colours do not show which side is pressed in; touch an edge or "
-            "press less deep"
+            f"by its colours {100 * found.mean():.0f} % of the window is in contact, not {100 * touch.mask.mean():.0f} %; "
+            f"touch an edge or {press}"
         )
-    elif share < _FOUND:
-        why = "the contact is small or shallow; press deeper"
     else:
         return
     to_stderr(f"warning: {image}: localize would not find this contact: {why}, or leave --tactile-image out")

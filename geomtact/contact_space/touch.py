@@ -34,18 +34,29 @@ def simulate_mask(
     return elastic_in_window(depth, pitch, margin, sensor.max_penetration)
 
 
-def simulate_depth_map(space: ContactSpace, T: ArrayLike, elastic: bool = True) -> NDArray[np.float32]:
-    """How deep the gel is pressed in [m] by the object at ``T`` (4, 4): (H, W) at the sensor's own resolution.
+def simulate_depth_map(
+    space: ContactSpace,
+    T: ArrayLike,
+    elastic: bool = True,
+    thickness: float = np.inf,
+    shape: tuple[int, int] | None = None,
+) -> NDArray[np.float32]:
+    """How deep the gel is pressed in [m] by the object at ``T`` (4, 4): (h, w) over the window.
 
-    An ``elastic`` gel sinks beside the contact too.
+    Parameters
+    ----------
+    elastic : the gel sinks beside the contact too
+    thickness : of an elastic gel [m]: a thin one hardly sinks beside the contact
+    shape : (h, w) of the result, the image's own by default
     """
+    h, w = shape or space.sensor.image_size_px[::-1]
     if not elastic:
-        height = space.caster.contact(space.sensor, T).height
+        height = space.caster.contact(space.sensor, T, (h, w)).height
         assert height is not None
         return height
-    depth, pitch, margin = _around(space, T, space.sensor.image_size_px[::-1])
+    depth, pitch, margin = _around(space, T, (h, w))
     gel, window = _where_gel(depth, margin, space.sensor.max_penetration)
-    return elastic_contact(gel, pitch)[1][window]
+    return elastic_contact(gel, pitch, thickness)[1][window]
 
 
 def _around(

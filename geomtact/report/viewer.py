@@ -58,7 +58,7 @@ class Viewer:
         scene = self._server.scene
         at = np.tile([1.0, 0, 0, 0], (_POSES, 1)), np.zeros((_POSES, 3))
         self._drawn = scene.add_batched_meshes_simple("/drawn", *shape, *at, batched_colors=colours[0], opacity=_FAINT)
-        self._mode = scene.add_mesh_simple("/mode", *shape, color=colours[1], opacity=0.8)
+        self._mode = scene.add_mesh_simple("/mode", *shape, color=colours[1])
         self._eye = mesh.diameter * np.array([0.4, -1.4, 0.8])  # in the sensor frame, for browsers that come
         self._rng = np.random.default_rng(0)
 

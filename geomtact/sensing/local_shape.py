@@ -4,7 +4,8 @@ The difference from the background is taken as a linear image of the gel's slope
 span the slope; the 2x2 map that is left unknown is the one that makes the slope field a gradient (free of curl). Its
 integral is the gel's indentation up to a factor; the rim of the contact is where, on the way up, the gel is steepest
 (``registration/contact_problem.py`` registers that rim). Or the pressure that bends an elastic gel so is worked
-out, and the contact is where there is any. A network needs no linear image: it is asked where light is blown out.
+out, and the contact is where there is any. A network needs no linear image: it is asked where light is blown out, or the gel
+bulges.
 """
 
 from __future__ import annotations
@@ -75,9 +76,9 @@ def contact_mask(
         pixels
     method : "classical": within the rim where the gel is steepest, by its slope, which colours give up to a factor; "pressure":
         where, by that slope, a thick elastic gel is pressed on; "learned": by a network trained on simulated images alone;
-        or "auto": learned where more than a hundredth of what changes is blown out, else classical. On a white gel, all of
-        whose change is along one colour, each takes what changes more than half as much as anywhere. None: as the sensor
-        says, "auto" without one
+        or "auto": learned where more than a hundredth of what changes is blown out, or the sensor's gel bulges, else classical.
+        On a white gel, all of whose change is along one colour, each takes what changes more than half as much as anywhere.
+        None: as the sensor says, "auto" without one
 
     Returns
     -------
@@ -113,6 +114,8 @@ def find_contact(
     if sensor is not None:
         sensor = Sensor.load(sensor)
         method = method or sensor.contact_method
+        if method == "auto" and sensor.membrane_radius:
+            method = "learned"  # colours at rest differ from place to place, so that they are no linear image of slopes
         pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
         check_size(image, sensor, "image")
     reference = None if background is None else background_of(background, image)

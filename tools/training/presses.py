@@ -29,7 +29,8 @@ PITCH = 0.125e-3  # m
 PRESSES = 12  # of each object
 SIZES = (0.5, 4.0)  # longest side of an object, in long sides of the window
 BALLS, RADII = 0.3, (1.5e-3, 12e-3)  # share of balls among the objects, and their radius [m]
-FLAT, TILT = 0.45, 0.05  # share of presses that lie on a face, and by how much that is tilted [rad]
+FLAT, TILT = 0.35, 0.05  # share of presses on a face, and by how much that is tilted [rad]
+EDGES, SHARP = 0.35, 0.3  # share of presses on a sharp edge, and by how much its faces turn there, at least [rad]
 DEPTHS = (0.3e-3, 3.5e-3)  # m
 THICKNESS = (0.5e-3, 30e-3)  # of the gel [m]; a thin one hardly sinks beside the object
 CURVED, BULGES = (
@@ -101,17 +102,38 @@ def press_part(i: int, seed: int) -> Presses:
 
 
 def _turned(part: Mesh, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A rotation (3, 3): any, or with a face of the object nearly flat on the membrane."""
-    any_way = Rotation.random(random_state=int(rng.integers(1 << 31)))
-    if rng.random() > FLAT:
-        return any_way.as_matrix()
+    """A rotation (3, 3): any, or with a face or a sharp edge of the object nearly flat on the membrane."""
+    on = rng.random()
+    if on < FLAT:
+        towards = _face_normal(part, rng)
+    elif on < FLAT + EDGES:
+        towards = _edge_normal(part, rng)
+    else:
+        return Rotation.random(random_state=int(rng.integers(1 << 31))).as_matrix()
+    down = Rotation.align_vectors([[0.0, 0.0, -1.0]], [towards])[0]
+    tilt = Rotation.from_rotvec([*(rng.normal(size=2) * TILT), 0.0])
+    return (tilt * Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]) * down).as_matrix()
+
+
+def _face_normal(part: Mesh, rng: np.random.Generator) -> NDArray[np.float64]:
+    """The outward normal (3,) of a face, drawn by area."""
     a, b, c = np.asarray(part.vertices, float)[np.asarray(part.faces).T]
     normals = np.cross(b - a, c - a)
     area = np.linalg.norm(normals, axis=1)
-    normal = any_way.apply(normals[rng.choice(len(area), p=area / area.sum())])
-    flat = Rotation.align_vectors([[0.0, 0.0, -1.0]], [normal])[0]
-    tilt = Rotation.from_rotvec([*(rng.normal(size=2) * TILT), rng.uniform(0, 2 * np.pi)])
-    return (tilt * flat * any_way).as_matrix()
+    return np.asarray(normals[rng.choice(len(area), p=area / area.sum())])
+
+
+def _edge_normal(part: Mesh, rng: np.random.Generator) -> NDArray[np.float64]:
+    """A direction (3,) between the normals of the two faces at a sharp edge, drawn by length; a face's normal without any."""
+    mesh = trimesh.Trimesh(part.vertices, part.faces)
+    sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > SHARP)
+    if not sharp.any():
+        return _face_normal(part, rng)
+    ends = mesh.vertices[mesh.face_adjacency_edges[sharp]]
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    one, other = mesh.face_normals[mesh.face_adjacency[sharp][rng.choice(len(length), p=length / length.sum())]]
+    share = rng.random()
+    return np.asarray(share * one + (1 - share) * other)
 
 
 def _part(rng: np.random.Generator, window: float) -> Mesh:
