@@ -15,7 +15,7 @@ from geomtact.evaluation import simultaneous_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import sampler, two_runs
 from geomtact.inference.effort import GRID_ALONE, LEAST_CONTACTS, Effort
-from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, mixture_weights
+from geomtact.scoring.contact_likelihood import OUTLINE, POWERS, ContactQuery, mixture_weights
 from geomtact.sensing.reading import read_observation
 
 EFFORT = Effort(3, contacts=96_000)  # 10,000 at first
@@ -222,12 +222,17 @@ def test_it_serves_as_a_prior(localizer, touch, posterior):
 
 
 def test_a_contact_found_in_an_image_is_trusted_less(localizer, touch, posterior, tmp_path):
-    """Than the same one given as a mask; also when it comes back from a file."""
+    """Than the same one given as a mask: by smaller powers of its likelihood; also when it comes back from a file."""
     read = read_observation(touch.mask, localizer.sensor, "mask")
     found = localizer.localize(replace(read, kind="reading", method="network"), effort=EFFORT)
     assert found.explored.density.target.query.source == "image"
     assert posterior.explored.density.target.query.source == "mask"
-    assert found.information_gain_nats < posterior.information_gain_nats
+    for log_outline in np.log(np.geomspace(5e-3, 100e-3, 20) / OUTLINE):
+        image, mask = (
+            mixture_weights([replace(query, log_outline=log_outline)])
+            for query in (found.explored.density.target.query, posterior.explored.density.target.query)
+        )
+        assert image @ POWERS < mask @ POWERS
     found.save(tmp_path / "posterior.npz")
     np.testing.assert_array_equal(Posterior.load(tmp_path, localizer.cache_dir).log_prob, found.log_prob)
 

@@ -15,8 +15,9 @@ class Effort:
     ----------
     modes : that are refined, where the pose is resolved within the cells
     contacts : that the largest attempt to resolve the pose within the cells of the grid may cut, on all sensors together. The
-        first one has a twentieth of them on each, 10,000 at least, and settles most touches (see ``inference.two_runs``). Of one
-        sensor, half as many more weigh the modes, and the density at poses takes more. 0 leaves the cells as they are
+        first one has a twentieth of them, 10,000 at least, or a quarter of that on each of several sensors, and settles most
+        touches (see ``inference.two_runs``). Of one sensor, half as many more weigh the modes, and the density at poses takes
+        more. 0 leaves the cells as they are
     thorough : whether each mode is refined by all registrations or by one
     """
 
@@ -31,7 +32,7 @@ class Effort:
             raise UsageError(f"Effort: expected 0 contacts or more, got {self.contacts}; give 0 for none")
 
 
-# Of an attempt on each sensor: with fewer, the evidence is mostly found too small, by more than a nat (docs/adaptive.md).
+# Of an attempt on one sensor: with fewer, the evidence is mostly found too small, by more than a nat (docs/adaptive.md).
 LEAST_CONTACTS = 10_000
 GRID_ALONE = Effort(0)  # for studies, and for what lives on the cells of the grid
 EFFORTS = {

@@ -33,14 +33,17 @@ from geomtact.se3 import Array
 # of the likelihood, by which objects are compared: of the larger ones the one that distinguishes them best
 EVIDENCE_POWER = POWERS[3]
 # poses that are kept in the end, at least, which is as many as with several sensors, and at most; and contacts for each
-_POSES, _FOR_EACH = (300, 600), 20
+_POSES, _FOR_EACH = (200, 600), 20
 # nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
 # believed, while more contacts may be cut and in the last attempt: to leave a contact to the cells costs more; hand-set
 _AGREE, _AGREE_AT_LAST = 1.0, 2.0
 # Of two runs that do not agree, one at least has missed something. So what they found rests on one run, which nothing confirms:
 # by the rule of succession another one would find the same with this probability.
 _TRUST = 0.5
-_SHARE = 20  # the first attempt cuts one of so many of all contacts on each sensor
+_SHARE = 20  # the first attempt cuts one of so many of all contacts
+_FEWER_OF_SEVERAL = (
+    4  # times as few of several sensors, where registration finds the modes; docs/method-several-sensors.md
+)
 _MORE = 4  # times as many contacts are cut in each attempt after the first
 # powers that an attempt may leave out, before the last: of several sensors, of a mask, and of depths, whose likelihood is
 # sharper; where the gain of 20 touches each of pin and head levels off (seed 91), and of 10 scenes of four objects (seed 810)
@@ -79,8 +82,8 @@ def explore_twice(
     others: Sequence[OtherSensor] = (),
     search: Search | None = None,
 ) -> Finding:
-    """The distribution of the pose with its modes, by two runs that share a twentieth of the ``contacts`` on each sensor, 10,000
-    at least, and have to agree on the evidence; arguments as of :func:`explore`.
+    """The distribution of the pose with its modes, by two runs that share a twentieth of the ``contacts``, 10,000 at least, or a
+    quarter of that on each of several sensors, and have to agree on the evidence; arguments as of :func:`explore`.
 
     Where they do not, the largest powers of the likelihood are left out until they do, one to three of them at most. If that
     does not help, both are repeated with four times the contacts, while that is no more than ``contacts`` on all sensors
@@ -88,7 +91,7 @@ def explore_twice(
     end, what they found has half of the probability, and the coarse posterior the rest.
     """
     cut, found = 0, Finding(None, unexplained_nats=np.inf if others else None)
-    attempts = [max(LEAST_CONTACTS, contacts // _SHARE)]
+    attempts = [max(LEAST_CONTACTS, contacts // _SHARE) // (_FEWER_OF_SEVERAL if others else 1)]
     while _MORE * attempts[-1] * (1 + len(others)) <= contacts:
         attempts.append(_MORE * attempts[-1])
     of_one = _LEFT_OUT if query.indentation is None else _LEFT_OUT_OF_DEPTHS

@@ -35,6 +35,7 @@ from geomtact.contact_space.index import Index
 from geomtact.kernels.contact_energy import BLOCK, SHARES, Cut, Samples
 from geomtact.kernels.depth_loss import Indentation
 from geomtact.kernels.gel_likelihood import gel_log_likelihood
+from geomtact.kernels.parts import by_parts
 from geomtact.se3 import Array
 from geomtact.sensing.contact import Contact, SoftMask
 from geomtact.sensing.moments import cleaned
@@ -47,10 +48,9 @@ RATE = 108e9
 SHARE = (6.47, 13.18)  # of the beta distribution of an elastic contact's share of the depth
 # Of the likelihood, by the posteriors that are mixed; hand-set. A sharper one would have no weight: its evidence is not found.
 POWERS = (0.0, 0.01, 0.03, 0.1, 0.3)
-# Their weights are the softmax of intercept + slope log(outline / OUTLINE): of a given mask, and of a contact found in an image,
-# perhaps badly.
-INTERCEPT = {"mask": (-4.68, -3.09, -0.64, 0.63, 0.0), "image": (-2.48, 0.27, 0.93, 1.41, 0.0)}
-SLOPE = {"mask": (0.14, 0.56, 2.74, 2.82, 0.0), "image": (0.75, 2.56, 3.34, 2.85, 0.0)}
+# Their weights are the softmax of intercept + slope log(outline / OUTLINE): of a given mask, and of a contact found in an image.
+INTERCEPT = {"mask": (-2.88, 0.09, -2.45, 1.77, 0.0), "image": (0.88, 2.81, 0.59, 3.25, 0.0)}
+SLOPE = {"mask": (1.08, 6.62, 0.42, 4.27, 0.0), "image": (4.62, 6.43, 1.95, 4.34, 0.0)}
 SCALE_ERROR = 0.0025  # half width of the distribution of errors of the object's scale
 SHIFT_ERROR = 0.05e-3  # m: that of errors of where a contact is, along each axis
 OUTLINE = 15e-3  # m, the length of a usual outline
@@ -61,6 +61,7 @@ _SCALE = 0.05  # standard deviation of a depth, as a share of it, beside the sen
 # head and the connector plug, seed 91
 _INDEPENDENT = 3e-6
 _ALL = 0.99  # of a sample lies on the object, where the gel counts as lying on it
+_PART = 2048  # energies that a thread takes at a time
 _EVERY = 2  # samples of the window along each axis, of whose depths one is compared
 
 
@@ -117,7 +118,8 @@ class ContactQuery:
         the image; -inf where nothing is touched. Parameters are those of ``ContactMaps.compare``, one of the last two."""
         maps = ContactMaps.of(index)
         cut = maps.compare(self.samples, self.area, poses, membrane, depth)
-        out = gel_log_likelihood(cut.energy, RATE, _LOG_SHARE)
+        parts = by_parts(lambda some: gel_log_likelihood(cut.energy[some], RATE, _LOG_SHARE), len(cut.energy), _PART)
+        out = np.concatenate(parts)
         touches = np.flatnonzero(np.isfinite(out))
         if self.indentation is not None and len(touches):
             at = cut.reach - depth if depth is not None else membrane
@@ -135,10 +137,11 @@ class ContactQuery:
 
 
 def mixture_weights(queries: Sequence[ContactQuery]) -> Array:
-    """Weights (K,) of the posteriors by ``POWERS``, for contacts of several sensors as for one that is as long as all of them."""
+    """Weights (K,) of the posteriors by ``POWERS``: for contacts of several sensors as for one of their mean length, for each has
+    errors of its own."""
     shown = [query for query in queries if query.touched.any()]
     source = "mask" if all(query.source == "mask" for query in shown) else "image"
-    log_outline = float(np.logaddexp.reduce([query.log_outline for query in shown]))
+    log_outline = float(np.logaddexp.reduce([query.log_outline for query in shown]) - np.log(len(shown)))
     return np.asarray(softmax(np.array(INTERCEPT[source]) + np.array(SLOPE[source]) * log_outline))
 
 

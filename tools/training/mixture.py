@@ -3,7 +3,7 @@
 Touches of procedural objects, on any side or a known face, on rigid and elastic gels, with noise of any strength up to heavy, are
 explored by the sampler as it is. What each power makes of the true pose, averaged over the errors that a whole contact has in
 common, says how to weigh it: the weights maximise the mean log density at the true poses ("covariate-dependent stacking", Yao et
-al. 2022). Every third contact is found badly, as in an image: given masks have weights without these.
+al. 2022). Half of the contacts are found in tactile images under random lamps: these have weights of their own.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax, logsumexp
 
 from geomtact.contact_space.space import ContactSpace
-from geomtact.contact_space.touch import CALIBRATION_NOISE, draw_noise, simulate_mask, spoilt
+from geomtact.contact_space.touch import CALIBRATION_NOISE, draw_noise, simulate_depth_map, simulate_mask, spoilt
 from geomtact.contact_space.touches import Touch, counts, each_touch
 from geomtact.files import write_text
 from geomtact.geometry.mesh import Mesh
@@ -32,9 +33,12 @@ from geomtact.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.contact_likelihood import POWERS, SCALE_ERROR, SHIFT_ERROR, ContactQuery, from_outline
 from geomtact.se3 import Array
+from geomtact.sensing.local_shape import contact_of
 from geomtact.sensing.noise import CLEAN, MODERATE
 from geomtact.versions import versions
 from tools.training.examples import SENSORS, drawn_object, resumed
+from tools.training.presses import THICKNESS
+from tools.training.tactile_images import random_reading
 
 SIZES = (0.5, 5.0)  # longest side of an object, in long sides of the window
 FACES = 3  # one object of so many is touched on a known face
@@ -43,15 +47,19 @@ CONTACTS, REFERENCE = 10_000, 80_000  # of the sampler, and of the run that says
 KEPT = 80  # poses of each posterior, at most
 _LARGER = 0.01  # objects are as much larger or smaller than their meshes, at most
 _SCALE = 0.02  # pixels are as much larger or smaller than stated, at most
-_WITHIN = -0.1e-3, 0.2e-3  # m: by how much an outline lies too far in or out that is not badly found, at most
-_OFF = 0.7e-3  # m: by how much the outline of a badly found contact lies too far out or in, at most
-_DISPLACED = 1.2e-3, (1e-3, 8e-3)  # m: by how much it is displaced, rms, at most; and over which lengths
+_WITHIN = -0.1e-3, 0.2e-3  # m: by how much the outline of a mask lies too far in or out, at most
+_IMAGES = 0.5  # share of contacts that are found in tactile images
+_SHORTER = 120  # px of their shorter side
+_OVERLAP = (
+    0.5  # least overlap (IoU) of a contact found in an image with the true one; of 89 real images the least is 0.70
+)
+_LONGEST, _OF = 0.5, 4  # share of touches whose contact is the largest of so many
 _PENALTY = 1e-3  # of the square of a slope, beside a mean log density
 _LEAST = -60.0  # nats: a lower log density at a true pose is as bad as this
 
-_SINGLE = ("log_outline", "elastic", "badly_found")
+_SINGLE = ("log_outline", "elastic", "in_image")
 
-SCHEMA = "geomtact/mixture/4"
+SCHEMA = "geomtact/mixture/5"
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 
 
@@ -68,7 +76,7 @@ class Example:
     excess : (K,) log of the integral of each density, by the evidence of a run with ``REFERENCE`` contacts
     log_outline : log of the outline's length over ``OUTLINE``
     elastic : whether the gel was
-    badly_found : whether the contact was
+    in_image : whether the contact was found in a tactile image
     """
 
     at_truth: Array
@@ -78,7 +86,7 @@ class Example:
     excess: Array
     log_outline: float
     elastic: bool
-    badly_found: bool
+    in_image: bool
 
 
 def make_examples(
@@ -94,36 +102,57 @@ def _examples_of(i: int, touches: int, seed: int) -> Iterator[Example]:
     sensor, mesh = drawn_object(i, SIZES, rng)
     face = [(np.eye(3)[rng.integers(3)] * rng.choice([-1, 1]), 0.0)] if i % FACES == FACES - 1 else None
     localizer = Localizer.prepare(mesh, sensor=sensor, approach=face, max_poses=MAX_POSES)
-    for touch, badly_found in _touches(localizer, touches, rng):
-        query = ContactQuery.of(touch.mask, sensor)
+    for touch, in_image in _touches(localizer, touches, rng):
+        query = ContactQuery.of(touch.mask, sensor, "image" if in_image else "mask")
         coarse = np.exp(localizer.scorer.log_mass(localizer.index, touch.mask)).sum(0)
         run = pooled(*explore(localizer.index, query, coarse, CONTACTS // 2, rng, runs=2), len(POWERS) - 1, rng)
         (reference,) = explore(localizer.index, query, coarse, REFERENCE, rng)
-        yield _example(run, reference, touch, badly_found, rng)
+        yield _example(run, reference, touch, in_image, rng)
 
 
 def _touches(localizer: Localizer, n: int, rng: np.random.Generator) -> Iterator[tuple[Touch, bool]]:
-    """``n`` touches without those that show less than 1 mm^2 of contact, and whether each is found badly.
+    """Up to ``n`` touches, and whether the contact was found in an image; without those that show less than 1 mm^2 of contact,
+    or whose image hardly shows it.
 
-    Half of them are as the localizer expects them, with moderate noise. Of the others, noise has any strength up to heavy, and
-    objects, pixels and outlines are off. Every third is found badly, as in images of a gel that nobody measured: its outline
-    lies too far out or in, and is displaced by much more than noise does.
+    Half of them are as the localizer expects them: masks have moderate noise. Of the others, masks have noise of any strength up
+    to heavy, and objects, pixels and the outlines of masks are off. Half of them are the largest of a few touches: else hardly
+    any would have a long outline, and the weights depend on it.
     """
     space = localizer.space
-    for number, touch in enumerate(each_touch(space, n, int(rng.integers(1 << 31)), noise=CLEAN)):
+    drawn = each_touch(space, _OF * n, int(rng.integers(1 << 31)), noise=CLEAN)
+    for number in range(n):
+        some = list(islice(drawn, _OF))
+        touch = max(some, key=lambda each: int(each.mask.sum())) if rng.random() < _LONGEST else some[number % _OF]
         as_expected = number % 4 < 2  # rigid and elastic ones alike
         size = 0.0 if as_expected else rng.random()  # of errors, of the largest
         mesh = larger(space.mesh, 1 + size * rng.uniform(-_LARGER, _LARGER))
-        mask = simulate_mask(ContactSpace(mesh, space.sensor), touch.T_sensor_object, touch.elastic)
-        noise, badly_found = MODERATE if as_expected else draw_noise(CALIBRATION_NOISE, rng), number % 3 == 2
-        off = rng.uniform(-_OFF, _OFF) if badly_found else size * rng.uniform(*_WITHIN)
+        pressed, T, in_image = ContactSpace(mesh, space.sensor), touch.T_sensor_object, rng.random() < _IMAGES
+        true = simulate_mask(pressed, T, touch.elastic)
+        mask = _found(pressed, T, rng) if in_image else true
+        if (mask & true).sum() < _OVERLAP * (mask | true).sum():
+            continue
         mask = _scaled(mask, 1 + size * rng.uniform(-_SCALE, _SCALE))
-        mask = from_outline(mask, float(np.sqrt(space.sensor.pixel_area(mask.shape)))) < off
-        if badly_found:
-            noise = replace(noise, outline_rms=rng.uniform(0, _DISPLACED[0]), correlation=_DISPLACED[1])
-        mask = spoilt(mask, space, noise, rng)
+        if not in_image:
+            off = size * rng.uniform(*_WITHIN)
+            mask = from_outline(mask, float(np.sqrt(space.sensor.pixel_area(mask.shape)))) < off
+            mask = spoilt(mask, space, MODERATE if as_expected else draw_noise(CALIBRATION_NOISE, rng), rng)
         if counts(space, mask):
-            yield replace(touch, mask=mask), badly_found
+            yield replace(touch, mask=mask), in_image
+
+
+def _found(space: ContactSpace, T: Array, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """The contact (H, W) with the object at ``T`` (4, 4), as it is found in an image of a gel of random thickness under random
+    lamps."""
+    sensor = space.sensor
+    shape = sensor.along((_SHORTER, round(_SHORTER * max(sensor.image_size_px) / min(sensor.image_size_px))))
+    thickness = float(np.exp(rng.uniform(*np.log(THICKNESS))))
+    height = simulate_depth_map(space, T, True, thickness, shape)
+    pitch = np.sqrt(sensor.pixel_area(shape))
+    at_rest = -sensor.lift(np.stack(np.meshgrid(*sensor.pixel_centres(shape)), -1))[..., 2]
+    image, background = random_reading(height / pitch, rng, at_rest / pitch)
+    found = contact_of(image, background, "learned", np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)).mask
+    size = sensor.image_size_px
+    return np.asarray(cv2.resize(found.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5)
 
 
 def larger(mesh: Mesh, by: float) -> Mesh:
@@ -139,7 +168,7 @@ def _scaled(mask: NDArray[np.bool_], by: float) -> NDArray[np.bool_]:
     return np.asarray(cv2.warpAffine(image, moved, size, borderMode=cv2.BORDER_REPLICATE) > 127)
 
 
-def _example(run: Run, reference: Run, touch: Touch, badly_found: bool, rng: np.random.Generator) -> Example:
+def _example(run: Run, reference: Run, touch: Touch, in_image: bool, rng: np.random.Generator) -> Example:
     density, target = run.density, run.density.target
     at_particles, sizes, inside = [], [], []
     for particles in run.particles:
@@ -158,7 +187,7 @@ def _example(run: Run, reference: Run, touch: Touch, badly_found: bool, rng: np.
         np.subtract(reference.log_evidence, run.log_evidence),
         target.query.log_outline,
         touch.elastic,
-        badly_found,
+        in_image,
     )
 
 
@@ -190,8 +219,8 @@ class Fit:
     ----------
     intercept, slope : (K,) the weights are the softmax of intercept + slope log(outline / OUTLINE)
     n : touches
-    gain, expected_gain : means [nats], at the true poses, where it is at most that of the densest particle, and under the
-        posteriors themselves; the first is of the density divided by its integral
+    gain, expected_gain : means [nats] of the density divided by its integral, at the true poses, where it is at most that of the
+        densest particle, and under the posteriors themselves
     coverage : share of the touches whose true pose is in the regions of ``LEVELS``: of all, rigid, elastic ones
     """
 
@@ -231,7 +260,7 @@ def fit(examples: Sequence[Example]) -> Fit:
         at_truth = min(logsumexp(e.at_truth + log_weight) - log_inside, density.max(initial=-np.inf))
         too_much = logsumexp(log_weight + e.excess, b=e.inside) - log_inside
         gain.append(float(at_truth - too_much))
-        expected.append(float(mass @ density))
+        expected.append(float(mass @ density - too_much))
         level.append(float(mass @ (density > at_truth)))
     elastic = np.array([e.elastic for e in examples])
     return Fit(
@@ -252,7 +281,7 @@ def fit_mixture(
 ) -> dict[str, Fit]:
     """Make examples in ``folder``, fit the weights of masks and of images to them, and write these to ``out``."""
     examples = make_examples(folder, objects, touches, seed, progress)
-    found = {"mask": fit([e for e in examples if not e.badly_found]), "image": fit(examples)}
+    found = {source: fit([e for e in examples if e.in_image == (source == "image")]) for source in ("mask", "image")}
     settings = {
         "objects": objects,
         "touches": touches,
