@@ -75,11 +75,11 @@ def test_a_saved_one_is_the_same(posterior, tmp_path, localizer):
     np.testing.assert_allclose(again.modes(1)[0].T, posterior.modes(1)[0].T, atol=1e-9)
 
 
-def test_powers_weigh_as_for_one_contact_as_long_as_all(posterior):
+def test_powers_weigh_as_for_one_contact_of_the_mean_length(posterior):
     target = posterior.explored.density.target
     queries = [target.query, target.others[0].query]
-    long = replace(queries[0], log_outline=np.logaddexp(*(query.log_outline for query in queries)))
-    np.testing.assert_allclose(target.weights, mixture_weights([long]))
+    mean = replace(queries[0], log_outline=np.log(np.mean(np.exp([query.log_outline for query in queries]))))
+    np.testing.assert_allclose(target.weights, mixture_weights([mean]))
 
 
 def test_poses_that_miss_a_sensor_are_possible_by_the_cells_alone(posterior):
