@@ -10,7 +10,6 @@ import base64
 import contextlib
 import io
 import json
-import os
 import sys
 import tempfile
 from pathlib import Path
@@ -64,7 +63,6 @@ def read(path: Path) -> dict[str, Any]:
 
 def main(names: list[str]) -> None:
     """Run the notebooks of these names, all without any."""
-    os.environ.setdefault("COLUMNS", "100")
     for path in sorted(FOLDER.glob("*.ipynb")):
         if not names or path.stem in names:
             path.write_text(json.dumps(run(read(path)), indent=1) + "\n", encoding="utf-8")

@@ -33,6 +33,7 @@ from geomtact.localizer import Localizer
 from geomtact.progress import Progress
 from geomtact.scoring.contact_likelihood import POWERS, SCALE_ERROR, SHIFT_ERROR, ContactQuery, from_outline
 from geomtact.se3 import Array
+from geomtact.sensing.change import GRID
 from geomtact.sensing.local_shape import contact_of
 from geomtact.sensing.noise import CLEAN, MODERATE
 from geomtact.versions import versions
@@ -49,10 +50,7 @@ _LARGER = 0.01  # objects are as much larger or smaller than their meshes, at mo
 _SCALE = 0.02  # pixels are as much larger or smaller than stated, at most
 _WITHIN = -0.1e-3, 0.2e-3  # m: by how much the outline of a mask lies too far in or out, at most
 _IMAGES = 0.5  # share of contacts that are found in tactile images
-_SHORTER = 120  # px of their shorter side
-_OVERLAP = (
-    0.5  # least overlap (IoU) of a contact found in an image with the true one; of 89 real images the least is 0.70
-)
+_OVERLAP = 0.5  # least overlap (IoU) of a contact found in one with the true one; of 89 real images the least is 0.70
 _LONGEST, _OF = 0.5, 4  # share of touches whose contact is the largest of so many
 _PENALTY = 1e-3  # of the square of a slope, beside a mean log density
 _LEAST = -60.0  # nats: a lower log density at a true pose is as bad as this
@@ -75,7 +73,7 @@ class Example:
     inside : (K,) which share of its poses that is
     excess : (K,) log of the integral of each density, by the evidence of a run with ``REFERENCE`` contacts
     log_outline : log of the outline's length over ``OUTLINE``
-    elastic : whether the gel was
+    elastic : whether the gel of a mask was; that of an image always is, whatever this says
     in_image : whether the contact was found in a tactile image
     """
 
@@ -144,7 +142,7 @@ def _found(space: ContactSpace, T: Array, rng: np.random.Generator) -> NDArray[n
     """The contact (H, W) with the object at ``T`` (4, 4), as it is found in an image of a gel of random thickness under random
     lamps."""
     sensor = space.sensor
-    shape = sensor.along((_SHORTER, round(_SHORTER * max(sensor.image_size_px) / min(sensor.image_size_px))))
+    shape = sensor.along((GRID, round(GRID * max(sensor.image_size_px) / min(sensor.image_size_px))))
     thickness = float(np.exp(rng.uniform(*np.log(THICKNESS))))
     height = simulate_depth_map(space, T, True, thickness, shape)
     pitch = np.sqrt(sensor.pixel_area(shape))
