@@ -137,10 +137,13 @@ def test_the_better_sensor_poses_are_known_the_more_is_known(localizer, scenes):
     assert gains[0] > gains[1] > gains[2]
 
 
-def test_unexplained_contacts_leave_the_cells(localizer, scenes, monkeypatch):
+def test_what_leaves_contacts_unexplained_has_half_of_the_probability(localizer, scenes, monkeypatch):
+    explained = found(localizer, scenes[0])
     monkeypatch.setattr(two_runs, "UNEXPLAINED_NATS", -1.0)
     unexplained = found(localizer, scenes[0])
-    assert unexplained.explored is None and any("not resolved" in warning for warning in unexplained.warnings)
+    assert unexplained.explored.density.trust == 0.5 and explained.explored.density.trust == 1
+    assert unexplained.modes(1)[0].probability < 0.6 < explained.modes(1)[0].probability
+    assert any("explains all contacts: half of the probability" in warning for warning in unexplained.warnings)
 
 
 @pytest.mark.slow

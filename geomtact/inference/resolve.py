@@ -23,10 +23,7 @@ from geomtact.scoring.contact_likelihood import POWERS, ContactQuery, indentatio
 from geomtact.scoring.fitted import FittedScorer
 from geomtact.se3 import Array, inverse
 
-_UNCONFIRMED = (
-    "two runs of the sampler do not agree: half of the probability is left on the grid's cells; "
-    "cut more contacts: --effort exact"
-)
+_UNCONFIRMED = "half of the probability is left on the grid's cells; cut more contacts: --effort exact"
 LogMass = NDArray[np.floating] | None  # (M,) of every cell of an index; None for the uniform's
 
 
@@ -120,7 +117,7 @@ def _resolved(
         return replace(posterior, diagnostics=diagnostics, warnings=[*posterior.warnings, warning])
     settled = explored.density.trust == 1
     power = explored.density.powers[-1] / POWERS[-1] if settled else 0.0
-    warnings = [] if settled else [_UNCONFIRMED]
+    warnings = [] if settled else [f"{found.why_not}: {_UNCONFIRMED}"]
     return replace(
         posterior,
         explored=explored,

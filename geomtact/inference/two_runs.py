@@ -37,8 +37,9 @@ _POSES, _FOR_EACH = (200, 600), 20
 # nats for each sensor: the largest difference of two log evidences, in the mean by the weights of the powers, at which runs are
 # believed, while more contacts may be cut and in the last attempt: to leave a contact to the cells costs more; hand-set
 _AGREE, _AGREE_AT_LAST = 1.0, 2.0
-# Of two runs that do not agree, one at least has missed something. So what they found rests on one run, which nothing confirms:
-# by the rule of succession another one would find the same with this probability.
+# Of two runs that do not agree, one at least has missed something; where no pose explains all contacts, both may have. So what
+# they found rests on one run, which nothing confirms: by the rule of succession another one would find the same with this
+# probability.
 _TRUST = 0.5
 _SHARE = 20  # the first attempt cuts one of so many of all contacts
 # times as few on each of several sensors, where registration finds the modes: mean gains of 14 to 20 scenes of four objects
@@ -62,14 +63,14 @@ class Finding:
     log_evidence : log of the mean under the prior of the likelihood of all contacts, to the power ``EVIDENCE_POWER``; -inf where
         no pose was found that touches all sensors which show contact
     misfit_nats, unexplained_nats : as of ``facts.Diagnostics``
-    why_not : why there is no distribution; empty where there is
+    why_not : why there is no distribution, or half of the probability is left to the cells
     """
 
     explored: Explored | None
     log_evidence: float = -np.inf
     misfit_nats: float = np.inf
     unexplained_nats: float | None = None
-    why_not: str = ""
+    why_not: str = "no pose that was found explains all contacts"
 
 
 def explore_twice(
@@ -88,7 +89,7 @@ def explore_twice(
     Where they do not, the largest powers of the likelihood are left out until they do, one to three of them at most. If that
     does not help, both are repeated with four times the contacts, while that is no more than ``contacts`` on all sensors
     together. So are runs of several sensors that found no pose which explains all contacts. If the runs do not agree in the
-    end, what they found has half of the probability, and the coarse posterior the rest.
+    end, or explain too little, what they found has half of the probability, and the coarse posterior the rest.
     """
     cut, found = 0, Finding(None, unexplained_nats=np.inf if others else None)
     attempts = [max(LEAST_CONTACTS, contacts // _SHARE) // (_FEWER_OF_SEVERAL if others else 1)]
@@ -102,10 +103,10 @@ def explore_twice(
             cut += one.contacts + other.contacts
             unexplained = _unexplained(one, other) if others else None
             found = Finding(None, _log_evidence(one, other), _misfit(one, other), unexplained)
-            if unexplained is not None and unexplained > UNEXPLAINED_NATS:
-                continue
-            is_last = asked == attempts[-1]
-            explored, cut = _agreed(one, other, left_out, _AGREE_AT_LAST if is_last else _AGREE, asked, cut, rng)
+            is_last, explored = asked == attempts[-1], None
+            if unexplained is None or unexplained <= UNEXPLAINED_NATS:
+                explored, cut = _agreed(one, other, left_out, _AGREE_AT_LAST if is_last else _AGREE, asked, cut, rng)
+                found = replace(found, why_not="two runs of the sampler do not agree")
             if explored is None and is_last:
                 explored = _by_one_run(one, other, asked, cut, rng)
         except InputError as error:
@@ -115,7 +116,7 @@ def explore_twice(
             if others:
                 unexplained = _unexplained_in_place(one, other, explored)
             return replace(found, explored=explored, unexplained_nats=unexplained)
-    return replace(found, why_not=found.why_not or f"{index.mesh.name}: no pose explains all contacts")
+    return found
 
 
 def _agreed(
