@@ -114,17 +114,20 @@ def find_contact(
     if sensor is not None:
         sensor = Sensor.load(sensor)
         method = method or sensor.contact_method
-        if method == "auto" and sensor.membrane_radius:
-            method = "learned"  # colours at rest differ from place to place, so that they are no linear image of slopes
         pitch = np.asarray(sensor.pixel_pitch) / min(sensor.pixel_pitch)
         check_size(image, sensor, "image")
     reference = None if background is None else background_of(background, image)
-    return contact_of(image, reference, method or CONTACT_METHODS[0], pitch)
+    return contact_of(image, reference, method or CONTACT_METHODS[0], pitch, does_bulge(sensor))
 
 
-def contact_of(image: Array, reference: Array | None, method: str, pitch: Array) -> FoundContact:
+def does_bulge(sensor: Sensor | None) -> bool:
+    """Whether the sensor's gel bulges: then colours at rest differ from place to place, and are no linear image of slopes."""
+    return sensor is not None and bool(sensor.membrane_radius)
+
+
+def contact_of(image: Array, reference: Array | None, method: str, pitch: Array, bulges: bool = False) -> FoundContact:
     """As :func:`find_contact`, of images (H, W, 3) of 0..1 whose columns and rows are as far apart as ``pitch`` (2,) says, in the
-    smaller of both."""
+    smaller of both; of a gel that ``bulges``, or is flat."""
     size = image.shape[1::-1]
     image, estimated = on_grid(image), reference is None
     reference = smooth_background(image) if reference is None else on_grid(reference)
@@ -139,7 +142,7 @@ def contact_of(image: Array, reference: Array | None, method: str, pitch: Array)
     if not changed.any():
         return FoundContact(np.zeros(size[::-1], bool), None, "classical" if method == "auto" else method)
     if method == "auto":
-        method = "learned" if _blown_out(changed, image, reference) > _BLOWN_OUT else "classical"
+        method = "learned" if bulges or _blown_out(changed, image, reference) > _BLOWN_OUT else "classical"
     colours = _colours(change, changed)
     if colours.one:
         method = "classical"

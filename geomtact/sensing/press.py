@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geomtact.se3 import Array
 from geomtact.sensing.change import as_unit_rgb, colour_change, same_size
 from geomtact.sensing.flicker import without_flicker
-from geomtact.sensing.local_shape import contact_of
+from geomtact.sensing.local_shape import contact_of, does_bulge
 from geomtact.sensing.sensor import Sensor
 
 SAME = "it is the same image as one before"
@@ -58,7 +58,8 @@ def find_presses(
         seen.append(image)
         image = without_flicker(image, reference).image
         change, changed = colour_change(image, reference)
-        mask = contact_of(image, reference, "auto", np.array([1.0, stretch]) / min(1.0, stretch)).mask
+        finer = np.array([1.0, stretch]) / min(1.0, stretch)
+        mask = contact_of(image, reference, "auto", finer, does_bulge(sensor)).mask
         if not mask.any():
             left_out[name] = "no contact was found"
             continue
