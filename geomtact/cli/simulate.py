@@ -164,7 +164,7 @@ def _warn(space: ContactSpace, touch: Touch, image: Path, background: Path | Non
     elif found.all() or share < _FOUND:
         press = "press less deep" if touch.mask.mean() > _LARGE else "press deeper"
         why = (
-            f"by its colours {100 * found.mean():.0f} % of the window is in contact, not {100 * touch.mask.mean():.0f} %; "
+            f"by its colours {100 * found.mean():.1f} % of the window is in contact, not {100 * touch.mask.mean():.1f} %; "
             f"touch an edge or {press}"
         )
     else:

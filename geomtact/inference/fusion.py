@@ -223,10 +223,10 @@ def poor_agreement(unexplained_nats: float | None, most: float, with_prior: bool
     if not np.isfinite(unexplained_nats):
         left = "does not suit all of them"
     return [
-        f"the sensors agree badly: the likeliest pose {left}, rarely more than {most:g} nats where the sensor "
-        f"poses are right; check {'the prior, ' * with_prior}T_world_sensor, whether one of them touches something else, or "
-        "whether the object reaches deeper than the sensor's housing_depth outside its window; or give the uncertainty of "
-        "the sensor poses (std_mm, std_deg)"
+        f"the sensors agree badly: the likeliest pose {left}, rarely more than {most:g} nats where sensor poses and "
+        f"contacts are right; check {'the prior, ' * with_prior}T_world_sensor, the contacts that were found, whether one of "
+        "them touches something else, or whether the object reaches deeper than the sensor's housing_depth outside its window; "
+        "or give the uncertainty of the sensor poses (std_mm, std_deg)"
     ]
 
 
