@@ -40,7 +40,9 @@ def main() -> None:
         cache = given.keep or Path(scratch)
         figures = {"machine": machine(), "rays": rays(given.part, given.sensor)}
         figures["prepare"] = in_process("prepare", given.part, given.sensor, cache)
+        figures["kernels"] = in_process("kernels", given.part, given.sensor, cache)
         figures["localize_warm"] = in_process("localize", given.part, given.sensor, cache, given.repeats)
+        figures["several"] = in_process("several", given.part, given.sensor, cache, given.repeats)
         figures["start"] = starts(given.part, given.sensor, cache, max(3, given.repeats // 4))
     figures["machine"]["load_before"] = load
     show(figures)
@@ -100,7 +102,7 @@ def rays(part: str, sensor_name: str) -> dict[str, Any]:
 
 
 def in_process(what: str, *args: Any) -> dict[str, Any]:
-    """``_prepare`` or ``_localize`` in a separate process, so that peak memory is its own."""
+    """One of ``_MEASURED`` in a separate process, so that peak memory is its own."""
     command = [sys.executable, __file__, f"--{what}", *map(str, args)]
     return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
 
@@ -177,6 +179,89 @@ def _localize(part: str, sensor: str, cache: str, repeats: str) -> dict[str, Any
     }
 
 
+def _several(part: str, sensor: str, cache: str, repeats: str) -> dict[str, Any]:
+    """Scenes of two and three sensors, a third as many as touches, by `fast` and `balanced` in turn."""
+    from geomtact.evaluation import localized, simultaneous_touches
+    from geomtact.localizer import Localizer
+
+    localizer = Localizer.prepare(part, sensor=sensor, cache_dir=cache)
+    scenes = list(simultaneous_touches(localizer.space, max(3, int(repeats) // 3) + 1, 3, seed=0))
+    ms: dict[str, list[float]] = {}
+    for number, scene in enumerate(scenes):
+        for sensors in (2, 3):
+            for effort in ("fast", "balanced"):
+                took = localized(localizer, scene, sensors, effort=effort)[1]
+                if number and took:  # the first scene warms up
+                    ms.setdefault(f"{sensors} sensors, {effort}", []).append(took)
+    return {"scenes": len(scenes) - 1, "ms": {what: spread(took) for what, took in ms.items()}}
+
+
+def _kernels(part: str, sensor: str, cache: str) -> dict[str, Any]:
+    """Each kernel on all threads: how much it does in a second, the limit that was measured here, and the share reached."""
+    import torch
+
+    from geomtact.contact_space.contact_maps import ContactMaps, located
+    from geomtact.localizer import Localizer
+    from geomtact.scoring.contact_likelihood import SHAPE, ContactQuery
+    from geomtact.scoring.encoder import Tower
+    from geomtact.scoring.precision import autocast
+
+    localizer = Localizer.prepare(part, sensor=sensor, cache_dir=cache)
+    index, rng = localizer.index, np.random.default_rng(0)
+    T, masks = zip(*((t.T_sensor_object, t.mask) for t in _touches(localizer, 40)), strict=True)
+    poses, membrane = located(index, np.repeat(T, 250, 0))
+    query = ContactQuery.of(masks[0].astype(np.float32), index.sensor)
+    maps = ContactMaps.of(index)
+    heights = maps.maps.heights[0]
+    pixels = rng.integers(heights.size, size=(1000, SHAPE[0] * SHAPE[1]))
+    gather = pixels.size / best(lambda: heights.ravel().take(pixels))
+    out = {
+        "cut and compare contacts": rate(len(membrane), best(lambda: query.compare(index, poses, membrane)), "contacts")
+    }
+    out["cut and compare contacts"] |= {
+        "limit": gather / pixels.shape[1],
+        "limited by": "heights gathered by numpy, one thread",
+    }
+
+    scorer: Any = localizer.scorer.scorer
+    tower = scorer.descriptor
+    assert isinstance(tower, Tower)
+    shown = np.zeros((16_384, 24, 32), bool)
+    shown[:, 6:18, 8:24] = rng.random((len(shown), 12, 16)) < 0.5
+    flop = 2 * sum(w.size for name, w in tower.weights.items() if w.ndim == 2 and "touch" not in name)
+    a = torch.randn(4096, 1024)
+    with torch.inference_mode(), autocast():
+        peak = 2 * len(a) * 1024 * 1024 / best(lambda: a @ a[:1024].T)
+    out["encode contacts"] = rate(len(shown), best(lambda: tower.describe(shown, index.sensor)), "contacts")
+    out["encode contacts"] |= {"limit": peak / flop, "limited by": "a matrix product in the same precision"}
+
+    image = masks[0].astype(np.float32)
+    stored = scorer.stored
+    read = stored.nbytes / best(lambda: stored.max())
+    out["score all poses"] = rate(len(stored), best(lambda: scorer.score(index, image)), "poses")
+    out["score all poses"] |= {
+        "limit": read / stored.nbytes * len(stored),
+        "limited by": "the largest of all numbers, by numpy",
+    }
+    return out
+
+
+def _touches(localizer: Any, n: int) -> Any:
+    from geomtact.contact_space.touches import random_touches
+
+    return random_touches(localizer.space, n, seed=0)
+
+
+def rate(n: int, seconds: float, what: str) -> dict[str, Any]:
+    """How many a second."""
+    return {"per_second": n / seconds, "of": what}
+
+
+def best(what: Callable[[], Any]) -> float:
+    """The least of the seconds that seven calls take: what the machine can do."""
+    return min(timed(what, 7))
+
+
 def thesis_query(sensor: Any) -> Callable[[Any], Any]:
     """The thesis's comparison of a mask with 150,000 stored contacts: a ResNet-50 forward and a cosine with 1,000 numbers
     each. Its time does not depend on what the weights are, so they are random."""
@@ -249,13 +334,24 @@ def show(figures: dict[str, Any]) -> None:
     for what, ms in warm["ms"].items():
         print(f"  {what:26} {ms['median']:7.1f} ({ms['10 %']:.1f} to {ms['90 %']:.1f})")
     print(f"  balanced takes {warm['balanced_over_thesis_query']:.2f} of the time of the thesis's query")
+    print(f"several sensors, {figures['several']['scenes']} scenes [ms]: median (10 % to 90 %)")
+    for what, ms in figures["several"]["ms"].items():
+        print(f"  {what:26} {ms['median']:7.0f} ({ms['10 %']:.0f} to {ms['90 %']:.0f})")
+    print("kernels [million a second], the limit, and the share of it that is reached")
+    for what, one in figures["kernels"].items():
+        share = 100 * one["per_second"] / one["limit"]
+        print(
+            f"  {what:26} {one['per_second'] / 1e6:7.2f} {one['limit'] / 1e6:8.2f} {share:4.0f} %  ({one['limited by']})"
+        )
     print("cold processes [s]: median (10 % to 90 %)")
     for name, s in figures["start"].items():
         print(f"  {name:24} {s['median']:.2f} ({s['10 %']:.2f} to {s['90 %']:.2f})")
 
 
+_MEASURED = {"prepare": _prepare, "kernels": _kernels, "localize": _localize, "several": _several}
+
 if __name__ == "__main__":
-    if sys.argv[1:2] in (["--prepare"], ["--localize"]):
-        print(json.dumps((_prepare if sys.argv[1] == "--prepare" else _localize)(*sys.argv[2:])))
+    if sys.argv[1:] and sys.argv[1].removeprefix("--") in _MEASURED:
+        print(json.dumps(_MEASURED[sys.argv[1].removeprefix("--")](*sys.argv[2:])))
     else:
         main()
