@@ -22,7 +22,7 @@ SCRIPTS = [path for folder in ("tools", "docs/examples", "meshes") for path in s
 
 # A module imports only from its own stage and from stages above it in this list; one line, one height.
 STAGES = [
-    ["errors", "files", "log_mass", "progress", "se3", "versions"],
+    ["errors", "files", "log_mass", "progress", "se3", "threads", "versions"],
     ["json_values"],
     ["geometry"],
     ["sensing"],

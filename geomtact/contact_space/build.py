@@ -22,8 +22,7 @@ from geomtact.se3 import Array
 from geomtact.sensing.cast import Caster
 from geomtact.sensing.moments import moments
 from geomtact.sensing.sensor import Sensor
-
-_THREADS = 2
+from geomtact.threads import thread_count
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ def build(
         return [_touches(there, turn, lattice, window) for turn in turns]
 
     turns: list[_Turn] = []
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         try:
             for k, some in enumerate(pool.map(one, range(len(directions.vectors)))):
                 turns += some

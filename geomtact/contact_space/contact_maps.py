@@ -28,10 +28,10 @@ from geomtact.kernels.depth_loss import Indentation, depth_loss
 from geomtact.kernels.parts import by_parts
 from geomtact.se3 import Array
 from geomtact.sensing.sensor import Sensor
+from geomtact.threads import thread_count
 
 SHAPE = (48, 64)  # samples of the window, lying
 _PIXELS_PER_SAMPLE = 2  # of the height maps
-_THREADS = 2
 _CENTRING = 1.5  # samples of the window
 _PART = 256  # poses that a thread takes at a time
 _FORMAT = 1  # of the file in an index's folder
@@ -160,7 +160,7 @@ def _cast(index: Index) -> NDArray[np.float32]:
     def one(a: Array) -> NDArray[np.float32]:
         return HeightMap.cast(index.space.caster, a, index.mesh.centre, index.mesh.reach, 0.0, pixel).heights
 
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         return np.stack(list(pool.map(one, index.directions.vectors)))
 
 
@@ -215,7 +215,7 @@ def _read(path: Path) -> NDArray[np.float32] | None:
     with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, cv2.error):
         with np.load(path, allow_pickle=False) as data:
             coded, ends, (low, step) = data["bytes"], data["ends"], data["scale"]
-        with ThreadPoolExecutor(_THREADS) as pool:
+        with ThreadPoolExecutor(thread_count()) as pool:
             images = list(pool.map(_decoded, np.split(coded, ends[:-1])))
         return _heights(np.stack(images), float(low), float(step))
     return None

@@ -39,6 +39,7 @@ from geomtact.se3 import Array, inverse
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.moments import cleaned
 from geomtact.sensing.sensor import Sensor
+from geomtact.threads import thread_count
 
 # Least correlation between the log densities of two sensors, because a cell's width hides the same part of the pose from both.
 # Hand-set; its effect was measured on simulated scenes apart from those of the study (docs/evaluation-several-sensors.md).
@@ -106,7 +107,7 @@ def fuse(
             CellTransfer(index, other.index, T_other_first, extrinsics_std or ExtrinsicsStd()), other, unlikely
         )
 
-    with ThreadPoolExecutor(2) as pool:  # whole sensors, for parts of one would wait for each other
+    with ThreadPoolExecutor(thread_count()) as pool:  # whole sensors, for parts of one would wait for each other
         likelihoods = list(pool.map(likelihood_of, [posteriors[i] for i in others]))
     seen, uniform = [each[0].astype(float) for each in likelihoods], [each[1] for each in likelihoods]
     total = float(_product(place_mass, seen).sum())

@@ -8,7 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
-_THREADS = 2
+from geomtact.threads import thread_count
+
 _T = TypeVar("_T")
 
 
@@ -21,4 +22,4 @@ def by_parts(work: Callable[[slice], _T], n: int, size: int) -> list[_T]:
 @cache
 def _pool(process: int) -> ThreadPoolExecutor:
     """The threads of a process, by its number: a process that it forks has none of them."""
-    return ThreadPoolExecutor(_THREADS)
+    return ThreadPoolExecutor(thread_count())

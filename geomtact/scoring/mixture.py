@@ -19,6 +19,7 @@ from geomtact.scoring.probability import chunks
 from geomtact.sensing.contact import SoftMask
 from geomtact.sensing.patches import patches
 from geomtact.sensing.sensor import Sensor
+from geomtact.threads import thread_count
 
 # Summed share of the hypotheses that one patch alone is the contact. Chosen on 654 simulated touches of several patches on four
 # objects: 0.1 to 0.3 gain 0.06 to 0.08 nats over none. On a gear, whose stored contacts have several patches, 0.15 costs 0.1.
@@ -73,7 +74,7 @@ def mix_hypotheses(
         np.multiply(largest, np.float32(temperature), out=out[part])
 
     parts = chunks(len(out))
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         evidence = [np.logaddexp.reduce(list(pool.map(partial(weigh, score), parts))) for score in scores]
         constant = (np.log(shares) - evidence).astype(np.float32)
         list(pool.map(mix, parts))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from geomtact.contact_space.index import Index, pack
 from geomtact.sensing.contact import SoftMask
+from geomtact.threads import thread_count
 
-_THREADS = 2
 _CHUNK = 1 << 15  # poses a step: the words of one chunk stay in the processor's cache
 
 
@@ -32,7 +32,7 @@ def overlaps(bits: NDArray[np.uint64], mask: NDArray[np.bool_]) -> NDArray[np.in
                 count += np.bitwise_count(part[w] & words[w])
         out[level, start : start + _CHUNK] = count
 
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         list(pool.map(work, [(level, start) for level in range(levels) for start in range(0, n, _CHUNK)]))
     return out
 

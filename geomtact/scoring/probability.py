@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geomtact.threads import thread_count
+
 TINY = 1e-30  # probability below which sums are made of logarithms: single precision ends near 1e-38
 _CHUNK = 1 << 18  # rows worked on at a time
 
@@ -63,7 +65,7 @@ def posterior_log_prob(
         joint[tiny] = kept
 
     parts = chunks(len(out))
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         tops, sums = zip(*pool.map(weigh, parts), strict=True)
         total = float(np.logaddexp.reduce(sums))
         list(pool.map(mix, parts, tops))

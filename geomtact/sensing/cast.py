@@ -19,6 +19,7 @@ from geomtact.se3 import Array, apply, inverse
 from geomtact.sensing.contact import Contact
 from geomtact.sensing.scene import MISSED, scene_of
 from geomtact.sensing.sensor import Sensor
+from geomtact.threads import thread_count
 
 _RAYS_PER_CALL = 1 << 18
 _OFF = 1e-6  # m from a surface, where a ray begins that must not meet it
@@ -31,7 +32,7 @@ class Caster:
     ----------
     vertices : (V, 3) object frame [m]
     faces : (F, 3) indices into vertices
-    threads : how many batches of poses are cast at once (the GIL is released)
+    threads : how many batches of poses are cast at once (the GIL is released); by default ``threads.thread_count``
 
     Attributes
     ----------
@@ -39,9 +40,9 @@ class Caster:
     scene : the object's triangles
     """
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike, threads: int = 2):
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike, threads: int | None = None):
         self.vertices, self.faces = np.asarray(vertices, float), np.asarray(faces)
-        self.threads = threads
+        self.threads = thread_count() if threads is None else threads
         # Embree works in float32: rays start near the object's centre to keep 1e-8 m
         self.centre = 0.5 * (self.vertices.min(0) + self.vertices.max(0))
         self._radius = float(np.linalg.norm(self.vertices - self.centre, axis=1).max())
