@@ -97,9 +97,20 @@ def unit(v: ArrayLike) -> Array:
 
 def hat(w: ArrayLike) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
-    x, y, z = np.moveaxis(np.asarray(w, float), -1, 0)
-    o = np.zeros_like(x)
-    return np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(*x.shape, 3, 3)
+    w = np.asarray(w, float)
+    out = np.zeros((*w.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., k, j] = w[..., i]
+        out[..., j, k] = -w[..., i]
+    return out
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Cross products (n, 3) of vectors (n, 3): of few, ``np.cross`` takes five times as long."""
+    out = np.empty_like(a)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
+    return out
 
 
 def exp(xi: ArrayLike) -> Array:

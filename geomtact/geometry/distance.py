@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from geomtact.geometry.mesh import Mesh, outermost
 from geomtact.geometry.symmetry import Symmetry
-from geomtact.se3 import Array, apply, hat, transform
+from geomtact.se3 import Array, apply, transform
 
 _BATCH = 2048
 
@@ -117,7 +117,7 @@ class PoseDistance:
         best = (fixed + np.hypot(cosine, sine)).argmax(1)
         row = np.arange(len(others))
         angle = np.arctan2(sine[row, best], cosine[row, best])[:, None, None]
-        along, across, ahead = _about_axis(symmetry)
+        along, across, ahead = symmetry.turn_parts
         S = along + np.cos(angle) * across + np.sin(angle) * ahead
         S = S @ symmetry.elements[best, :3, :3]
         return others @ transform(S, symmetry.centre - S @ symmetry.centre)
@@ -132,15 +132,8 @@ def _kernels(symmetry: Symmetry | None, C: Array) -> list[Array]:
     """What the nine numbers of R^T R' are multiplied by (9, G) for tr(R^T R' S C) with each element S, of every part of a turn
     about the symmetry's axis before it, or of none; ``C`` (3, 3) = E p p^T."""
     elements = np.eye(3)[None] if symmetry is None else symmetry.elements[:, :3, :3]
-    parts = (np.eye(3),) if symmetry is None or symmetry.axis is None else _about_axis(symmetry)
+    parts = (np.eye(3),) if symmetry is None or symmetry.axis is None else symmetry.turn_parts
     return [np.ascontiguousarray(np.swapaxes(part @ elements @ C, 1, 2).reshape(-1, 9).T) for part in parts]
-
-
-def _about_axis(symmetry: Symmetry) -> tuple[Array, Array, Array]:
-    """What a turn by an angle about the axis leaves, multiplies by its cosine and by its sine: (3, 3) each."""
-    assert symmetry.axis is not None
-    along = np.outer(symmetry.axis, symmetry.axis)
-    return along, np.eye(3) - along, hat(symmetry.axis)
 
 
 def mssd(T_true: ArrayLike, T: ArrayLike, mesh: Mesh) -> Array:

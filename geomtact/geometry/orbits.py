@@ -5,6 +5,8 @@ Of the directions that symmetry makes one (an orbit) one is kept, the *canonical
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,5 +103,12 @@ def axis_of(symmetry: Symmetry) -> Array:
 
 
 def azimuth_of(a: Array, axis: Array) -> Array:
-    x, y, _ = facing(-axis)
+    x, y = _across(*axis.tolist())
     return np.arctan2(a @ y, a @ x)
+
+
+@cache
+def _across(*axis: float) -> tuple[Array, Array]:
+    """Where azimuths about an ``axis`` begin (3,), and what is a quarter of a turn ahead (3,)."""
+    x, y, _ = facing(-np.array(axis))
+    return x, y

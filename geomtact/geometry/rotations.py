@@ -42,7 +42,7 @@ from geomtact.geometry.orbits import (
     turn_period,
 )
 from geomtact.geometry.symmetry import Symmetry, about
-from geomtact.se3 import Array, hat, random_rotations, transform
+from geomtact.se3 import Array, cross, hat, random_rotations, transform
 
 _TIE = 1e-9  # of a turn's step: halfway between two turns the first is taken, whatever the last digit that a processor computes
 _BATCH = 2**16  # directions proposed at once; after 16 times as many, a cell counts as one without area
@@ -146,6 +146,11 @@ class Directions:
     def disk_step(self, a: Array) -> float:
         """Angle [rad] across the cells of the disk that holds an approach direction ``a`` (3,); inf where none does."""
         return np.inf if self.cells is None else self.cells.disk_step(a)
+
+    @cached_property
+    def _along_x(self) -> Array:
+        """What is along the sensor's x axis at turn 0 of each direction (D, 3), object frame."""
+        return facing(self.vectors)[:, 0]
 
     @cached_property
     def first_turn(self) -> NDArray[np.int64]:
@@ -300,7 +305,8 @@ class Directions:
             target = self.vectors[self.direction_of(a)]
             axis = axis_of(sym)
             angle = azimuth_of(a, axis) - azimuth_of(target, axis)
-            S = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
+            along, across, ahead = sym.turn_parts
+            S = along + np.cos(angle)[:, None, None] * across + np.sin(angle)[:, None, None] * ahead
             T = _about(T, sym.centre, T[:, :3, :3] @ S)
         return T
 
@@ -321,9 +327,13 @@ class Directions:
         R = T[:, :3, :3]
         a = approach_of(R)
         k = self.direction_of(a)
-        # carry the cell's direction onto the pose's by the smallest rotation: what remains is the turn
-        level = R @ _smallest_rotation(self.vectors[k], a)
-        x = (level @ np.swapaxes(facing(self.vectors[k]), -1, -2))[:, :, 0]
+        # carry the cell's direction onto the pose's by the smallest rotation, and what is along x at its turn 0 with it: what
+        # remains is the turn
+        v, x = self.vectors[k], self._along_x[k]
+        about = cross(v, a)
+        ahead = cross(about, x)
+        x = x + ahead + cross(about, ahead) / np.maximum(1 + (v * a).sum(-1, keepdims=True), 1e-9)
+        x = (R @ x[..., None])[..., 0]
         n, period = self.turns[k], self.periods[k]
         safe = np.where(period > 0, period, 1.0)
         turn = np.arctan2(x[:, 1], x[:, 0]) % (2 * np.pi)
@@ -345,7 +355,7 @@ def _about(T: Array, centre: Array, R: Array) -> Array:
 
 def _smallest_rotation(a: Array, b: Array) -> Array:
     """Rotations (n, 3, 3) that carry unit vectors ``a`` onto ``b`` along great circles (Rodrigues)."""
-    v = np.cross(a, b)
+    v = cross(a, b)
     c = (a * b).sum(-1)[:, None, None]
     W = hat(v)
     return np.eye(3) + W + W @ W / np.maximum(1 + c, 1e-9)

@@ -8,12 +8,13 @@ surface onto itself within the tolerance is kept: candidates may be wrong, resul
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from geomtact.se3 import Array, random_rotations, transform
+from geomtact.se3 import Array, hat, random_rotations, transform
 
 MAX_ORDER = 64  # of a discrete axis
 _MAX_GROUP = 2 * MAX_ORDER
@@ -60,6 +61,13 @@ class Symmetry:
             return np.eye(6)
         across = np.linalg.svd(self.axis[None])[2][1:]
         return np.concatenate([np.hstack([across, np.cross(self.centre, across)]), shifts])
+
+    @cached_property
+    def turn_parts(self) -> tuple[Array, Array, Array]:
+        """What a turn by an angle about the axis leaves, multiplies by its cosine and by its sine: (3, 3) each."""
+        assert self.axis is not None
+        along = np.outer(self.axis, self.axis)
+        return along, np.eye(3) - along, hat(self.axis)
 
     @property
     def density(self) -> float:
