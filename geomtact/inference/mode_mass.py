@@ -32,10 +32,10 @@ def weighed(
     explored: Explored, further: Array, log_measure: float, contacts: int, rng: np.random.Generator
 ) -> tuple[Explored, float]:
     """``explored``, of one sensor, with its leading modes, as many as ``contacts`` contacts weigh, and the log of the sum of
-    their masses as it was found.
+    all mass as it was found: theirs, and the share of the poses that are beside them.
 
-    Each is the poses within the mode radius of its densest pose, of the particles and the ``further`` ones (c, 4, 4). If their
-    masses add up to more than 1, the evidence is too small; then they are scaled to add up to 1.
+    Each is the poses within the mode radius of its densest pose, of the particles and the ``further`` ones (c, 4, 4). If all mass
+    adds up to more than 1, the evidence is too small; then the masses are divided by the sum.
     """
     density, mesh = explored.density, explored.index.mesh
     distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
@@ -67,7 +67,8 @@ def weighed(
     log_mass = np.array([mode.log_integral + log_measure for mode in modes])
     most = max(float(log_mass.max()), 0.0)
     mass = _shared_out(explored, members, np.exp(log_mass - most))
-    log_sum = most + float(np.log(max(mass.sum(), 1e-300)))
+    beside = 1 - explored.weight[np.unique(np.concatenate(members))].sum()
+    log_sum = float(np.logaddexp(most + np.log(max(mass.sum(), 1e-300)), np.log(max(beside, 1e-300))))
     mass *= np.exp(most - max(log_sum, 0.0))
     order = np.argsort(-mass, kind="stable")
     contacts = explored.contacts + _ROUNDS * _DRAWS * len(modes)

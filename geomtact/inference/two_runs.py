@@ -124,7 +124,7 @@ def _agreed(
 ) -> tuple[Explored | None, int]:
     """The distribution of the pose by the largest power of the likelihood at which two runs differ by ``most`` nats a sensor,
     where ``left_out`` powers at most are larger, if there is one; and how many contacts were cut until then, ``cut`` of them
-    before. The masses of the modes may add up to more than 1 by as many nats; then the evidence is raised.
+    before. All mass that was found may add up to more than 1 by as many nats; then the evidence is raised.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def _with_modes(
     one: Run, other: Run, run: Run, last: int, asked: int, rng: np.random.Generator
 ) -> tuple[Explored, float]:
     """The distribution of the pose by both runs as one ``run`` up to the ``last`` stop, with its modes; and the log of the sum of
-    their masses as it was found, 0 of several sensors."""
+    all mass as it was found, 0 of several sensors."""
     further = _sharpest(one, other)
     if run.density.target.others:
         led_to = (one.about.led_to, one.about.origin) if one.about else None
@@ -175,7 +175,7 @@ def _by_one_run(one: Run, other: Run, asked: int, cut: int, rng: np.random.Gener
 
 
 def _raised(density: Density, log_sum: float) -> Density:
-    """``density`` with an evidence larger by ``log_sum``, the log of the sum of the modes' masses, if that is positive."""
+    """``density`` with an evidence larger by ``log_sum``, the log of the sum of all mass, if that is positive."""
     if log_sum <= 0:
         return density
     evidence = np.array(density.log_evidence) + np.where(np.array(density.powers) > 0, log_sum, 0)
