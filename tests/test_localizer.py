@@ -162,12 +162,23 @@ def test_the_evidence_prefers_the_object_that_was_pressed(make_localizer, ball, 
 
 def test_a_constant_prior_is_none(localizer, a_touch):
     mask = a_touch(localizer)[1]
-    none = localizer.localize(mask)
+    none = localizer.localize(mask, effort=GRID_ALONE)
     for c in (0.0, 7.0):
-        constant = localizer.localize(mask, prior=lambda T, c=c: np.full(len(T), c))
+        constant = localizer.localize(mask, effort=GRID_ALONE, prior=lambda T, c=c: np.full(len(T), c))
         assert (constant.cells == none.cells).all()
         assert constant.log_prob == pytest.approx(none.log_prob, abs=1e-4)
         assert constant.log_evidence == pytest.approx(none.log_evidence, abs=1e-4)
+
+
+def test_contacts_gain_as_much_under_a_constant_prior(localizer, a_touch):
+    """The coarse density differs in its last bits, and with it the poses that are drawn: so within their chance."""
+    T, mask = a_touch(localizer)
+    gains = [
+        localizer.localize(mask, prior=prior, seed=seed).log_density(T)
+        for prior in (None, lambda T: np.full(len(T), 7.0))
+        for seed in range(3)
+    ]
+    assert np.mean(gains[:3]) == pytest.approx(np.mean(gains[3:]), abs=1.5) and min(gains) > 1
 
 
 def test_a_prior_multiplies_the_likelihood(plug, a_touch, rng):
