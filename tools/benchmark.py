@@ -201,6 +201,7 @@ def _kernels(part: str, sensor: str, cache: str) -> dict[str, Any]:
     import torch
 
     from geomtact.contact_space.contact_maps import ContactMaps, located
+    from geomtact.contact_space.touches import random_touches
     from geomtact.localizer import Localizer
     from geomtact.scoring.contact_likelihood import SHAPE, ContactQuery
     from geomtact.scoring.encoder import Tower
@@ -208,53 +209,42 @@ def _kernels(part: str, sensor: str, cache: str) -> dict[str, Any]:
 
     localizer = Localizer.prepare(part, sensor=sensor, cache_dir=cache)
     index, rng = localizer.index, np.random.default_rng(0)
-    T, masks = zip(*((t.T_sensor_object, t.mask) for t in _touches(localizer, 40)), strict=True)
+    T, masks = zip(*((t.T_sensor_object, t.mask) for t in random_touches(localizer.space, 40, seed=0)), strict=True)
     poses, membrane = located(index, np.repeat(T, 250, 0))
-    query = ContactQuery.of(masks[0].astype(np.float32), index.sensor)
-    maps = ContactMaps.of(index)
-    heights = maps.maps.heights[0]
-    pixels = rng.integers(heights.size, size=(1000, SHAPE[0] * SHAPE[1]))
-    gather = pixels.size / best(lambda: heights.ravel().take(pixels))
-    out = {
-        "cut and compare contacts": rate(len(membrane), best(lambda: query.compare(index, poses, membrane)), "contacts")
-    }
-    out["cut and compare contacts"] |= {
-        "limit": gather / pixels.shape[1],
-        "limited by": "heights gathered by numpy, one thread",
-    }
+    image = masks[0].astype(np.float32)
+    query = ContactQuery.of(image, index.sensor)
+    heights = ContactMaps.of(index).maps.heights[0].ravel()
+    pixels = rng.integers(len(heights), size=(1000, SHAPE[0] * SHAPE[1]))
 
     scorer: Any = localizer.scorer.scorer
-    tower = scorer.descriptor
+    tower, stored = scorer.descriptor, scorer.stored
     assert isinstance(tower, Tower)
     shown = np.zeros((16_384, 24, 32), bool)
     shown[:, 6:18, 8:24] = rng.random((len(shown), 12, 16)) < 0.5
-    flop = 2 * sum(w.size for name, w in tower.weights.items() if w.ndim == 2 and "touch" not in name)
+    multiplied = sum(w.size for name, w in tower.weights.items() if w.ndim == 2 and "touch" not in name)
     a = torch.randn(4096, 1024)
     with torch.inference_mode(), autocast():
-        peak = 2 * len(a) * 1024 * 1024 / best(lambda: a @ a[:1024].T)
-    out["encode contacts"] = rate(len(shown), best(lambda: tower.describe(shown, index.sensor)), "contacts")
-    out["encode contacts"] |= {"limit": peak / flop, "limited by": "a matrix product in the same precision"}
-
-    image = masks[0].astype(np.float32)
-    stored = scorer.stored
-    read = stored.nbytes / best(lambda: stored.max())
-    out["score all poses"] = rate(len(stored), best(lambda: scorer.score(index, image)), "poses")
-    out["score all poses"] |= {
-        "limit": read / stored.nbytes * len(stored),
-        "limited by": "the largest of all numbers, by numpy",
+        product = len(a) * 1024 * 1024 / best(lambda: a @ a[:1024].T)
+    return {
+        "cut and compare contacts": {
+            "per_second": len(membrane) / best(lambda: query.compare(index, poses, membrane)),
+            "of": "contacts",
+            "limit": len(pixels) / best(lambda: heights.take(pixels)),
+            "limited by": "heights gathered by numpy, one thread",
+        },
+        "encode contacts": {
+            "per_second": len(shown) / best(lambda: tower.describe(shown, index.sensor)),
+            "of": "contacts",
+            "limit": product / multiplied,
+            "limited by": "a matrix product in the same precision",
+        },
+        "score all poses": {
+            "per_second": len(stored) / best(lambda: scorer.score(index, image)),
+            "of": "poses",
+            "limit": len(stored) / best(stored.max),
+            "limited by": "the largest of all numbers, by numpy",
+        },
     }
-    return out
-
-
-def _touches(localizer: Any, n: int) -> Any:
-    from geomtact.contact_space.touches import random_touches
-
-    return random_touches(localizer.space, n, seed=0)
-
-
-def rate(n: int, seconds: float, what: str) -> dict[str, Any]:
-    """How many a second."""
-    return {"per_second": n / seconds, "of": what}
 
 
 def best(what: Callable[[], Any]) -> float:

@@ -116,9 +116,7 @@ class PoseDistance:
         fixed, cosine, sine = gains
         best = (fixed + np.hypot(cosine, sine)).argmax(1)
         row = np.arange(len(others))
-        angle = np.arctan2(sine[row, best], cosine[row, best])[:, None, None]
-        along, across, ahead = symmetry.turn_parts
-        S = along + np.cos(angle) * across + np.sin(angle) * ahead
+        S = symmetry.turned(np.arctan2(sine[row, best], cosine[row, best]))
         S = S @ symmetry.elements[best, :3, :3]
         return others @ transform(S, symmetry.centre - S @ symmetry.centre)
 

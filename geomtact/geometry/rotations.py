@@ -305,9 +305,7 @@ class Directions:
             target = self.vectors[self.direction_of(a)]
             axis = axis_of(sym)
             angle = azimuth_of(a, axis) - azimuth_of(target, axis)
-            along, across, ahead = sym.turn_parts
-            S = along + np.cos(angle)[:, None, None] * across + np.sin(angle)[:, None, None] * ahead
-            T = _about(T, sym.centre, T[:, :3, :3] @ S)
+            T = _about(T, sym.centre, T[:, :3, :3] @ sym.turned(angle))
         return T
 
     def direction_of(self, a: ArrayLike) -> NDArray[np.int64]:
@@ -329,11 +327,7 @@ class Directions:
         k = self.direction_of(a)
         # carry the cell's direction onto the pose's by the smallest rotation, and what is along x at its turn 0 with it: what
         # remains is the turn
-        v, x = self.vectors[k], self._along_x[k]
-        about = cross(v, a)
-        ahead = cross(about, x)
-        x = x + ahead + cross(about, ahead) / np.maximum(1 + (v * a).sum(-1, keepdims=True), 1e-9)
-        x = (R @ x[..., None])[..., 0]
+        x = (R @ _carried(self._along_x[k], self.vectors[k], a)[..., None])[..., 0]
         n, period = self.turns[k], self.periods[k]
         safe = np.where(period > 0, period, 1.0)
         turn = np.arctan2(x[:, 1], x[:, 0]) % (2 * np.pi)
@@ -351,6 +345,13 @@ def _about(T: Array, centre: Array, R: Array) -> Array:
     """``T`` with its rotation replaced by ``R``, the object's point ``centre`` staying where it is."""
     where = T[:, :3, :3] @ centre + T[:, :3, 3]
     return transform(R, where - R @ centre)
+
+
+def _carried(x: Array, a: Array, b: Array) -> Array:
+    """Vectors ``x`` (n, 3) turned by :func:`_smallest_rotation`, without its matrices."""
+    v = cross(a, b)
+    ahead = cross(v, x)
+    return x + ahead + cross(v, ahead) / np.maximum(1 + (a * b).sum(-1, keepdims=True), 1e-9)
 
 
 def _smallest_rotation(a: Array, b: Array) -> Array:

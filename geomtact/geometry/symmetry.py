@@ -69,6 +69,12 @@ class Symmetry:
         along = np.outer(self.axis, self.axis)
         return along, np.eye(3) - along, hat(self.axis)
 
+    def turned(self, angle: Array) -> Array:
+        """Turns (n, 3, 3) by ``angle`` (n,) [rad] about the axis."""
+        along, across, ahead = self.turn_parts
+        angle = angle[:, None, None]
+        return along + np.cos(angle) * across + np.sin(angle) * ahead
+
     @property
     def density(self) -> float:
         """Of the uniform distribution of rotations, per rad of each direction that changes how the object is turned."""

@@ -41,6 +41,7 @@ _AGREE, _AGREE_AT_LAST = 1.0, 2.0
 # they found rests on one run, which nothing confirms: by the rule of succession another one would find the same with this
 # probability.
 _TRUST = 0.5
+_DISAGREE, _UNEXPLAINED = "two runs of the sampler do not agree", "no pose that was found explains all contacts"
 _SHARE = 20  # the first attempt cuts one of so many of all contacts
 # times as few on each of several sensors, where registration finds the modes: mean gains of 14 to 20 scenes of four objects
 # differ by -1.1 to 1.7 nats from those with as many (seeds 4711 and 5151)
@@ -59,7 +60,7 @@ class Finding:
 
     Attributes
     ----------
-    explored : the distribution of the pose; None where they found no pose that explains all contacts
+    explored : the distribution of the pose; None where they found no pose that touches all sensors which show contact
     log_evidence : log of the mean under the prior of the likelihood of all contacts, to the power ``EVIDENCE_POWER``; -inf where
         no pose was found that touches all sensors which show contact
     misfit_nats, unexplained_nats : as of ``facts.Diagnostics``
@@ -70,7 +71,7 @@ class Finding:
     log_evidence: float = -np.inf
     misfit_nats: float = np.inf
     unexplained_nats: float | None = None
-    why_not: str = "no pose that was found explains all contacts"
+    why_not: str = ""
 
 
 def explore_twice(
@@ -102,11 +103,12 @@ def explore_twice(
             one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, search)
             cut += one.contacts + other.contacts
             unexplained = _unexplained(one, other) if others else None
-            found = Finding(None, _log_evidence(one, other), _misfit(one, other), unexplained)
+            explains = unexplained is None or unexplained <= UNEXPLAINED_NATS
+            why_not = _DISAGREE if explains else _UNEXPLAINED
+            found = Finding(None, _log_evidence(one, other), _misfit(one, other), unexplained, why_not)
             is_last, explored = asked == attempts[-1], None
-            if unexplained is None or unexplained <= UNEXPLAINED_NATS:
+            if explains:
                 explored, cut = _agreed(one, other, left_out, _AGREE_AT_LAST if is_last else _AGREE, asked, cut, rng)
-                found = replace(found, why_not="two runs of the sampler do not agree")
             if explored is None and is_last:
                 explored = _by_one_run(one, other, asked, cut, rng)
         except InputError as error:
