@@ -6,6 +6,7 @@ Twists are ``xi = (rx, ry, rz, tx, ty, tz)``, rotation first, radians and metres
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
@@ -116,34 +117,107 @@ def cross(a: Array, b: Array) -> Array:
 def exp(xi: ArrayLike) -> Array:
     """Exponential of twists (..., 6) -> (..., 4, 4) (Barfoot, eqs. 7.25 and 7.37)."""
     xi = np.asarray(xi, float)
-    w, v = xi[..., :3], xi[..., 3:]
-    R = Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape[:-1], 3, 3)
-    return transform(R, (left_jacobian(w) @ v[..., None])[..., 0])
+    out = np.zeros((*xi.shape[:-1], 4, 4))
+    _exp(np.ascontiguousarray(xi).reshape(-1, 6), out.reshape(-1, 4, 4))
+    return out
 
 
 def left_jacobian(w: ArrayLike) -> Array:
     """Matrices (..., 3, 3) by which the exponential of a twist with the turn ``w`` (..., 3) shifts (Barfoot, eq. 7.37)."""
     w = np.asarray(w, float)
-    theta = np.linalg.norm(w, axis=-1)[..., None, None]
-    small = theta < 1e-5
-    safe = np.where(small, 1.0, theta)
-    a = np.where(small, 0.5 - theta**2 / 24, (1 - np.cos(safe)) / safe**2)
-    b = np.where(small, 1 / 6 - theta**2 / 120, (safe - np.sin(safe)) / safe**3)
-    W = hat(w)
-    return np.asarray(np.eye(3) + a * W + b * (W @ W))
+    out = np.empty((*w.shape, 3))
+    _left_jacobian(np.ascontiguousarray(w).reshape(-1, 3), out.reshape(-1, 3, 3))
+    return out
 
 
 def log(T: ArrayLike) -> Array:
     """Twist (..., 6) whose exponential is ``T`` (..., 4, 4), rotation angle at most pi."""
     T = np.asarray(T, float)
-    w = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*T.shape[:-2], 3)
-    theta = np.linalg.norm(w, axis=-1)[..., None, None]
-    small = theta < 1e-4
-    safe = np.where(small, 1.0, theta)
-    c = np.where(small, 1 / 12 + theta**2 / 720, 1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.sin(safe) + 1e-300))
-    W = hat(w)
-    V_inv = np.eye(3) - 0.5 * W + c * (W @ W)
-    return np.concatenate([w, (V_inv @ T[..., :3, 3, None])[..., 0]], -1)
+    out = np.empty((*T.shape[:-2], 6))
+    _log(np.ascontiguousarray(T).reshape(-1, 4, 4), out.reshape(-1, 6))
+    return out
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _exp(xi, T):  # type: ignore[no-untyped-def]
+    """Writes the exponential of every ``xi`` (n, 6) to ``T`` (n, 4, 4), which is 0."""
+    V = np.empty((3, 3))
+    for i in range(len(xi)):
+        w, v = xi[i, :3], xi[i, 3:]
+        sine, cosine, rest = _of_turn(np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2))
+        _combined(w, sine, cosine, T[i, :3, :3])
+        _combined(w, cosine, rest, V)
+        for a in range(3):
+            T[i, a, 3] = V[a, 0] * v[0] + V[a, 1] * v[1] + V[a, 2] * v[2]
+        T[i, 3, 3] = 1.0
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _left_jacobian(w, out):  # type: ignore[no-untyped-def]
+    """Writes the matrix of every turn ``w`` (n, 3) to ``out`` (n, 3, 3)."""
+    for i in range(len(w)):
+        _, cosine, rest = _of_turn(np.sqrt(w[i, 0] ** 2 + w[i, 1] ** 2 + w[i, 2] ** 2))
+        _combined(w[i], cosine, rest, out[i])
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _log(T, xi):  # type: ignore[no-untyped-def]
+    """Writes the logarithm of every ``T`` (n, 4, 4) to ``xi`` (n, 6)."""
+    q, inverse_jacobian = np.empty(4), np.empty((3, 3))
+    for i in range(len(T)):
+        _quaternion(T[i], q)
+        n = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
+        theta = 2 * np.arctan2(n, q[3])
+        for a in range(3):
+            xi[i, a] = q[a] * (theta / n if n > 1e-12 else 2.0)
+        second = 1 / 12 + theta**2 / 720 if theta < 1e-4 else 1 / theta**2 - q[3] / (2 * n * theta)
+        _combined(xi[i, :3], -0.5, second, inverse_jacobian)
+        for a in range(3):
+            xi[i, 3 + a] = 0.0
+            for b in range(3):
+                xi[i, 3 + a] += inverse_jacobian[a, b] * T[i, b, 3]
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _of_turn(theta):  # type: ignore[no-untyped-def]
+    """sin(x) / x, (1 - cos(x)) / x^2 and (x - sin(x)) / x^3 at ``theta`` [rad]."""
+    if theta < 1e-5:
+        return 1 - theta**2 / 6, 0.5 - theta**2 / 24, 1 / 6 - theta**2 / 120
+    sine = np.sin(theta)
+    return sine / theta, (1 - np.cos(theta)) / theta**2, (theta - sine) / theta**3
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _combined(w, first, second, out):  # type: ignore[no-untyped-def]
+    """Writes I + ``first`` W + ``second`` W^2 to ``out`` (3, 3), W the cross-product matrix of ``w`` (3,)."""
+    on_diagonal = 1 - second * (w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        out[a, a] = on_diagonal + second * w[a] ** 2
+        out[a, b] = second * w[a] * w[b] - first * w[c]
+        out[b, a] = second * w[a] * w[b] + first * w[c]
+
+
+@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _quaternion(T, q):  # type: ignore[no-untyped-def]
+    """Writes the unit quaternion, x, y, z, w with w >= 0, of a rotation, the first of ``T`` (4, 4), to ``q`` (4,) (Shepperd
+    1978)."""
+    trace = T[0, 0] + T[1, 1] + T[2, 2]
+    a = 0
+    for other in (1, 2):
+        if T[other, other] > T[a, a]:
+            a = other
+    b, c = (a + 1) % 3, (a + 2) % 3
+    if trace > T[a, a]:
+        q[0], q[1], q[2], q[3] = T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1], 1 + trace
+    else:
+        q[a], q[b], q[c] = 1 + 2 * T[a, a] - trace, T[a, b] + T[b, a], T[a, c] + T[c, a]
+        q[3] = T[c, b] - T[b, c]
+    length = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    if q[3] < 0:
+        length = -length
+    for i in range(4):
+        q[i] /= length
 
 
 def adjoint(T: ArrayLike) -> Array:

@@ -1,4 +1,4 @@
-"""How many threads share compiled work. Results do not depend on it, because the work is always cut into the same parts."""
+"""How many threads share compiled work. Results do not depend on it, because rows of the work do not depend on one another."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def test_particles_stay_in_the_contact_pose_space(localizer, maps):
         assert ((particles.depth >= 0) & (particles.depth <= localizer.sensor.max_penetration)).all()
     assert run.density.weights.sum() == pytest.approx(1)
     assert run.contacts <= 1.25 * 3000
-    found = two_runs._explored_from(run, 10_000, np.random.default_rng(1))
+    found, _ = two_runs._explored_from(run, 10_000, np.random.default_rng(1))
     assert len(found.poses) == round(np.exp(found.density.log_inside) * sum(map(len, run.particles)))
     assert ((found.depth >= 0) & (found.depth <= localizer.sensor.max_penetration)).all()
 

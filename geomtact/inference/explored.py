@@ -84,7 +84,11 @@ class Density:
 
     def log_density(self, T: ArrayLike) -> Array:
         """Log density (n,), relative to the uniform, at poses ``T_sensor_object`` (n, 4, 4) of the contact pose space."""
-        return np.asarray(np.logaddexp.reduce(self.of_powers(T) + np.log(self.weights), -1)) - self.log_inside
+        return self.mixed(self.of_powers(T))
+
+    def mixed(self, of_powers: Array) -> Array:
+        """Log density (n,) where :meth:`of_powers` is (n, K)."""
+        return np.asarray(np.logaddexp.reduce(of_powers + np.log(self.weights), -1)) - self.log_inside
 
     def of_powers(self, T: ArrayLike) -> Array:
         """As :meth:`log_density` of each posterior (n, K), but not divided by the share that ``log_inside`` is the log of."""

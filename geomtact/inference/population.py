@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from geomtact.contact_space.contact_maps import centring_std, located
 from geomtact.inference.particles import Particles, Target, poses_of
@@ -200,10 +199,10 @@ def _nudged(target: Target, T: Array, size: float, rng: np.random.Generator) -> 
     rotvec = scale * _TURN * rng.normal(size=(n, 3))
     if target.index.space.on_known_faces:
         rotvec[:, :2] = 0
-    turn = Rotation.from_rotvec(rotvec).as_matrix()
+    turn = exp(np.column_stack([rotvec, np.zeros((n, 3))]))[:, :3, :3]
     shift = scale * centring_std(target.index.sensor) * rng.normal(size=(n, 3))
     about = target.query.centroid
-    where = np.einsum("nij,nj->ni", turn, T[:, :3, 3] - about) + about + shift
+    where = (turn @ (T[:, :3, 3] - about)[..., None])[..., 0] + about + shift
     return transform(turn @ T[:, :3, :3], where)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
 from geomtact.inference.effort import LEAST_CONTACTS
-from geomtact.inference.explored import Density, Explored
+from geomtact.inference.explored import Explored
 from geomtact.inference.facts import UNEXPLAINED_NATS
 from geomtact.inference.mode_mass import counted, shares_near, weighed
 from geomtact.inference.particles import OtherSensor, Particles
@@ -141,11 +141,8 @@ def _agreed(
         if run.density.weights @ apart >= most * run.density.target.sensors:
             continue
         found, log_sum = _with_modes(one, other, run, last, asked, rng)
-        if log_sum <= 0:
-            return found, cut
         if log_sum < most:
-            density = _raised(found.density, log_sum)
-            return replace(found, density=density, log_density=density.log_density(found.poses)), cut
+            return found, cut
         cut = found.contacts
     return None, cut
 
@@ -154,34 +151,31 @@ def _with_modes(
     one: Run, other: Run, run: Run, last: int, asked: int, rng: np.random.Generator
 ) -> tuple[Explored, float]:
     """The distribution of the pose by both runs as one ``run`` up to the ``last`` stop, with its modes; and the log of the sum of
-    all mass as it was found, 0 of several sensors."""
+    all mass as it was found, 0 of several sensors. If that is positive, the evidence is larger by as much."""
     further = _sharpest(one, other)
     if run.density.target.others:
         led_to = (one.about.led_to, one.about.origin) if one.about else None
         draws = _draws_left(one, last) + _draws_left(other, last)
-        return counted(_explored_from(run, _POSES[0], rng), further, draws, led_to), 0.0
-    found = _explored_from(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
-    return weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
+        return counted(_explored_from(run, _POSES[0], rng)[0], further, draws, led_to), 0.0
+    found, of_powers = _explored_from(run, int(np.clip(asked // _FOR_EACH, *_POSES)), rng)
+    found, log_sum = weighed(found, further, run.log_measure, round(_WEIGHING * asked), rng)
+    if log_sum > 0:
+        more = np.where(np.array(found.density.powers) > 0, log_sum, 0.0)
+        density = replace(found.density, log_evidence=tuple((found.density.log_evidence + more).tolist()))
+        found = replace(found, density=density, log_density=density.mixed(of_powers - more))
+    return found, log_sum
 
 
 def _by_one_run(one: Run, other: Run, asked: int, cut: int, rng: np.random.Generator) -> Explored:
     """What two runs that do not agree found, with the probability ``_TRUST``, else the coarse posterior."""
     last = len(one.log_evidence) - 1
     run = replace(pooled(one, other, last, rng, alike=False), contacts=cut)
-    found, log_sum = _with_modes(one, other, run, last, asked, rng)
-    density = replace(_raised(run.density, log_sum), trust=_TRUST)
-    drawn = _explored_from(replace(run, density=density, contacts=found.contacts), len(found.poses), rng)
+    found, _ = _with_modes(one, other, run, last, asked, rng)
+    density = replace(found.density, trust=_TRUST)
+    drawn, _ = _explored_from(replace(run, density=density, contacts=found.contacts), len(found.poses), rng)
     coarse = density.target.poses(run.particles[0])
     masses = _TRUST * found.masses + (1 - _TRUST) * shares_near(run.density.index.mesh, found.hearts, coarse)
     return replace(drawn, hearts=found.hearts, masses=masses)
-
-
-def _raised(density: Density, log_sum: float) -> Density:
-    """``density`` with an evidence larger by ``log_sum``, the log of the sum of all mass, if that is positive."""
-    if log_sum <= 0:
-        return density
-    evidence = np.array(density.log_evidence) + np.where(np.array(density.powers) > 0, log_sum, 0)
-    return replace(density, log_evidence=tuple(evidence.tolist()))
 
 
 def _log_evidence(one: Run, other: Run) -> float:
@@ -241,8 +235,9 @@ def pooled(one: Run, other: Run, last: int, rng: np.random.Generator, alike: boo
     return replace(one, density=density, particles=tuple(particles), log_measure=measure)
 
 
-def _explored_from(run: Run, n: int, rng: np.random.Generator) -> Explored:
-    """Up to ``n`` poses of a ``run`` with errors, drawn by ``rng``: those that are in the contact pose space.
+def _explored_from(run: Run, n: int, rng: np.random.Generator) -> tuple[Explored, Array]:
+    """Up to ``n`` poses of a ``run`` with errors, drawn by ``rng``: those that are in the contact pose space; and what their
+    density is mixed of.
 
     Raises
     ------
@@ -263,7 +258,8 @@ def _explored_from(run: Run, n: int, rng: np.random.Generator) -> Explored:
     averaged = NODES + (target.sensors - 1) * NODES_BESIDE
     contacts = run.contacts + target.sensors * len(each) + averaged * len(inside)
     T = T[inside]
-    return Explored(density, T, moved.depth[inside], density.log_density(T), contacts)
+    of_powers = density.of_powers(T)
+    return Explored(density, T, moved.depth[inside], density.mixed(of_powers), contacts), of_powers
 
 
 def _sharpest(one: Run, other: Run) -> Array:

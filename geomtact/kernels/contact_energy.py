@@ -136,14 +136,14 @@ def _contact_energy(  # type: ignore[no-untyped-def]
     centroid,
 ):
     """The loop of :func:`contact_energy`, which writes ``energy``, ``found`` and ``centroid``."""
-    n, blocks, samples = len(direction), len(block), within.shape[1]
+    n, blocks, samples = len(direction), len(block), BLOCK * BLOCK  # known when it is compiled
     size = heights.shape[1]
     half = np.float32(size // 2 + 0.5)
     one, nothing, empty = np.float32(1), np.float32(-1e3), np.float32(_NOTHING)
     middle = np.float32(0.5) * deepest
     surface = np.empty((blocks, samples), np.float32)
     highest = np.empty(blocks, np.float32)
-    cut = np.empty(blocks, np.uint8)
+    above, cut = np.empty(blocks, np.float32), np.empty(blocks, np.uint8)
     sums = np.empty((SHARES, 3), np.float32)
     deepest_in, deep = np.empty(blocks, np.float32), np.empty((rows, columns), np.float32)
     wide_deep, between = np.empty((rows, columns), np.float32), _between_blocks()
@@ -172,7 +172,7 @@ def _contact_energy(  # type: ignore[no-untyped-def]
                 if 0 <= column < size and 0 <= row < size:
                     h = up * wide[row // COARSER, column // COARSER] - lean_x * u - lean_y * v + slack - least_sag[k]
                 highest[k] = h
-                cut[k] = 0
+                cut[k], above[k] = 0, nothing
                 top = max(top, h)
             if top < empty:
                 break
@@ -181,7 +181,7 @@ def _contact_energy(  # type: ignore[no-untyped-def]
                 for k in range(blocks):
                     if cut[k] or highest[k] < limit:
                         continue
-                    cut[k] = 1
+                    cut[k], peak = 1, nothing
                     x, y = block[k, 0] - off_x, block[k, 1] - off_y
                     for j in range(samples):
                         xj, yj = x + within[k, j, 0], y + within[k, j, 1]
@@ -191,7 +191,8 @@ def _contact_energy(  # type: ignore[no-untyped-def]
                         if 0 <= column < size and 0 <= row < size:
                             h = up * height[row, column] - lean_x * u - lean_y * v - sag[k, j]
                         surface[k, j] = h
-                        best = max(best, h)
+                        peak = max(peak, h)
+                    above[k], best = peak, max(best, peak)
                 lowest = best - depth[i] if np.isnan(membrane[i]) else membrane[i]
                 limit = empty if best < empty else max(lowest, best - deepest)
             if best < empty or not np.isnan(membrane[i]):
@@ -208,10 +209,7 @@ def _contact_energy(  # type: ignore[no-untyped-def]
         energy[i] = 0
         sums[:] = 0
         for k in range(blocks):
-            deepest_in[k] = 0
-            if cut[k]:
-                for j in range(samples):
-                    deepest_in[k] = max(deepest_in[k], surface[k, j] - lowest)
+            deepest_in[k] = max(above[k] - lowest, np.float32(0))
             deep[k // columns, k % columns] = deepest_in[k]
         _smooth_maximum(deep, wide_deep)
         for k in range(blocks):
