@@ -38,6 +38,15 @@ def test_without_symmetry_it_is_the_plain_mean(rng):
     assert distance.largest(T, others) == pytest.approx(d.max(1), rel=1e-12)
 
 
+@each_object
+def test_of_all_images_one_is_nearest(name, rng):
+    """Of the elements' images; those that turns about an axis make are as near as one another."""
+    distance = PoseDistance(load_mesh(name), 128)
+    T, others = np.eye(4), transform(random_rotations(40, rng), 5e-3 * rng.normal(size=(40, 3)))
+    nearest = [distance.is_nearest(T, others @ S) for S in distance.mesh.symmetry.elements]
+    assert (np.sum(nearest, 0) == 1).all()
+
+
 @pytest.mark.parametrize("name", ["hex_nut", "gear", "damping_pin"])
 def test_it_is_the_least_over_the_symmetry_group(name, rng):
     """Images are aligned in mean square, so the mean is a little above its own minimum."""

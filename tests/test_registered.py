@@ -65,10 +65,12 @@ def test_draws_about_modes_have_their_density(localizer, scenes):
     few = AboutModes(
         target, about.hearts[:1], about.bases[:1], about.students[:1], about.led_to, about.origin, about.best, 0
     )
-    some = target.particles_at(about.draw(4000, rng))
-    inside = np.isfinite(some.log_target(0))
+    drawn, counts = about.draw(4000, rng)
+    some = target.particles_at(drawn)
+    inside = np.isfinite(some.log_target(0)) & counts
     ratio = np.exp(few.log_density(some) - about.log_density(some))
-    share = np.isfinite(target.particles_at(few.draw(4000, rng)).log_target(0)).mean()
+    drawn, counts = few.draw(4000, rng)
+    share = (np.isfinite(target.particles_at(drawn).log_target(0)) & counts).mean()
     mean = np.where(inside, ratio, 0).mean()
     assert mean == pytest.approx(share, abs=4 * np.std(np.where(inside, ratio, 0)) / np.sqrt(4000) + 0.05)
 

@@ -11,7 +11,7 @@ from geomtact import Sensor
 from geomtact.contact_space.contact_maps import SHAPE, ContactMaps, located
 from geomtact.contact_space.touches import random_touches
 from geomtact.geometry.mesh_file import load_mesh
-from geomtact.inference import explored, sampler, two_runs
+from geomtact.inference import explored, population, sampler, two_runs
 from geomtact.inference.particles import Target, poses_of
 from geomtact.inference.sampler import explore
 from geomtact.scoring.contact_likelihood import POWERS, RATE, ContactQuery
@@ -126,6 +126,13 @@ def test_the_uniform_density_has_the_measure_of_the_cells(localizer, maps):
     drawn, log_weight, _ = sampler._draw(target, share, 1, 20_000, rng)
     of_cells = np.exp(logsumexp(log_weight[0] + drawn.log_target(0)))
     assert density.sum() / n == pytest.approx(of_cells, rel=5 * density.std() / density.sum() * np.sqrt(len(T)) + 0.02)
+
+
+def test_a_step_ends_where_it_is_to_end():
+    """However much the weights change."""
+    change = np.array([[0.0] + [-1e6] * 99])
+    assert population._next_step(change, 5e-5) == 5e-5 and population._next_step(change, 0.1) < 0.1
+    assert population._next_step(np.zeros((2, 9)), 0.1) == 0.1
 
 
 def test_particles_stay_in_the_contact_pose_space(localizer, maps):

@@ -322,6 +322,19 @@ def test_a_prior_waits_for_the_first_contact(flat_nut, creeping):
     assert gains[0] == pytest.approx(gains[1], abs=1e-6) and gains[0] > 3
 
 
+def test_a_prior_fades_over_frames_that_are_skipped(pin):
+    """The object moves meanwhile: where it is after the frames is hardly less likely than without the prior."""
+    trajectory = random_trajectory(pin.space, 6, 0, elastic=False)
+    before, truth = trajectory.T_sensor_object[[0, 5]]
+    prior = GaussianPrior(before, np.diag([0.02**2] * 3 + [0.3e-3**2] * 3))
+    frames = [*[None] * 5, trajectory.masks[5]]
+    faded, none, narrow = (
+        list(track(pin, each, prior=prior, on_error="skip", effort="fast"))[-1].log_density(truth)
+        for each, prior in ((frames, prior), (frames, None), (frames[5:], prior))
+    )
+    assert faded > none - 2 > narrow
+
+
 def test_bad_frames_are_named_by_their_number(flat_nut, creeping, tmp_path):
     masks = creeping[0][0].masks
     small = np.zeros((10, 10), bool)

@@ -12,6 +12,7 @@ from geomtact.contact_space.cell_transfer import ExtrinsicsStd
 from geomtact.evaluation import simultaneous_touches
 from geomtact.inference import two_runs
 from geomtact.inference.effort import Effort
+from geomtact.inference.gaussian_prior import GaussianPrior
 from geomtact.inference.particles import SURE
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.systematic_errors import ERRORS, stand_of
@@ -135,6 +136,16 @@ def test_the_better_sensor_poses_are_known_the_more_is_known(localizer, scenes):
         assert all(p.explored is None or p.explored.density.target.others[0].extrinsics_std == rig for p in each)
         gains.append(np.mean([p.information_gain_nats for p in each]))
     assert gains[0] > gains[1] > gains[2]
+
+
+def test_a_narrow_prior_adds_to_the_contacts(localizer, scenes):
+    """One of 1 mm and 2 degrees about the true pose: in most cells its density is smaller than any number."""
+    for scene in scenes[:2]:
+        prior = GaussianPrior(scene.T_world_object, np.diag([np.deg2rad(2) ** 2] * 3 + [1e-6] * 3))
+        with_prior, without = (found(localizer, scene, prior=each) for each in (prior, None))
+        assert with_prior.explored is not None and np.isfinite(with_prior.log_evidence)
+        gained = with_prior.log_density(scene.T_world_object) - without.log_density(scene.T_world_object)
+        assert gained > 1 and with_prior.log_evidence > without.log_evidence
 
 
 def test_what_leaves_contacts_unexplained_has_half_of_the_probability(localizer, scenes, monkeypatch):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from geomtact.geometry.mesh import Mesh, outermost
 from geomtact.geometry.symmetry import Symmetry
@@ -119,6 +119,17 @@ class PoseDistance:
         S = symmetry.turned(np.arctan2(sine[row, best], cosine[row, best]))
         S = S @ symmetry.elements[best, :3, :3]
         return others @ transform(S, symmetry.centre - S @ symmetry.centre)
+
+    def is_nearest(self, T: ArrayLike, others: ArrayLike) -> NDArray[np.bool_]:
+        """Whether each of ``others`` (m, 4, 4) is the nearest to ``T`` of its images under the object's symmetry; turns about an
+        axis are not looked at, because no motion of ``Symmetry.motions`` makes them."""
+        T, others = np.asarray(T, float), np.asarray(others, float)
+        symmetry = self.mesh.symmetry
+        if symmetry is None or len(symmetry.elements) == 1:
+            return np.ones(len(others), bool)
+        if symmetry.axis is not None:  # a half turn swaps its ends
+            return np.asarray((others[:, :3, :3] @ symmetry.axis) @ (T[:3, :3] @ symmetry.axis) > 0)
+        return np.asarray(np.abs(self.aligned(T, others) - others).max((1, 2)) < 1e-9)
 
     @cached_property
     def _overlap(self) -> list[Array]:

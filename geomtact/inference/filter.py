@@ -194,6 +194,7 @@ class Filter:
 
     def _passed_over(self, T_frame_sensor: Array) -> CellLogProb:
         """The distribution after a frame that constrains nothing."""
+        self.prior = None  # the object has moved since
         self.predict(T_frame_sensor)
         return self._with_mass(self._normalise(self._log_density(self.memory)))
 

@@ -53,7 +53,7 @@ def weighed(
         )
         turn = np.linalg.norm(xi[..., :3], axis=-1)
         # beyond these turns a placement is met again
-        nearest = [_is_nearest(distance, mode.heart, each) for mode, each in zip(modes, T, strict=True)]
+        nearest = [distance.is_nearest(mode.heart, each) for mode, each in zip(modes, T, strict=True)]
         near &= np.array(turn < np.pi, bool) & np.array(nearest, bool)
         found = np.full(near.shape, -np.inf)
         carried = shares[near][:, None] if density.target.carried else None
@@ -90,10 +90,11 @@ def counted(
     hearts, members = _grown(explored, further, distance, radius, _MODES[1])
     if led_to is not None:
         T, origin = led_to
-        near = np.stack(
-            [distance.within(heart, T, radius) for heart, rows in zip(hearts, members, strict=True) if len(rows)]
-        )
-        draws = max(draws, len(np.unique(origin[near.any(0) & (origin >= 0)])))
+        near = np.zeros(len(T), bool)
+        for heart, rows in zip(hearts, members, strict=True):
+            if len(rows):
+                near |= np.asarray(distance.within(heart, T, radius), bool)
+        draws = max(draws, len(np.unique(origin[near & (origin >= 0)])))
     mass = _shared_out(explored, members, np.array([explored.weight[rows].sum() for rows in members]))
     order = np.argsort(-mass, kind="stable")
     return replace(explored, hearts=hearts[order], masses=mass[order] * draws / (draws + 1))
@@ -123,17 +124,6 @@ def _modes(explored: Explored, hearts: Array, members: list[NDArray[np.int64]], 
         least = np.where(basis[:, :3].any(1), pitch / explored.index.mesh.radius_rms, pitch)
         modes.append(_Mode(heart, basis, least, [Student.of(motions, weight, least)]))
     return modes
-
-
-def _is_nearest(distance: PoseDistance, heart: Array, T: Array) -> NDArray[np.bool_]:
-    """Whether each of ``T`` (n, 4, 4) is the nearest to ``heart`` of its images under the symmetry; turns about an axis are not
-    looked at, because no motion makes them."""
-    symmetry = distance.mesh.symmetry
-    if symmetry is None or len(symmetry.elements) == 1:
-        return np.ones(len(T), bool)
-    if symmetry.axis is not None:  # a half turn swaps its ends
-        return np.asarray((T[:, :3, :3] @ symmetry.axis) @ (heart[:3, :3] @ symmetry.axis) > 0)
-    return np.asarray(np.abs(distance.aligned(heart, T) - T).max((1, 2)) < 1e-9)
 
 
 def _grown(

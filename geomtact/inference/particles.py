@@ -112,8 +112,8 @@ class OtherSensor:
         cut, likely = query.compare(self.index, poses, membrane)
         depth = np.where(np.isfinite(cut.reach), cut.reach - membrane, -_FARTHEST)
         if not query.touched.any():
-            # the largest power stands for the whole likelihood
-            return np.where(depth > 0, np.log(MISSED_CONTACT_SHARE) / POWERS[-1], 0.0), np.zeros(len(T))
+            # to the power p, for the coarse posterior holds the same share to the power 1 - p
+            return np.where(depth > 0, np.log(MISSED_CONTACT_SHARE), 0.0), np.zeros(len(T))
         missed = np.clip(np.maximum(-depth, depth - sensor.max_penetration), 0, _FARTHEST)
         log_likelihood = np.full(len(T), query.log_likelihood_of_nothing)
         touches = np.isfinite(likely)

@@ -125,7 +125,7 @@ def _next_step(change: Array, most: float) -> float:
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if leaves_enough(middle) else (low, middle)
-    return max(low, 1e-4)
+    return min(max(low, 1e-4), most)
 
 
 def _moved(

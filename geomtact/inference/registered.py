@@ -101,13 +101,16 @@ class AboutModes:
     def _distance(self) -> PoseDistance:
         return PoseDistance(self.target.index.mesh)
 
-    def draw(self, n: int, rng: np.random.Generator) -> Array:
-        """Poses (n, 4, 4) without errors."""
-        of, out = rng.integers(len(self.hearts), size=n), np.empty((n, 4, 4))
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.bool_]]:
+        """Poses (n, 4, 4) without errors, and which of them count (n,): only the image of a placement that is nearest to the pose
+        that it is drawn about, by turns of less than pi."""
+        of, out, counts = rng.integers(len(self.hearts), size=n), np.empty((n, 4, 4)), np.ones(n, bool)
         for mode, (heart, basis, student) in enumerate(zip(self.hearts, self.bases, self.students, strict=True)):
             some = np.flatnonzero(of == mode)
-            out[some] = heart @ exp(student.draw(len(some), rng) @ basis)
-        return out
+            xi = student.draw(len(some), rng) @ basis
+            out[some] = heart @ exp(xi)
+            counts[some] = self._distance.is_nearest(heart, out[some]) & (np.linalg.norm(xi[:, :3], axis=1) < np.pi)
+        return out, counts
 
     def log_density(self, particles: Particles) -> Array:
         """Log density (n,) at ``particles`` (n,), relative to the uniform."""
@@ -127,7 +130,8 @@ def bridged(about: AboutModes, power: float, runs: int, n: int, rng: np.random.G
     were drawn touch all sensors."""
     target = about.target
     m = _DRAWS * n * runs
-    poses, membrane = located(target.index, about.draw(m, rng))
+    drawn, counts = about.draw(m, rng)
+    poses, membrane = located(target.index, drawn)
     errors = rng.random((m, target.carried, ERRORS))
     particles = target.admitted(target.evaluated(poses, membrane, errors=errors))
 
@@ -139,7 +143,7 @@ def bridged(about: AboutModes, power: float, runs: int, n: int, rng: np.random.G
 
     best = particles.by_sensor.max(0)
     population = Population(target, rng, particles, np.zeros(runs), best, contacts=m * target.sensors)
-    log_weight = np.where(particles.missed, -np.inf, change(particles))
+    log_weight = np.where(particles.missed | ~counts, -np.inf, change(particles))
     each = log_weight.reshape(runs, -1)
     if not np.isfinite(each).any(1).all():
         return None

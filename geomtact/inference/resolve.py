@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geomtact.contact_space.cell_transfer import ExtrinsicsStd
-from geomtact.contact_space.index import Index
-from geomtact.inference.distribution import cell_densities
 from geomtact.inference.effort import Effort
 from geomtact.inference.particles import OtherSensor
 from geomtact.inference.pose_prior import prior_at_poses
@@ -40,15 +38,15 @@ def resolve_touch(
     It is as it was without contact. ``prior`` and ``log_prior`` are as of ``single_touch.touch_posterior``,
     ``alone`` is the posterior of the same image without them, where that is known.
     """
-    if log_prior is None or not _can_resolve([posterior], effort):
-        return _resolved(posterior, [posterior], None, None, None, effort)
-    assert posterior.observation is not None
+    if log_prior is None:
+        return resolve_touches(posterior, [posterior], None, None, effort)
+    log_coarse = None
     if alone is not None:
-        coarse = _mass_of_places(alone.index, cell_densities(alone))
-    else:
+        log_coarse = _log_mass(alone)
+    elif posterior.observation is not None and posterior.contact:
         # cells that the prior rules out have no mass in the posterior
-        coarse = np.exp(scorer.log_mass(posterior.index, posterior.observation.contact.soft_mask)).sum(0)
-    return _resolved(posterior, [posterior], coarse, prior, log_prior, effort)
+        log_coarse = scorer.log_mass(posterior.index, posterior.observation.contact.soft_mask)
+    return resolve_touches(posterior, [posterior], prior, log_prior, effort, log_coarse=log_coarse)
 
 
 def resolve_touches(
@@ -59,41 +57,27 @@ def resolve_touches(
     effort: Effort,
     extrinsics_std: ExtrinsicsStd | None = None,
     search: Search | None = None,
+    log_coarse: LogMass = None,
 ) -> Posterior:
     """The ``posterior`` of several sensors, resolved within the cells of the first with contact.
 
-    ``touches``, ``prior`` and ``log_prior`` are as of ``fusion.fused_posterior``.
+    ``touches``, ``prior`` and ``log_prior`` are as of ``fusion.fused_posterior``. ``log_coarse`` (P, n) is the log mass of the
+    cells without the prior, by default that of ``posterior``, divided by the prior.
     """
-    return _resolved(posterior, touches, None, prior, log_prior, effort, extrinsics_std, search)
-
-
-def _can_resolve(touches: Sequence[Posterior], effort: Effort) -> bool:
-    return bool(effort.contacts) and any(touch.contact and touch.observation for touch in touches)
-
-
-def _resolved(
-    posterior: Posterior,
-    touches: Sequence[Posterior],
-    coarse: Array | None,
-    prior: Any,
-    log_prior: LogMass,
-    effort: Effort,
-    extrinsics_std: ExtrinsicsStd | None = None,
-    search: Search | None = None,
-) -> Posterior:
-    """``coarse`` (n,) is the mass of the places without the prior, by default that of ``posterior``, divided by the prior."""
-    if not _can_resolve(touches, effort):
+    if not effort.contacts or not any(touch.contact and touch.observation for touch in touches):
         return posterior
     index, at_poses = posterior.index, None
     with timed(posterior.timing_ms, "explore"):
         if log_prior is not None:
             in_cells = np.where(index.log_weight > -np.inf, log_prior - np.maximum(index.log_weight, -1e3), -np.inf)
             at_poses = prior_at_poses(index, in_cells, prior, posterior.T_frame_sensor)
-        if coarse is None:
-            density = cell_densities(posterior)
-            if at_poses is not None:
-                density = np.where(in_cells > -np.inf, density * np.exp(-np.maximum(in_cells, -1e3)), 0)
-            coarse = _mass_of_places(index, density)
+        if log_coarse is None:
+            log_coarse = _log_mass(posterior)
+            if at_poses is not None:  # in logarithms: a narrow prior has densities that no number holds
+                possible = np.isfinite(in_cells)
+                log_coarse = np.where(possible, log_coarse - np.where(possible, in_cells, 0), -np.inf)
+            log_coarse = log_coarse - log_coarse.max()
+        coarse = np.exp(log_coarse).reshape(index.weight.shape).sum(0, dtype=float)
         first = next(touch for touch in touches if touch.contact)
         others = [
             OtherSensor(
@@ -126,9 +110,11 @@ def _resolved(
     )
 
 
-def _mass_of_places(index: Index, density: NDArray[np.floating]) -> Array:
-    """Mass (n,) of the places of ``index``, of a density (N,) in its cells."""
-    return np.asarray((density.reshape(index.weight.shape) * index.weight).sum(0, dtype=float))
+def _log_mass(posterior: Posterior) -> Array:
+    """Log mass (N,) of every cell of its index."""
+    out = np.full(len(posterior.index), -np.inf)
+    out[posterior.cells] = posterior.cell_log_prob
+    return out
 
 
 def _query(touch: Posterior) -> ContactQuery:

@@ -36,9 +36,8 @@ _UNIFORM = 0.2  # share of the uniform distribution in the coarse posterior, by 
 # All other constants choose where poses are drawn: they change how precise the evidence is, not what is estimated.
 _CUTS = 3  # contacts that are cut for a draw, at most
 _DRAWS = 4  # draws for each pose that is kept
-# Of several sensors: poses that are kept, by power, over those with one: hardly any touch all sensors at first. The largest power
-# is left out.
-_OF_SEVERAL = (16, 8, 6, 4)
+# Of several sensors: poses that are kept, by power, over those with one: hardly any touch all sensors at first.
+_OF_SEVERAL = (16, 8, 6, 4, 3)
 _REGISTERED = 2 / 3  # of the draws of several sensors
 _OF_SEVERAL_COST = 12  # contacts that this takes, over those with one sensor
 _MEASURED = 2000  # draws by which the measure of what touches is known, where a prior is no one of the cells
@@ -107,7 +106,7 @@ def explore(
     numbers = [max(contacts // usual, 20)] * len(POWERS)
     if others:
         numbers = [max(int(contacts / usual * more / _OF_SEVERAL_COST), 20) for more in _OF_SEVERAL]
-    number = dict(zip(POWERS, numbers, strict=False))
+    number = dict(zip(POWERS, numbers, strict=True))
     largest = max(number)
     drawn, log_weight, cut = _draw(target, share, runs, _DRAWS * numbers[0], rng)
     if isinstance(prior, NormalPrior):
