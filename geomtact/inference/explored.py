@@ -1,7 +1,11 @@
 """The distribution of a pose within the cells of an index: what the sampler leaves of it, and the density at any pose.
 
-The posterior is a mixture of posteriors by powers of the likelihood, whose evidences are known. So its density is known wherever
-the likelihood is made: at a pose, and at those that errors of the object's scale and of the contact's place make of it.
+Relative to the uniform distribution, its density at a pose T is a mixture over powers p of the likelihood L,
+
+    sum over p of  w(p) prior(T) coarse(T)^(1 - p) L(T)^p / Z(p),
+
+averaged over errors of the object's scale and of the contact's place. The weights w are fitted (``scoring.contact_likelihood``),
+the coarse density is that of the cells, and the evidences Z come from the sampler. So the density is known wherever L is made.
 """
 
 from __future__ import annotations
@@ -63,8 +67,8 @@ class Density:
         return weights
 
     def by_power(self, log_likelihood: Array, log_coarse: Array) -> Array:
-        """Log density (..., K) of each posterior over the prior, without errors, from the log likelihood and the log density of
-        the coarse posterior (...)."""
+        """Log (..., K) of coarse^(1 - p) L^p / Z(p) by each power p, from the log likelihood and the log density of the coarse
+        posterior (...)."""
         each = [
             tempered(log_likelihood, log_coarse, power) - log_evidence
             for power, log_evidence in zip(self.powers, self.log_evidence, strict=True)

@@ -88,7 +88,7 @@ class Population:
 
 
 def effective(log_weight: Array) -> Array:
-    """How many draws of equal weight would do as well (...), of those of ``log_weight`` (..., m)."""
+    """Effective sample size (...) of draws of ``log_weight`` (..., m)."""
     most = log_weight.max(-1, keepdims=True)
     weight = np.exp(log_weight - np.where(np.isfinite(most), most, 0.0))
     return np.asarray(weight.sum(-1) ** 2 / np.maximum(np.square(weight).sum(-1), 1e-300))

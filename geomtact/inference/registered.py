@@ -158,7 +158,8 @@ def bridged(about: AboutModes, power: float, runs: int, n: int, rng: np.random.G
 
 
 def united(one: Population | None, other: Population | None) -> Population | None:
-    """Two populations of one distribution, each of which may have missed what the other found: by how much of it they found."""
+    """Two populations of one distribution, each of which may have missed what the other found: poses of each by its evidence. The
+    larger evidence is kept, which at worst makes the density too small."""
     if one is None or other is None:
         return one or other
     share = expit(other.log_evidence - one.log_evidence)

@@ -43,8 +43,7 @@ def random_errors(n: int, rng: np.random.Generator) -> Array:
 
 
 def errors_of(shares: Array) -> Array:
-    """Errors (..., 4) as of :func:`random_errors`, below which the first four of ``shares`` (..., ERRORS) lie along each axis;
-    none at 0.5."""
+    """Errors (..., 4) as of :func:`random_errors`: the quantiles at the first four of ``shares`` (..., ERRORS); 0.5 is none."""
     return _quantiles(shares[..., :4], _WIDTHS)
 
 
@@ -89,7 +88,7 @@ def undisplaced(centre: Array, errors: Array, about: Array) -> Array:
 
 
 def _quantiles(share: Array, width: Array) -> Array:
-    """Errors (..., 4) below which ``share`` (..., 4) of the distributions of ``width`` (4,) lie."""
+    """Quantiles (..., 4) at ``share`` (..., 4) of the distributions of ``width`` (4,)."""
     return np.asarray(width * np.tan((2 * share - 1) * np.arctan(_LIMIT / width)))
 
 

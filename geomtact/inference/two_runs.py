@@ -4,6 +4,9 @@ One run does not show what it has missed. So two are compared: where they disagr
 found; where the masses of the modes add up to much more than 1, both have. Then more contacts are cut, or the sharpest powers are
 left out. Where that does not help, the coarse posterior has half of the probability.
 
+Of several sensors one registration leads both runs to modes, so that both miss what it misses. Then their agreement proves less,
+and masses of modes leave room for it (``mode_mass.counted``).
+
 How likely the contacts are at all is known even where the runs do not agree, only less exactly.
 """
 
@@ -38,8 +41,8 @@ _POSES, _FOR_EACH = (200, 600), 20
 # believed, while more contacts may be cut and in the last attempt: to leave a contact to the cells costs more; hand-set
 _AGREE, _AGREE_AT_LAST = 1.0, 2.0
 # Of two runs that do not agree, one at least has missed something; where no pose explains all contacts, both may have. So what
-# they found rests on one run, which nothing confirms: by the rule of succession another one would find the same with this
-# probability.
+# they found rests on one run, which was never tried against another: by the rule of succession one more run would find the same
+# with the probability (0 + 1) / (0 + 2).
 _TRUST = 0.5
 _DISAGREE, _UNEXPLAINED = "two runs of the sampler do not agree", "no pose that was found explains all contacts"
 _SHARE = 20  # the first attempt cuts one of so many of all contacts
@@ -61,8 +64,8 @@ class Finding:
     Attributes
     ----------
     explored : the distribution of the pose; None where they found no pose that touches all sensors which show contact
-    log_evidence : log of the mean under the prior of the likelihood of all contacts, to the power ``EVIDENCE_POWER``; -inf where
-        no pose was found that touches all sensors which show contact
+    log_evidence : log of the prior mean of the likelihood of all contacts to the power ``EVIDENCE_POWER``; -inf where no pose was
+        found that touches all sensors which show contact
     misfit_nats, unexplained_nats : as of ``facts.Diagnostics``
     why_not : why there is no distribution, or half of the probability is left to the cells
     """
@@ -102,7 +105,8 @@ def explore_twice(
         try:
             one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, search)
             cut += one.contacts + other.contacts
-            unexplained = _unexplained(one, other) if others else None
+            found_last = one.particles[-1].joined(other.particles[-1])
+            unexplained = _unexplained(one, other, found_last) if others else None
             explains = unexplained is None or unexplained <= UNEXPLAINED_NATS
             why_not = _DISAGREE if explains else _UNEXPLAINED
             found = Finding(None, _log_evidence(one, other), _misfit(one, other), unexplained, why_not)
@@ -115,8 +119,9 @@ def explore_twice(
             found = replace(found, why_not=str(error))
             continue
         if explored is not None:
-            if others:
-                unexplained = _unexplained_in_place(one, other, explored)
+            if others:  # if all sensors were where they are said to be
+                T = explored.hearts if one.about is None else np.concatenate([explored.hearts, one.about.led_to])
+                unexplained = _unexplained(one, other, one.density.target.particles_at(T))
             return replace(found, explored=explored, unexplained_nats=unexplained)
     return found
 
@@ -271,26 +276,14 @@ def _sharpest(one: Run, other: Run) -> Array:
 
 
 def _draws_left(run: Run, last: int) -> float:
-    """From how many draws, if all had as many, the particles at the ``last`` stop come."""
+    """Effective number of draws from which the particles at the ``last`` stop come."""
     count = np.unique(run.particles[last].draw, return_counts=True)[1]
     return float(count.sum() ** 2 / np.square(count).sum())
 
 
-def _unexplained_in_place(one: Run, other: Run, found: Explored) -> float:
-    """As :func:`_unexplained`, of the likeliest pose if all sensors were where they are said to be."""
-    T = found.hearts if one.about is None else np.concatenate([found.hearts, one.about.led_to])
-    at = one.density.target.particles_at(T)
-    return _short_of_best(one, other, at)
-
-
-def _unexplained(one: Run, other: Run) -> float:
-    """Nats by which the likeliest pose that two runs found explains each of several contacts less than the best pose of each
-    sensor alone does, in the mean and by the largest power."""
-    return _short_of_best(one, other, one.particles[-1].joined(other.particles[-1]))
-
-
-def _short_of_best(one: Run, other: Run, found: Particles) -> float:
-    """Nats by which the likeliest of the ``found`` poses explains each contact less, as of :func:`_unexplained`."""
+def _unexplained(one: Run, other: Run, found: Particles) -> float:
+    """Nats by which the likeliest of the ``found`` poses explains each of several contacts less than the best pose of each sensor
+    alone does, in the mean and by the largest power."""
     best = np.maximum(one.best, other.best)
     return float(POWERS[-1] * (best.sum() - _likeliest(found)) / len(best))
 

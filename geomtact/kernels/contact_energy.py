@@ -216,11 +216,11 @@ def _contact_energy(  # type: ignore[no-untyped-def]
             if deepest_in[k] <= 0:
                 continue
             about[:] = 0
-            for n in range(9):
-                y = min(max(k // columns + n // 3 - 1, 0), rows - 1)
-                x = min(max(k % columns + n % 3 - 1, 0), columns - 1)
+            for beside_k in range(9):
+                y = min(max(k // columns + beside_k // 3 - 1, 0), rows - 1)
+                x = min(max(k % columns + beside_k % 3 - 1, 0), columns - 1)
                 for j in range(samples):
-                    about[j] += between[n, j] * wide_deep[y, x]
+                    about[j] += between[beside_k, j] * wide_deep[y, x]
             for j in range(samples):
                 pressed = surface[k, j] - lowest
                 e = np.sqrt(max(one - pressed / about[j], np.float32(0))) * SHARES
