@@ -16,6 +16,7 @@ from geomtact.contact_space.contact_maps import ContactMaps, located
 from geomtact.contact_space.touch import simulate_depth_map, simulate_mask
 from geomtact.contact_space.touches import random_touches
 from geomtact.inference.effort import GRID_ALONE
+from geomtact.scoring import contact_likelihood
 from geomtact.scoring.contact_likelihood import ContactQuery, indentation_of
 from geomtact.se3 import transform
 from geomtact.sensing.contact import Contact
@@ -203,6 +204,7 @@ def test_a_calibrated_sensor_identifies_the_real_ball_by_its_heights(data_folder
     found = calibrations(data_folder, cameras()["parallel rays"])
     sensors = {ball: each.sensor for ball, each in found.items()}
     assert all(0.01 * MM < sensor.height_noise < 0.05 * MM for sensor in sensors.values())
+    assert all(0.5 * MM < sensor.height_correlation < 2 * MM for sensor in sensors.values())
     observation = read_observation(
         folder / "9.500mm" / "10.png", sensors[BALLS[0]], background=folder / "background.png"
     )
@@ -218,10 +220,17 @@ def test_a_calibrated_sensor_identifies_the_real_ball_by_its_heights(data_folder
 
 
 def test_the_height_noise_of_a_sensor_is_kept(tmp_path):
-    mine = replace(SENSOR, height_noise=0.02 * MM)
-    assert Sensor.from_toml(mine.to_toml()).height_noise == pytest.approx(0.02 * MM)
+    mine = replace(SENSOR, height_noise=0.02 * MM, height_correlation=0.5 * MM)
+    again = Sensor.from_toml(mine.to_toml())
+    assert (again.height_noise, again.height_correlation) == pytest.approx((0.02 * MM, 0.5 * MM))
     usual = replace(SENSOR, height_noise=HEIGHT_NOISE)
-    assert "height_noise" not in usual.to_toml() and mine.sha256 == usual.sha256
+    assert "height_" not in usual.to_toml() and mine.sha256 == usual.sha256
+
+
+def test_the_farther_depths_correlate_the_less_they_say():
+    """As many observations as areas of the correlation fit in, and at most one for each depth."""
+    shares = [contact_likelihood._observations(replace(SENSOR, height_correlation=c * MM)) for c in (0.01, 1.0, 2.0)]
+    assert shares[0] == 1 and shares[1] / shares[2] == pytest.approx(4)
 
 
 def test_a_scan_is_read_with_its_pitch(data_folder):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geomtact.sensing.noise import CLEAN, HEAVY, MODERATE, Noise, perturb, smooth_field
+from geomtact.sensing.noise import CLEAN, HEAVY, MODERATE, Noise, correlation_length, perturb, smooth_field
 
 PITCH = (0.0634e-3, 0.0634e-3)
 SHAPE = (240, 320)
@@ -92,3 +92,17 @@ def test_full_contact_stays_full_but_for_the_patch(rng):
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1)])
 def test_tiny_grids(shape, rng):
     assert perturb(np.ones(shape, bool), PITCH, HEAVY, rng).shape == shape
+
+
+@pytest.mark.parametrize("length", [0.3e-3, 1e-3])
+def test_the_correlation_length_of_a_field_is_found(length, rng):
+    """In images of any shape and size; some with holes."""
+    x, y = np.arange(120) * 0.05e-3, np.arange(90) * 0.06e-3
+    fields = [smooth_field(x, y[: 90 - k], length, rng) for k in range(12)]
+    for field in fields[::3]:
+        field[20:50, 30:50] = np.nan
+    assert correlation_length(fields, (0.05e-3, 0.06e-3)) == pytest.approx(length, rel=0.15)
+
+
+def test_what_correlates_everywhere_does_as_far_as_it_reaches():
+    assert correlation_length([np.ones((20, 30))], (1e-4, 1e-4)) == pytest.approx(np.hypot(19, 29) * 1e-4, rel=0.02)

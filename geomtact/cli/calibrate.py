@@ -217,5 +217,7 @@ def _print(found: SensorCalibration, ball_mm: float) -> None:
         "                        this checks that the presses agree, not that --ball-mm is right\n"
         f"  slope error           {colour.slope_rms:.3f} rms (a slope of 1 is 45 degrees)\n"
         f"  depth error           {1e3 * colour.height_rms:.3f} mm rms where nothing touches\n"
+        f"  depth noise           {1e3 * found.sensor.height_noise:.3f} mm rms under the ball, correlated over "
+        f"{1e3 * found.sensor.height_correlation:.2f} mm\n"
         f"  contact threshold     {1e3 * colour.contact_depth:.2f} mm indentation depth"
     )

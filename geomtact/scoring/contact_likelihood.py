@@ -57,9 +57,6 @@ OUTLINE = 15e-3  # m, the length of a usual outline
 RIGID = 0.5  # share of touches on a rigid gel
 _LIMIT = 2e-3  # m: distance from the observed outline beyond which nothing more is added
 _SCALE = 0.05  # standard deviation of a depth, as a share of it, beside the sensor's noise; hand-set
-# m^2 of a depth map that count as one observation: of 1, 3 and 10 mm^2 what leaves the largest gain on 60 touches of the pin, the
-# head and the connector plug, seed 91
-_INDEPENDENT = 3e-6
 _ALL = 0.99  # of a sample lies on the object, where the gel counts as lying on it
 _PART = 2048  # energies that a thread takes at a time
 _EVERY = 2  # samples of the window along each axis, of whose depths one is compared
@@ -178,8 +175,9 @@ def from_outline(mask: NDArray[np.bool_], pitch: float) -> NDArray[np.float32]:
 
 
 def _observations(sensor: Sensor) -> float:
-    """How many independent depths one that is compared stands for."""
-    return min(1.0, _EVERY**2 * sensor.pixel_area(sensor.along(SHAPE)) / _INDEPENDENT)
+    """How many independent depths one that is compared stands for: over the area of the correlation exp(-(r / length)^2) there is
+    one."""
+    return min(1.0, _EVERY**2 * sensor.pixel_area(sensor.along(SHAPE)) / (np.pi * sensor.height_correlation**2))
 
 
 def indentation_of(contact: Contact, sensor: Sensor) -> Indentation | None:

@@ -22,6 +22,7 @@ from geomtact.sensing.ball import OnBall, from_middle
 from geomtact.sensing.change import check_size
 from geomtact.sensing.colour import ColourTable, fit_weights, kept, terms
 from geomtact.sensing.height import relief
+from geomtact.sensing.noise import correlation_length
 from geomtact.sensing.press import SAME, Press, find_presses, named_image
 from geomtact.sensing.sensor import Sensor
 
@@ -165,12 +166,12 @@ def _check_rest(presses: Sequence[Press]) -> None:
 def _fitted(presses: list[Press], sensor: Sensor, radius: float) -> tuple[Sensor, Array]:
     """``sensor`` with the colours of a ball of ``radius`` [m], and its diameter (n,) [m] on each press by the others."""
     samples = [samples_on(press, sensor, radius) for press in presses]
-    diameters, slope_rms, height_noise = _left_one_out(presses, samples, sensor, radius)
+    diameters, slope_rms, height_noise, correlation = _left_one_out(presses, samples, sensor, radius)
     x, y = (tuple(map(float, row)) for row in weights_of(samples))
     colour = ColourTable((x, y), slope_rms, 0.0, 0.0)
     noise, depth = _at_rest(presses, colour, sensor.pixel_pitch)
     colour = replace(colour, height_rms=noise, contact_depth=depth)
-    return replace(sensor, colour=colour, height_noise=height_noise), diameters
+    return replace(sensor, colour=colour, height_noise=height_noise, height_correlation=correlation), diameters
 
 
 def _warnings(presses: Sequence[Press], without_ball: int, diameters: Array, off: float) -> list[str]:
@@ -235,21 +236,29 @@ def weights_of(samples: Sequence[tuple[Array, Array]]) -> Array:
 
 def _left_one_out(
     presses: Sequence[Press], samples: Sequence[tuple[Array, Array]], sensor: Sensor, radius: float
-) -> tuple[Array, float, float]:
+) -> tuple[Array, float, float, float]:
     """By the others' colours: the ball's diameter (n,) [m] on each press, and how far off slopes (rms) and depths [m] (median
-    of the presses' rms, their offset aside) are on a ball of ``radius`` [m]."""
+    of the presses' rms, their offset aside) are on a ball of ``radius`` [m], and over what length [m] depths are."""
     diameters, squares, beside = np.zeros(len(presses)), [], []
     for i, press in enumerate(presses):
         weights = weights_of([s for k, s in enumerate(samples) if k != i])
         x, y = (tuple(map(float, row)) for row in weights)
         on = OnBall.within(press, sensor, INNER)
         depths = relief(press.change, press.changed, ColourTable((x, y), 0, 0, 0), sensor.pixel_pitch)
-        beside.append(float((depths[on.at] - on.height(radius)).std()))
+        off = depths[on.at] - on.height(radius)
+        image = np.full(np.ptp(on.at, axis=1) + 1, np.nan)
+        image[tuple(np.array(on.at) - np.min(on.at, axis=1, keepdims=True))] = off - off.mean()
+        beside.append(image)
         features, true = samples[i]
         sloping = true.any(1)
         squares.append(((features[sloping] @ weights.T - true[sloping]) ** 2).mean())
         diameters[i] = diameter_from_colours(press, sensor, weights)
-    return diameters, float(np.sqrt(np.mean(squares))), float(np.median(beside))
+    return (
+        diameters,
+        float(np.sqrt(np.mean(squares))),
+        float(np.median([np.nanstd(image) for image in beside])),
+        correlation_length(beside, sensor.pixel_pitch),
+    )
 
 
 def ball_slopes(press: Press, sensor: Sensor, ball_diameter: float) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +76,28 @@ def smooth_field(x: Array, y: Array, correlation: float, rng: np.random.Generato
         weight = np.exp(-0.5 * ((at[:, None] - nodes) / sigma) ** 2)
         weights.append(weight / np.linalg.norm(weight, axis=1, keepdims=True))
     return weights[0] @ rng.normal(size=(weights[0].shape[1], weights[1].shape[1])) @ weights[1].T
+
+
+def correlation_length(errors: Sequence[Array], pitch: tuple[float, float]) -> float:
+    """Over what length [m] ``errors``, images (h, w) of the mean 0 with NaN where there is none, correlate: to 1/e, as of
+    :func:`smooth_field`. Where they do farther than they reach, it is how far they reach."""
+    shape = tuple(2 * max(each.shape[axis] for each in errors) for axis in (0, 1))
+    product, count = np.zeros(shape), np.zeros(shape)
+    for each in errors:
+        known = np.isfinite(each)
+        product += np.fft.ifft2(np.abs(np.fft.fft2(np.where(known, each, 0.0), shape)) ** 2).real
+        count += np.fft.ifft2(np.abs(np.fft.fft2(known.astype(float), shape)) ** 2).real
+    lags = [n * np.fft.fftfreq(n) * step for n, step in zip(shape, pitch[::-1], strict=True)]
+    lag = np.hypot(lags[0][:, None], lags[1])
+    ring = (lag / max(pitch)).astype(np.int64).ravel()
+    pairs = np.bincount(ring, np.rint(count).ravel())
+    some = pairs > 0
+    share = np.bincount(ring, product.ravel())[some] / pairs[some]
+    length = np.bincount(ring, (lag * np.rint(count)).ravel())[some] / pairs[some]
+    below = int(np.argmax(share < share[0] / np.e))
+    if not below:
+        return float(length.max())
+    return float(np.interp(-share[0] / np.e, -share[below - 1 : below + 1], length[below - 1 : below + 1]))
 
 
 def _displaced(

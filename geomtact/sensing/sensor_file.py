@@ -19,6 +19,7 @@ _LENGTHS = (
     "membrane_radius",
     "housing_depth",
     "height_noise",
+    "height_correlation",
 )
 _PAIRS, _TEXTS = ("image_size_px", "pixel_pitch"), ("name", "contact_method", "note")
 _ALWAYS = "membrane_radius"  # is written even where it is the default
