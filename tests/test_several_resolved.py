@@ -13,6 +13,7 @@ from geomtact.evaluation import simultaneous_touches
 from geomtact.inference import two_runs
 from geomtact.inference.effort import Effort
 from geomtact.inference.gaussian_prior import GaussianPrior
+from geomtact.inference.mode_mass import counted
 from geomtact.inference.particles import SURE
 from geomtact.inference.posterior import Posterior
 from geomtact.inference.systematic_errors import ERRORS, stand_of
@@ -66,6 +67,19 @@ def test_its_modes_leave_room_for_what_was_missed(posterior):
     masses = np.array([mode.probability for mode in posterior.modes(20)])
     assert (np.diff(masses) <= 0).all() and masses.sum() < 1
     assert np.isfinite(posterior.log_density(np.stack([mode.T for mode in posterior.modes(3)]))).all()
+
+
+def test_a_mode_holds_the_more_the_more_often_it_is_found(posterior):
+    """Modes that are found once stand for as many that are missed; those that are found always hold what poses say."""
+    explored = posterior.explored
+    none, first = np.zeros((0, 4, 4)), np.repeat(explored.hearts[:1], 9, 0)
+    once, nine, always = (
+        counted(explored, none, draws, led_to).masses
+        for draws, led_to in ((0.0, None), (0.0, (first, np.arange(9))), (1e12, None))
+    )
+    beside = 1 - 2 * once.sum()
+    assert always == pytest.approx(2 * once / (1 + beside), rel=1e-6)
+    assert once.max() < nine.max() < always.max()
 
 
 def test_a_saved_one_is_the_same(posterior, tmp_path, localizer):

@@ -40,7 +40,7 @@ class PoseDistance:
         """Largest point distance (m,) [m] from the pose ``T`` (4, 4) to ``others`` (m, 4, 4)."""
         return self._distances(T, others, "max")
 
-    def within(self, T: ArrayLike, others: ArrayLike, radius: float) -> Array:
+    def within(self, T: ArrayLike, others: ArrayLike, radius: float) -> NDArray[np.bool_]:
         """Whether each of ``others`` (m, 4, 4) lies within ``radius`` [m] of ``T`` in mean point distance."""
         T, others = np.asarray(T, float), np.asarray(others, float)
         # the mean of the points moves no further than the points do in the mean

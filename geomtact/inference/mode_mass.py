@@ -81,23 +81,24 @@ def counted(
     """``explored``, of several sensors, with its leading modes; ``further`` is as of :func:`weighed`.
 
     The mass of a mode is the share of the poses near it: of several contacts there are few modes, and an integral about one would
-    be over the errors of all contacts too. All poses come from so many independent ``draws``, or registration was ``led_to``
-    their modes, poses (r, 4, 4), from more places (r,), where these are not -1: one more would have found a mode that was missed
-    with a probability of 1 / (draws + 1) (the rule of succession), which is left out.
+    be over the errors of all contacts too. How often a mode was found says how many like it were missed: by the rule of
+    succession modes that are found k times are found with the probability k / (k + 1). So one stands for (k + 1) / k of its mass
+    (Horvitz and Thompson 1952), and a pose beside all modes for twice its mass. A mode is found by its share of the independent
+    ``draws`` that all poses come from, or by registration from so many places (r,) that were ``led_to`` poses (r, 4, 4) near it,
+    -1 being none; whichever is more.
     """
     mesh = explored.index.mesh
     distance, radius = PoseDistance(mesh, _POINTS), mode_radius(mesh)
     hearts, members = _grown(explored, further, distance, radius, _MODES[1])
+    mass = _shared_out(explored, members, np.array([explored.weight[rows].sum() for rows in members]))
+    found = np.maximum(mass * draws, 1)
     if led_to is not None:
         T, origin = led_to
-        near = np.zeros(len(T), bool)
-        for heart, rows in zip(hearts, members, strict=True):
-            if len(rows):
-                near |= np.asarray(distance.within(heart, T, radius), bool)
-        draws = max(draws, len(np.unique(origin[near & (origin >= 0)])))
-    mass = _shared_out(explored, members, np.array([explored.weight[rows].sum() for rows in members]))
+        near = np.stack([distance.within(heart, T, radius) for heart in hearts]) & (origin >= 0)
+        found = np.maximum(found, np.array([len(np.unique(origin[each])) for each in near], float))
+    whole = mass @ (1 + 1 / found) + 2 * max(1 - mass.sum(), 0)
     order = np.argsort(-mass, kind="stable")
-    return replace(explored, hearts=hearts[order], masses=mass[order] * draws / (draws + 1))
+    return replace(explored, hearts=hearts[order], masses=mass[order] / whole)
 
 
 def shares_near(mesh: Mesh, hearts: Array, T: Array) -> Array:

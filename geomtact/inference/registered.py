@@ -79,7 +79,7 @@ class AboutModes:
         free = touching.copy()
         while free.any() and len(rows) < _MODES:
             rows.append(int(np.where(free, likely, -np.inf).argmax()))
-            free &= ~np.array(distance.within(refinement.T[rows[-1]], refinement.T, _APART), bool)
+            free &= ~distance.within(refinement.T[rows[-1]], refinement.T, _APART)
             free[rows[-1]] = False
         if not rows:
             return None
