@@ -121,7 +121,7 @@ def test_unlike_all_are_outliers_or_unexplained_touches_of_each_object(drawer, s
 def test_contacts_tell_objects_apart_that_moments_do_not(drawer):
     """By contacts the right one of three objects is the most probable in more of the same touches, and given more: the log of its
     probability is larger in the mean. None that explains them is ruled out."""
-    efforts = {"moments": GRID_ALONE, "contacts": "balanced"}
+    efforts = {"moments": GRID_ALONE, "contacts": "fast"}
     right, logs = dict.fromkeys(efforts, 0), {name: [] for name in efforts}
     for own in drawer:
         for mask in touches(own, 6, seed=3):

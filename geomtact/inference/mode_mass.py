@@ -58,7 +58,8 @@ def weighed(
         found = np.full(near.shape, -np.inf)
         carried = shares[near][:, None] if density.target.carried else None
         particles = density.target.particles_at(T[near], carried)
-        log_density = density.of_exact(particles) + np.log(explored.index.uniform_density(T[near]))
+        with np.errstate(divide="ignore"):  # where the approach allows no image
+            log_density = density.of_exact(particles) + np.log(explored.index.uniform_density(T[near]))
         log_density += log_volume(turn[near], len(modes[0].basis) - 3)  # 0 or 1 turns, on a known face, give the same
         found[near] = np.where(np.isfinite(particles.log_likelihood), log_density, -np.inf)
         for mode, each, log_densities in zip(modes, draws, found, strict=True):
