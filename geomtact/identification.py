@@ -135,9 +135,16 @@ def identify(
 
 
 def _efforts(effort: str | Effort) -> list[Effort]:
-    """The efforts by which an object is looked at, the last one only where the object may be the right one."""
+    """The efforts by which an object is looked at, the last one only where the object may be the right one.
+
+    All begin with as many contacts on each of several sensors as on one. With a quarter of them the right pose was missed in 5 of
+    60 scenes of three touches (``python -m tools.studies identify``, seed 42), and with it 20 to 45 nats of evidence.
+    """
     asked = effort_of(effort)
-    roughly = replace(asked, modes=0, contacts=min(asked.contacts, LEAST_CONTACTS))
+    if not asked.contacts:
+        return [asked]
+    asked = replace(asked, first=asked.first or asked.attempts(1)[0])
+    roughly = replace(asked, modes=0, contacts=min(asked.contacts, LEAST_CONTACTS), first=LEAST_CONTACTS)
     return [asked] if roughly.contacts == asked.contacts else [roughly, asked]
 
 

@@ -87,7 +87,9 @@ def resolve_touches(
             if touch is not first
         ]
         rng = np.random.default_rng(posterior.seed)
-        found = explore_twice(index, _query(first), coarse, effort.contacts, rng, at_poses, others, search)
+        found = explore_twice(
+            index, _query(first), coarse, effort.attempts(len(touches)), rng, at_poses, others, search
+        )
     diagnostics = replace(
         posterior.diagnostics,
         evidence_of="contacts",

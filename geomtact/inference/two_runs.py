@@ -20,7 +20,6 @@ import numpy as np
 
 from geomtact.contact_space.index import Index
 from geomtact.errors import InputError
-from geomtact.inference.effort import LEAST_CONTACTS
 from geomtact.inference.explored import Explored
 from geomtact.inference.facts import UNEXPLAINED_NATS
 from geomtact.inference.mode_mass import counted, shares_near, weighed
@@ -45,11 +44,6 @@ _AGREE, _AGREE_AT_LAST = 1.0, 2.0
 # with the probability (0 + 1) / (0 + 2).
 _TRUST = 0.5
 _DISAGREE, _UNEXPLAINED = "two runs of the sampler do not agree", "no pose that was found explains all contacts"
-_SHARE = 20  # the first attempt cuts one of so many of all contacts
-# times as few on each of several sensors, where registration finds the modes: mean gains of 14 to 20 scenes of four objects
-# differ by -1.1 to 1.7 nats from those with as many (seeds 4711 and 5151)
-_FEWER_OF_SEVERAL = 4
-_MORE = 4  # times as many contacts are cut in each attempt after the first
 # powers that an attempt may leave out, before the last: of several sensors, of a mask, and of depths, whose likelihood is
 # sharper; where the gain of 20 touches each of pin and head levels off (seed 91), and of 10 scenes of four objects (seed 810)
 _LEFT_OUT_OF_SEVERAL, _LEFT_OUT, _LEFT_OUT_OF_DEPTHS = 3, 2, 1
@@ -81,24 +75,21 @@ def explore_twice(
     index: Index,
     query: ContactQuery,
     coarse: Array,
-    contacts: int,
+    attempts: Sequence[int],
     rng: np.random.Generator,
     prior: PosePrior | None = None,
     others: Sequence[OtherSensor] = (),
     search: Search | None = None,
 ) -> Finding:
-    """The distribution of the pose with its modes, by two runs that share a twentieth of the ``contacts``, 10,000 at least, or a
-    quarter of that on each of several sensors, and have to agree on the evidence; arguments as of :func:`explore`.
+    """The distribution of the pose with its modes, by two runs that share the contacts of each of the ``attempts``, and have to
+    agree on the evidence; other arguments as of :func:`explore`.
 
     Where they do not, the largest powers of the likelihood are left out until they do, one to three of them at most. If that
-    does not help, both are repeated with four times the contacts, while that is no more than ``contacts`` on all sensors
-    together. So are runs of several sensors that found no pose which explains all contacts. If the runs do not agree in the
-    end, or explain too little, what they found has half of the probability, and the coarse posterior the rest.
+    does not help, the next attempt follows; so it does where runs of several sensors found no pose which explains all contacts.
+    If the runs do not agree in the end, or explain too little, what they found has half of the probability, and the coarse
+    posterior the rest.
     """
     cut, found = 0, Finding(None, unexplained_nats=np.inf if others else None)
-    attempts = [max(LEAST_CONTACTS, contacts // _SHARE) // (_FEWER_OF_SEVERAL if others else 1)]
-    while _MORE * attempts[-1] * (1 + len(others)) <= contacts:
-        attempts.append(_MORE * attempts[-1])
     of_one = _LEFT_OUT if query.indentation is None else _LEFT_OUT_OF_DEPTHS
     left_out = _LEFT_OUT_OF_SEVERAL if others else of_one
     for asked in attempts:

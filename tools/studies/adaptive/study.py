@@ -14,7 +14,7 @@ from geomtact.contact_space.contact_maps import located
 from geomtact.contact_space.index import Index
 from geomtact.contact_space.touches import Touch
 from geomtact.geometry.distance import PoseDistance, mode_radius
-from geomtact.inference.effort import EFFORTS
+from geomtact.inference.effort import EFFORTS, Effort
 from geomtact.inference.explored import Density
 from geomtact.inference.particles import Target, poses_of
 from geomtact.inference.two_runs import explore_twice
@@ -109,7 +109,7 @@ def _found(
     index: Index, query: ContactQuery, mass: Array, contacts: int, touch: Touch, rng: np.random.Generator
 ) -> _Found:
     T = touch.T_sensor_object[None]
-    explored = explore_twice(index, query, mass, contacts, rng).explored
+    explored = explore_twice(index, query, mass, Effort(0, contacts).attempts(1), rng).explored
     if explored is None:
         density = np.log(mass / index.weight.sum(0, dtype=float))
         at = float(density[located(index, T)[0].place[0]])
