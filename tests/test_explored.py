@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from speed import slow_but
 from geomtact import GaussianPrior, Posterior
 from geomtact.contact_space.contact_maps import located
 from geomtact.contact_space.touches import random_touches
+from geomtact.errors import UsageError
 from geomtact.evaluation import simultaneous_touches
 from geomtact.geometry.distance import PoseDistance, mode_radius
 from geomtact.inference import sampler, two_runs
@@ -37,6 +39,18 @@ def touch(localizer):
 @pytest.fixture(scope="module")
 def posterior(localizer, touch):
     return localizer.localize(touch.mask, "mask", effort=EFFORT)
+
+
+@pytest.mark.parametrize("sensors", [1, 2, 5])
+def test_attempts_grow_as_long_as_all_sensors_together_may_cut_as_many(sensors):
+    for contacts in (10_000, 200_000, 800_000):
+        for first in (None, 3_000):
+            attempts = Effort(0, contacts, first=first).attempts(sensors)
+            assert all(more == 4 * less for less, more in pairwise(attempts)) and attempts[0] == (first or attempts[0])
+            assert len(attempts) == 1 or attempts[-1] * sensors <= contacts < 4 * attempts[-1] * sensors
+    assert Effort(0, 10_000).attempts(1) == [10_000] and Effort(0, 10_000).attempts(2) == [2_500]
+    with pytest.raises(UsageError, match="expected 1 contact or more in the first attempt, got 0"):
+        Effort(0, 10_000, first=0)
 
 
 def test_it_says_more_than_its_cells(localizer, touch, posterior):
