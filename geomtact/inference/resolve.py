@@ -43,7 +43,7 @@ def resolve_touch(
     log_coarse = None
     if alone is not None:
         log_coarse = _log_mass(alone)
-    elif posterior.observation is not None and posterior.contact:
+    elif effort.contacts and posterior.contact and posterior.observation is not None:
         # cells that the prior rules out have no mass in the posterior
         log_coarse = scorer.log_mass(posterior.index, posterior.observation.contact.soft_mask)
     return resolve_touches(posterior, [posterior], prior, log_prior, effort, log_coarse=log_coarse)
