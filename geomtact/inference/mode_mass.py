@@ -48,13 +48,11 @@ def weighed(
         T = np.stack([mode.heart for mode in modes])[:, None] @ exp(xi)
         shares = rng.random((*xi.shape[:2], 4))
         moved = density.target.displaced(T, errors_of(shares))
-        near = np.array(
-            [distance.within(mode.heart, each, radius) for mode, each in zip(modes, moved, strict=True)], bool
-        )
+        near = np.stack([distance.within(mode.heart, each, radius) for mode, each in zip(modes, moved, strict=True)])
         turn = np.linalg.norm(xi[..., :3], axis=-1)
         # beyond these turns a placement is met again
         nearest = [distance.is_nearest(mode.heart, each) for mode, each in zip(modes, T, strict=True)]
-        near &= np.array(turn < np.pi, bool) & np.array(nearest, bool)
+        near &= (turn < np.pi) & np.stack(nearest)
         found = np.full(near.shape, -np.inf)
         carried = shares[near][:, None] if density.target.carried else None
         particles = density.target.particles_at(T[near], carried)

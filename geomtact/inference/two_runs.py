@@ -96,11 +96,11 @@ def explore_twice(
         try:
             one, other = explore(index, query, coarse, asked // 2, rng, prior, others, 2, search)
             cut += one.contacts + other.contacts
-            found_last = one.particles[-1].joined(other.particles[-1])
-            unexplained = _unexplained(one, other, found_last) if others else None
+            sharpest = one.particles[-1].joined(other.particles[-1])
+            unexplained = _unexplained(one, other, sharpest) if others else None
             explains = unexplained is None or unexplained <= UNEXPLAINED_NATS
             why_not = _DISAGREE if explains else _UNEXPLAINED
-            found = Finding(None, _log_evidence(one, other), _misfit(one, other), unexplained, why_not)
+            found = Finding(None, _log_evidence(one, other), _misfit(one, sharpest), unexplained, why_not)
             is_last, explored = asked == attempts[-1], None
             if explains:
                 explored, cut = _agreed(one, other, left_out, _AGREE_AT_LAST if is_last else _AGREE, asked, cut, rng)
@@ -195,10 +195,10 @@ def _log_evidence(one: Run, other: Run) -> float:
     return float(np.logaddexp.reduce(out) - np.log(2))
 
 
-def _misfit(one: Run, other: Run) -> float:
-    """As of :class:`Finding`."""
+def _misfit(one: Run, found: Particles) -> float:
+    """As of :class:`Finding`, by the poses ``found`` and those that registration led to."""
     target = one.density.target
-    best = _likeliest(one.particles[-1].joined(other.particles[-1]))
+    best = _likeliest(found)
     if one.about is not None:
         best = max(best, _likeliest(target.particles_at(one.about.led_to)))
     queries = [target.query, *(other.query for other in target.others)]

@@ -87,13 +87,14 @@ def correlation_length(errors: Sequence[Array], pitch: tuple[float, float]) -> f
         known = np.isfinite(each)
         product += np.fft.ifft2(np.abs(np.fft.fft2(np.where(known, each, 0.0), shape)) ** 2).real
         count += np.fft.ifft2(np.abs(np.fft.fft2(known.astype(float), shape)) ** 2).real
+    count = np.rint(count)
     lags = [n * np.fft.fftfreq(n) * step for n, step in zip(shape, pitch[::-1], strict=True)]
     lag = np.hypot(lags[0][:, None], lags[1])
     ring = (lag / max(pitch)).astype(np.int64).ravel()
-    pairs = np.bincount(ring, np.rint(count).ravel())
+    pairs = np.bincount(ring, count.ravel())
     some = pairs > 0
     share = np.bincount(ring, product.ravel())[some] / pairs[some]
-    length = np.bincount(ring, (lag * np.rint(count)).ravel())[some] / pairs[some]
+    length = np.bincount(ring, (lag * count).ravel())[some] / pairs[some]
     below = int(np.argmax(share < share[0] / np.e))
     if not below:
         return float(length.max())
